@@ -1,0 +1,36 @@
+"""Decide whether a learned model of a robot can be trusted for the control tasks it is meant for.
+
+An implementation of CuSTOM, *Context-Specific Validation of Data-Driven Models* (Bansal, Ghosh,
+Sangiovanni-Vincentelli, Seshia and Tomlin).
+"""
+
+from ctxval.campaign import Campaign, OpenTrial
+from ctxval.experiment import Experiment
+from ctxval.space import Parameters, TaskSpace
+from ctxval.store import Store, Trial
+from ctxval.task import Task
+from ctxval.trajectory import Trajectory, Transitions
+from ctxval.truth import Truth, grid_truth
+from ctxval.validation import Outcome, Plan, Validation
+from ctxval.verdict import Verdict
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Campaign",
+    "Experiment",
+    "OpenTrial",
+    "Outcome",
+    "Parameters",
+    "Plan",
+    "Store",
+    "Task",
+    "TaskSpace",
+    "Trajectory",
+    "Transitions",
+    "Trial",
+    "Truth",
+    "Validation",
+    "Verdict",
+    "grid_truth",
+]

@@ -1,0 +1,109 @@
+"""Float64 arrays with clear errors, and linear algebra on one thread.
+
+Small dense algebra is slower on many BLAS threads, and its last bits then depend on how many there are.
+"""
+
+from __future__ import annotations
+
+import functools
+from contextlib import AbstractContextManager
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from threadpoolctl import ThreadpoolController
+
+from ctxval.errors import InputError, ShapeError
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+Rows = npt.NDArray[np.intp]
+ArrayLike = npt.ArrayLike
+
+
+def as_floats(name: str, value: ArrayLike) -> Array:
+    """Return ``value`` as a float64 array.
+
+    Raises:
+        InputError: it is not numeric.
+    """
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be numbers, got {value!r}.") from error
+
+
+def as_finite(name: str, value: ArrayLike) -> Array:
+    """Return ``value`` as a float64 array without NaN and infinity.
+
+    Raises:
+        InputError: it is not numeric, or not finite.
+    """
+    array = as_floats(name, value)
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} must be finite, got {array.tolist()}.")
+    return array
+
+
+def require_shape(name: str, array: Array, expected: tuple[int, ...]) -> Array:
+    """Return ``array`` if its last axes are ``expected``.
+
+    Raises:
+        ShapeError: they are not; the message names both shapes.
+    """
+    if array.shape[array.ndim - len(expected) :] != expected or array.ndim < len(expected):
+        wanted = ", ".join(["...", *map(str, expected)])
+        raise ShapeError(f"{name} must have shape ({wanted}), got {array.shape}.")
+    return array
+
+
+def as_weight(name: str, value: ArrayLike) -> Array:
+    """Return a square weight matrix from a matrix or from its diagonal.
+
+    Raises:
+        ShapeError: it is neither.
+        InputError: it is not finite, not symmetric, or has a negative eigenvalue.
+    """
+    array = as_finite(name, value)
+    if array.ndim == 1:
+        array = np.diag(array)
+    if array.ndim != 2 or array.shape[0] != array.shape[1]:
+        raise ShapeError(f"{name} must be a diagonal or a square matrix, got shape {array.shape}.")
+    scale = max(1.0, float(np.abs(array).max(initial=0.0)))
+    if not np.allclose(array, array.T, rtol=0, atol=1e-10 * scale):
+        raise InputError(f"{name} must be symmetric, got {array.tolist()}.")
+    if np.linalg.eigvalsh(array).min() < -1e-10 * scale:
+        raise InputError(f"{name} must have no negative eigenvalue, got {array.tolist()}.")
+    return array
+
+
+def vector_norm(vectors: Array, order: float) -> Array:
+    """Return the ``order``-norm (1, 2 or infinity) over the last axis."""
+    magnitudes = np.abs(vectors)
+    if order == 1:
+        return np.asarray(magnitudes.sum(axis=-1))
+    if order == np.inf:
+        return np.asarray(magnitudes.max(axis=-1))
+    return np.asarray(np.sqrt((magnitudes**2).sum(axis=-1)))
+
+
+def as_norm_order(value: float) -> float:
+    """Return the order of a norm.
+
+    Raises:
+        InputError: it is none of 1, 2 and infinity.
+    """
+    if value not in (1, 2, np.inf):
+        raise InputError(f"norm must be 1, 2 or inf, got {value!r}.")
+    return float(value)
+
+
+@functools.cache
+def _thread_pools() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def single_threaded() -> AbstractContextManager[Any]:
+    """Bound BLAS to one thread while the context lasts."""
+    limits: AbstractContextManager[Any] = _thread_pools().limit(limits=1)
+    return limits

@@ -1,0 +1,235 @@
+"""Iterative LQR (Li and Todorov 2004; regularisation and line search after Tassa, Erez and Todorov 2012)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ctxval.arrays import Array, ArrayLike, Mask, Rows
+from ctxval.controller import AffineFeedback
+from ctxval.controllers.cost import QuadraticCost
+from ctxval.errors import DesignError, InputError
+from ctxval.model import Model, linearize
+from ctxval.task import Task
+
+_STEP_LENGTHS = 0.5 ** np.arange(12)
+_SUFFICIENT_DECREASE = 1e-4
+_DAMPING_MIN, _DAMPING_MAX = 1e-6, 1e10
+
+
+@dataclass(frozen=True, eq=False)
+class ILQRSolution:
+    """What iLQR found, for one task or a batch.
+
+    Attributes:
+        controller: the feedback around the optimised trajectory.
+        cost: shape ``(...)``.
+        iterations: accepted steps, integers of shape ``(...)``.
+        converged: shape ``(...)``; where false, the limit of iterations was reached or no step improved the cost.
+    """
+
+    controller: AffineFeedback
+    cost: Array
+    iterations: Array
+    converged: Array
+
+
+class ILQR:
+    """Finite-horizon iterative LQR on any model, a whole batch of tasks at once.
+
+    Minimises a quadratic cost on the deviation from the task's reference. On a linear model it converges in one
+    iteration, to the Riccati solution.
+
+    Args:
+        Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
+        R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``.
+        Q_final: weight of the last state; Q by default.
+        iterations: the most steps for one task.
+        tolerance: stop where the next step would lower the cost by less than this share of it.
+
+    Raises:
+        InputError: the weights are not positive semidefinite, R not positive definite, or a limit not positive.
+    """
+
+    batched = True
+
+    def __init__(
+        self,
+        Q: ArrayLike,
+        R: ArrayLike,
+        Q_final: ArrayLike | None = None,
+        *,
+        iterations: int = 100,
+        tolerance: float = 1e-8,
+    ) -> None:
+        self.cost = QuadraticCost(Q, R, Q_final)
+        self.iterations = iterations
+        self.tolerance = tolerance
+        if iterations < 1 or not tolerance > 0:
+            raise InputError(f"iterations and tolerance must be positive, got {iterations!r} and {tolerance!r}.")
+
+    def design(self, task: Task, model: Model) -> AffineFeedback:
+        """Return the feedback around the optimised trajectory of the model."""
+        return self.solve(task, model).controller
+
+    def solve(self, task: Task, model: Model) -> ILQRSolution:
+        """Return the controller with the cost, the iterations and whether it converged, task by task.
+
+        Raises:
+            DesignError: the model diverges before any control is applied.
+        """
+        self.cost.require_task(task)
+        with np.errstate(all="ignore"):
+            descent = _Descent(self, task, model)
+            while len(rows := descent.active_rows()):
+                descent.advance(rows)
+        return descent.solution(task.batch_shape)
+
+
+class _Descent:
+    """The iterates of all tasks, time first: states X ``(H+1, N, n)``, inputs U ``(H, N, m)``."""
+
+    def __init__(self, settings: ILQR, task: Task, model: Model) -> None:
+        n, m = task.initial_state.shape[-1], len(settings.cost.R)
+        self.settings, self.cost, self.model = settings, settings.cost, model
+        self.reference = np.moveaxis(task.reference.reshape(-1, task.horizon + 1, n), 1, 0)
+        batch = self.reference.shape[1]
+        self.U = np.zeros((task.horizon, batch, m))
+        self.X = np.empty((task.horizon + 1, batch, n))
+        self.X[0] = task.initial_state.reshape(-1, n)
+        self.K = np.zeros((task.horizon, batch, m, n))
+        self.X, self.U, self.J = self._forward(np.arange(batch), _Policy(self.K, self.U), np.zeros(batch))
+        if not np.isfinite(self.J).all():
+            raise DesignError("iLQR cannot start: the model diverges under zero input within the horizon.")
+        self.damping = np.zeros(batch)
+        self.iterations = np.zeros(batch, dtype=int)
+        self.converged = np.zeros(batch, dtype=bool)
+
+    def active_rows(self) -> Rows:
+        """Return the tasks that still move."""
+        stuck = self.damping > _DAMPING_MAX
+        return np.flatnonzero(~self.converged & ~stuck & (self.iterations < self.settings.iterations))
+
+    def advance(self, rows: Rows) -> None:
+        """Take one step for these tasks, or find that they have arrived."""
+        A, B = linearize(self.model, self.X[:-1, rows], self.U[:, rows])
+        policy, change = self._backward(rows, A, B)
+        self.K[:, rows] = policy.K if policy.K.ndim == 4 else policy.K[:, None]
+        gain = -change.at(np.ones(len(rows)))
+        arrived = gain <= self.settings.tolerance * (np.abs(self.J[rows]) + self.settings.tolerance)
+        # A damped step is small by itself: only an undamped one may declare arrival.
+        self.converged[rows] = arrived & (self.damping[rows] == 0)
+        self.damping[rows[arrived]] = 0.0
+        moved = self._line_search(rows, policy, change, ~arrived)
+        if A.ndim == 2 and B.ndim == 2:
+            # The model is linear: the step was the exact minimiser, and its gains hold everywhere.
+            self.converged[rows[moved]] = True
+
+    def _backward(self, rows: Rows, A: Array, B: Array) -> tuple[_Policy, _Change]:
+        """Minimise the quadratic expansion of the cost-to-go ``v'dx + 1/2 dx'V dx``, from the horizon to the start."""
+        deviations = self.X[:, rows] - self.reference[:, rows]
+        inputs = self.U[:, rows]
+        damping = self.damping[rows]
+        ridge = damping[:, None, None] * np.eye(inputs.shape[-1]) if damping.any() else 0.0
+        v, V = deviations[-1] @ self.cost.Q_final, self.cost.Q_final
+        slope, curvature = np.zeros(len(rows)), np.zeros(len(rows))
+        gains, feedforward = [], []
+        for t in reversed(range(len(inputs))):
+            A_t, B_t = (A, B) if A.ndim == 2 else (A[t], B[t])
+            VA, VB = V @ A_t, V @ B_t
+            Q_x, Q_u = deviations[t] @ self.cost.Q + _times(v, A_t), inputs[t] @ self.cost.R + _times(v, B_t)
+            Q_ux, Q_uu = _T(B_t) @ VA, self.cost.R + _T(B_t) @ VB
+            inverse = np.linalg.inv(Q_uu + ridge)
+            K, k = -inverse @ Q_ux, -_times(Q_u, inverse)
+            Q_uu_k = _times(k, Q_uu)
+            slope += (k * Q_u).sum(axis=-1)
+            curvature += (k * Q_uu_k).sum(axis=-1)
+            v = Q_x + _times(Q_uu_k + Q_u, K) + _times(k, Q_ux)
+            V = self.cost.Q + _T(A_t) @ VA + _T(K) @ (Q_uu @ K + Q_ux) + _T(Q_ux) @ K
+            V = 0.5 * (V + _T(V))
+            gains.append(K)
+            feedforward.append(k)
+        return _Policy(np.stack(gains[::-1]), np.stack(feedforward[::-1])), _Change(slope, curvature)
+
+    def _line_search(self, rows: Rows, policy: _Policy, change: _Change, wanted: Mask) -> Rows:
+        """Accept for each wanted task the longest step that lowers its cost; return which ones moved."""
+        waiting = np.flatnonzero(wanted)
+        for length in _STEP_LENGTHS:
+            if not len(waiting):
+                break
+            lengths = np.full(len(waiting), length)
+            X, U, J = self._forward(rows[waiting], policy.of(waiting), lengths)
+            expected = change.at(length)[waiting]
+            accepted = self.J[rows[waiting]] - J >= -_SUFFICIENT_DECREASE * expected
+            self._accept(rows[waiting[accepted]], X[:, accepted], U[:, accepted], J[accepted])
+            waiting = waiting[~accepted]
+        failed = rows[waiting]
+        self.damping[failed] = np.maximum(_DAMPING_MIN, 10 * self.damping[failed])
+        moved = wanted.copy()
+        moved[waiting] = False
+        return np.flatnonzero(moved)
+
+    def _accept(self, rows: Rows, X: Array, U: Array, J: Array) -> None:
+        self.X[:, rows], self.U[:, rows], self.J[rows] = X, U, J
+        self.iterations[rows] += 1
+        self.damping[rows] = np.where(self.damping[rows] > _DAMPING_MIN, self.damping[rows] / 10, 0.0)
+
+    def _forward(self, rows: Rows, policy: _Policy, lengths: Array) -> tuple[Array, Array, Array]:
+        """Run the model under ``u = u_old + length * k + K (x - x_old)``; return states, inputs and costs."""
+        X_old, U_old = self.X[:, rows], self.U[:, rows]
+        X, U = np.empty_like(X_old), np.empty_like(U_old)
+        X[0] = X_old[0]
+        for t in range(len(U)):
+            U[t] = U_old[t] + lengths[:, None] * policy.k[t]
+            if lengths.any():
+                U[t] += _times(X[t] - X_old[t], _T(policy.K[t]))
+            X[t + 1] = self.model.step(X[t], U[t])
+        J = self.cost.value(X - self.reference[:, rows], U)
+        return X, U, np.where(np.isfinite(J), J, np.inf)
+
+    def solution(self, batch_shape: tuple[int, ...]) -> ILQRSolution:
+        """Return the iterates as a solution, batch first."""
+
+        def batch_first(array: Array) -> Array:
+            return np.moveaxis(array, 0, 1).reshape(*batch_shape, len(array), *array.shape[2:])
+
+        controller = AffineFeedback(batch_first(self.K), batch_first(self.U), batch_first(self.X[:-1]))
+        return ILQRSolution(
+            controller,
+            self.J.reshape(batch_shape),
+            self.iterations.reshape(batch_shape),
+            self.converged.reshape(batch_shape),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Policy:
+    """Gains K ``(H, N, m, n)``, or ``(H, m, n)`` where all tasks share them, and feedforward k ``(H, N, m)``."""
+
+    K: Array
+    k: Array
+
+    def of(self, rows: Rows) -> _Policy:
+        return _Policy(self.K if self.K.ndim == 3 else self.K[:, rows], self.k[:, rows])
+
+
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """The expected change of the cost, ``length * slope + length^2 / 2 * curvature``."""
+
+    slope: Array
+    curvature: Array
+
+    def at(self, length: float | Array) -> Array:
+        return length * self.slope + 0.5 * length**2 * self.curvature
+
+
+def _times(rows: Array, matrix: np.ndarray[Any, np.dtype[np.floating[Any]]]) -> Array:
+    """Return ``row' M`` for rows ``(N, a)`` and one matrix ``(a, b)`` or N of them."""
+    return np.asarray(rows @ matrix if matrix.ndim == 2 else (rows[:, None, :] @ matrix)[:, 0, :])
+
+
+def _T(matrix: Array) -> Array:
+    return np.swapaxes(matrix, -1, -2)

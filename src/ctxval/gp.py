@@ -1,0 +1,194 @@
+"""Exact Gaussian-process regression (the paper's Sec. IV-B; Rasmussen and Williams 2006, algorithm 2.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
+from scipy.optimize import minimize
+
+from ctxval.arrays import Array
+from ctxval.errors import InputError, ShapeError
+from ctxval.kernels import Kernel
+
+Mean = Callable[[Array], Array]
+"""A prior mean: points ``(n, d)`` -> values ``(n,)``."""
+
+LogPrior = Callable[[Array], tuple[float, Array]]
+"""A prior of the hyperparameters: theta -> (log density, its gradient)."""
+
+NOISE = 1e-6
+"""The least noise variance, for values of unit variance: it keeps the Cholesky factor safe."""
+
+
+def zero_mean(X: Array) -> Array:
+    """Return the paper's prior mean, zero everywhere."""
+    return np.zeros(len(X))
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianProcess:
+    """A Gaussian process conditioned on observations; make one with :func:`condition` or :func:`fit`.
+
+    Attributes:
+        kernel, theta: the covariance and the logarithms of its hyperparameters.
+        noise: variance of the observations' noise.
+        mean: prior mean function.
+        X, y: observations, shapes ``(n, d)`` and ``(n,)``.
+        L: lower Cholesky factor of ``K + noise I``.
+        alpha: ``(K + noise I)^-1 (y - mean(X))``.
+    """
+
+    kernel: Kernel
+    theta: Array
+    noise: float
+    mean: Mean
+    X: Array
+    y: Array
+    L: Array
+    alpha: Array
+
+    def predict(self, X: Array) -> tuple[Array, Array]:
+        """Return the posterior mean and variance of the noise-free function at ``(m, d)``, shapes ``(m,)``."""
+        k = self.kernel(self.theta, X, self.X)
+        half = dtrtrs(self.L, k.T, lower=1)[0]
+        variance = self.kernel.diagonal(self.theta, X) - (half**2).sum(axis=0)
+        return self.mean(X) + k @ self.alpha, np.maximum(variance, 0.0)
+
+    def predict_gradient(self, X: Array) -> tuple[Array, Array]:
+        """Return the gradients of posterior mean and variance with respect to the points, shapes ``(m, d)``."""
+        k = self.kernel(self.theta, X, self.X)
+        dk = self.kernel.input_gradient(self.theta, X, self.X)
+        weights = _solve(self.L, k.T).T
+        d_mean = np.einsum("mnd,n->md", dk, self.alpha)
+        d_variance = self.kernel.diagonal_input_gradient(self.theta, X) - 2 * np.einsum("mnd,mn->md", dk, weights)
+        return d_mean + _mean_gradient(self.mean, X), d_variance
+
+    def log_marginal_likelihood(self) -> float:
+        """Return log p(y | X, theta)."""
+        return _log_likelihood(self.L, self.alpha, self.y - self.mean(self.X))
+
+
+def _mean_gradient(mean: Mean, X: Array) -> Array:
+    """Return the gradient of a prior mean by central differences: it is a plain function."""
+    if mean is zero_mean:
+        return np.zeros_like(X)
+    n, d = X.shape
+    moves = 1e-6 * np.eye(d)
+    up = mean((X[:, None, :] + moves).reshape(-1, d)).reshape(n, d)
+    return (up - mean((X[:, None, :] - moves).reshape(-1, d)).reshape(n, d)) / 2e-6
+
+
+def condition(
+    kernel: Kernel, theta: Array, X: Array, y: Array, *, noise: float = NOISE, mean: Mean = zero_mean
+) -> GaussianProcess:
+    """Return the process with these hyperparameters, conditioned on observations ``(n, d)``, ``(n,)``.
+
+    Raises:
+        ShapeError: X and y do not fit together.
+        InputError: the covariance matrix is not positive definite.
+    """
+    if X.ndim != 2 or y.shape != (len(X),):
+        raise ShapeError(f"observations need X (n, d) and y (n,), got {X.shape} and {y.shape}.")
+    L = _factor(kernel, theta, noise, X)
+    alpha = _solve(L, y - mean(X))
+    return GaussianProcess(kernel, np.asarray(theta, dtype=np.float64), noise, mean, X, y, L, alpha)
+
+
+def _factor(kernel: Kernel, theta: Array, noise: float, X: Array) -> Array:
+    covariance = kernel(theta, X, X)
+    covariance[np.diag_indices_from(covariance)] += noise
+    L, info = dpotrf(covariance, lower=1, clean=1)
+    if info:
+        raise InputError(f"the covariance of {len(X)} observations is not positive definite; raise the noise.")
+    return np.asarray(L)
+
+
+def _solve(L: Array, right: Array) -> Array:
+    """Return ``(L L')^-1 right``; LAPACK is called without the checks that cost more than a small solve."""
+    return np.asarray(dpotrs(L, right, lower=1)[0])
+
+
+def _inverse(L: Array) -> Array:
+    """Return ``(L L')^-1``."""
+    lower = dpotri(L, lower=1)[0]
+    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+
+
+def _log_likelihood(L: Array, alpha: Array, residual: Array) -> float:
+    fit = -0.5 * residual @ alpha
+    return float(fit - np.log(np.diag(L)).sum() - 0.5 * len(L) * np.log(2 * np.pi))
+
+
+def log_marginal_likelihood(
+    kernel: Kernel, theta: Array, noise: float, X: Array, residual: Array
+) -> tuple[float, Array]:
+    """Return log p(residual | X, theta, noise) and its gradient with respect to (theta, log noise).
+
+    ``residual`` is the observations less the prior mean (Rasmussen and Williams 2006, eq. 5.9).
+    """
+    L = _factor(kernel, theta, noise, X)
+    alpha = _solve(L, residual)
+    inverse = _inverse(L)
+    W = 0.5 * (np.outer(alpha, alpha) - inverse)
+    gradient = kernel.weighted_gradient(theta, X, W)
+    return _log_likelihood(L, alpha, residual), np.append(gradient, noise * np.trace(W))
+
+
+def fit(
+    kernel: Kernel,
+    X: Array,
+    y: Array,
+    *,
+    noise: tuple[float, float] = (NOISE, NOISE),
+    mean: Mean = zero_mean,
+    log_prior: LogPrior | None = None,
+    starts: Array | None = None,
+) -> GaussianProcess:
+    """Return the process with the most likely hyperparameters within the kernel's bounds.
+
+    The prior of the hyperparameters is uniform on the box of the kernel's bounds (line 2 of the paper's algorithm)
+    unless ``log_prior`` is given; then its mode is sought.
+
+    Args:
+        kernel: the covariance.
+        X: observed points ``(n, d)``.
+        y: observed values ``(n,)``, about unit variance.
+        noise: bounds of the noise variance; equal bounds fix it.
+        mean: prior mean function.
+        log_prior: density of (theta, log noise).
+        starts: where to start the climbs, shape ``(s, len(theta) + 1)``; the default spreads over length-scales.
+    """
+    bounds = [*kernel.bounds(X.shape[1]), (float(np.log(noise[0])), float(np.log(noise[1])))]
+    residual = y - mean(X)
+
+    def negative(parameters: Array) -> tuple[float, Array]:
+        try:
+            value, gradient = log_marginal_likelihood(
+                kernel, parameters[:-1], float(np.exp(parameters[-1])), X, residual
+            )
+        except InputError:
+            return 1e25, np.zeros_like(parameters)
+        if log_prior is not None:
+            prior, prior_gradient = log_prior(parameters)
+            value, gradient = value + prior, gradient + prior_gradient
+        return -value, -gradient
+
+    best, best_value = None, np.inf
+    for start in _default_starts(bounds) if starts is None else starts:
+        result = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 50})
+        if best is None or result.fun < best_value:
+            best, best_value = result.x, result.fun
+    assert best is not None  # there is at least one start
+    return condition(kernel, best[:-1], X, y, noise=float(np.exp(best[-1])), mean=mean)
+
+
+def _default_starts(bounds: list[tuple[float, float]]) -> Array:
+    """Return three starts between the bounds: rough, middling and smooth functions, of middling variance."""
+    low, high = np.array(bounds).T
+    middle = 0.5 * (low + high)
+    starts = np.tile(middle, (3, 1))
+    starts[:, 1:-1] = low[1:-1] + np.array([[0.25], [0.5], [0.75]]) * (high[1:-1] - low[1:-1])
+    return starts

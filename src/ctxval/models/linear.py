@@ -1,0 +1,68 @@
+"""A linear model learned from data."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ctxval.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval.errors import InputError, ShapeError
+from ctxval.trajectory import Transitions
+
+
+class Linear:
+    """The model ``x_next = A x + B u + c``.
+
+    Args:
+        A: shape ``(n, n)``.
+        B: shape ``(n, m)``.
+        c: shape ``(n,)``; zero by default.
+        data: the transitions that it was learned from, if any.
+
+    Raises:
+        ShapeError: the shapes do not fit together.
+    """
+
+    def __init__(self, A: ArrayLike, B: ArrayLike, c: ArrayLike | None = None, data: Transitions | None = None) -> None:
+        self.A: Array = as_finite("A", A)
+        self.B: Array = as_finite("B", B)
+        n = len(self.A) if self.A.ndim else 0
+        self.c: Array = np.zeros(n) if c is None else as_finite("c", c)
+        self.data = data
+        if self.A.shape != (n, n) or self.B.ndim != 2 or len(self.B) != n or self.c.shape != (n,):
+            raise ShapeError(
+                "a linear model needs A (n, n), B (n, m) and c (n,), "
+                f"got {self.A.shape}, {self.B.shape} and {self.c.shape}."
+            )
+
+    @classmethod
+    def fit(cls, data: Transitions, *, intercept: bool = True) -> Linear:
+        """Fit A, B and, with an intercept, c by least squares on recorded transitions.
+
+        Raises:
+            InputError: the data do not determine the model.
+        """
+        n, m = data.x.shape[1], data.u.shape[1]
+        columns = [data.x, data.u, *([np.ones((len(data), 1))] if intercept else [])]
+        regressors = np.concatenate(columns, axis=1)
+        with single_threaded():
+            weights, _, rank, _ = np.linalg.lstsq(regressors, data.x_next)
+        if rank < regressors.shape[1]:
+            raise InputError(
+                f"the data do not determine a linear model: {len(data)} transitions of {n} states and {m} inputs "
+                f"have rank {rank} where {regressors.shape[1]} is needed; excite every state and input."
+            )
+        return cls(weights[:n].T, weights[n : n + m].T, weights[n + m] if intercept else None, data)
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
+        return np.asarray(x @ self.A.T + u @ self.B.T + self.c)
+
+    def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """Return A and B, the same everywhere."""
+        return self.A, self.B
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this model in a store."""
+        return {"A": self.A.tolist(), "B": self.B.tolist(), "c": self.c.tolist()}

@@ -1,0 +1,35 @@
+"""Searches: ask and tell over the unit cube."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ctxval.errors import InputError, UnknownNameError
+from ctxval.searches.base import Origin, Search, SequentialSearch
+from ctxval.searches.gp_ucb import GPUCB
+from ctxval.searches.random import Random, SamplingDiscarding
+
+__all__ = ["GPUCB", "NAMES", "Origin", "Random", "SamplingDiscarding", "Search", "SequentialSearch", "by_name"]
+
+NAMES: dict[str, type[Any]] = {
+    "gp-ucb": GPUCB,
+    "random": Random,
+    "sampling-discarding": SamplingDiscarding,
+}
+"""The searches that the command line and experiment files know."""
+
+
+def by_name(name: str, **options: Any) -> Search:
+    """Return a new search from its name and its options.
+
+    Raises:
+        UnknownNameError: there is no such search; the message has the nearest name.
+        InputError: it does not take these options.
+    """
+    if name not in NAMES:
+        raise UnknownNameError.among("search", name, NAMES)
+    try:
+        search: Search = NAMES[name](**options)
+    except TypeError as error:
+        raise InputError(f"search {name!r}: {error}.") from error
+    return search

@@ -1,0 +1,110 @@
+"""What every search offers, and the bookkeeping that most of them share."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+
+from ctxval.arrays import Array, ArrayLike, as_floats
+from ctxval.errors import InputError, ShapeError
+
+Origin = Literal["iid", "initial", "acquisition", "manual"]
+"""Why a trial was chosen."""
+
+
+@runtime_checkable
+class Search(Protocol):
+    """Chooses the next points of the unit cube to evaluate, seeking the largest value.
+
+    The state of a search is a function of the seed and of the history of points and values, in their order: a new
+    search that is reset with the same seed and told the same history asks for the same points. So a campaign
+    resumes by telling, and saves no search.
+
+    Optional attributes:
+        iid: whether every point is an independent uniform draw (default False).
+        initial: how many first points are an initial design (default 0).
+        discard: how many of the largest values its estimate of the maximum leaves out (default 0).
+    """
+
+    def reset(self, dimension: int, seed: int) -> None:
+        """Forget everything and start on the unit cube of this dimension."""
+
+    def ask(self, n: int = 1) -> Array:
+        """Return the next points, shape ``(n, d)``; they are pending until told."""
+
+    def tell(self, points: ArrayLike, values: ArrayLike) -> None:
+        """Learn the values ``(n,)`` at points ``(n, d)``; NaN for an evaluation that is pending or has failed."""
+
+
+class SequentialSearch(ABC):
+    """A search that proposes one point at a time from the history of all points."""
+
+    iid = False
+    initial = 0
+    discard = 0
+
+    def reset(self, dimension: int, seed: int) -> None:
+        """Forget everything and start on the unit cube of this dimension."""
+        if dimension < 1:
+            raise InputError(f"a search needs at least one dimension, got {dimension}.")
+        self._dimension, self._seed = dimension, seed
+        self._points: list[Array] = []
+        self._values: list[float] = []
+
+    def ask(self, n: int = 1) -> Array:
+        """Return the next points, shape ``(n, d)``; they are pending until told."""
+        if n < 1:
+            raise InputError(f"a search is asked for at least one point, got n = {n}.")
+        proposals = []
+        for _ in range(n):
+            rng = np.random.default_rng(np.random.SeedSequence([self._seed, len(self._points)]))
+            proposals.append(self.propose(rng))
+            self._points.append(proposals[-1])
+            self._values.append(np.nan)
+        return np.array(proposals)
+
+    def tell(self, points: ArrayLike, values: ArrayLike) -> None:
+        """Learn the values ``(n,)`` at points ``(n, d)``; NaN for an evaluation that is pending or has failed.
+
+        Raises:
+            ShapeError: points and values do not fit together or the dimension.
+        """
+        rows, scalars = as_floats("points", points), as_floats("values", values)
+        if rows.ndim != 2 or rows.shape[1] != self._dimension or scalars.shape != (len(rows),):
+            raise ShapeError(
+                f"tell needs points (n, {self._dimension}) and values (n,), got {rows.shape} and {scalars.shape}."
+            )
+        for point, value in zip(rows, scalars.tolist(), strict=True):
+            slot = self._waiting_slot(point)
+            if slot is None:
+                self._points.append(point)
+                self._values.append(value)
+            else:
+                self._values[slot] = value
+
+    def _waiting_slot(self, point: Array) -> int | None:
+        for slot, (known, value) in enumerate(zip(self._points, self._values, strict=True)):
+            if np.isnan(value) and np.array_equal(known, point):
+                return slot
+        return None
+
+    @abstractmethod
+    def propose(self, rng: np.random.Generator) -> Array:
+        """Return the next point ``(d,)``, given ``self.points``, ``self.values`` and this point's own randomness."""
+
+    @property
+    def dimension(self) -> int:
+        """The dimension d of the unit cube."""
+        return self._dimension
+
+    @property
+    def points(self) -> Array:
+        """All points asked for or told, shape ``(n, d)``."""
+        return np.array(self._points).reshape(-1, self._dimension)
+
+    @property
+    def values(self) -> Array:
+        """Their values, shape ``(n,)``; NaN where pending or failed."""
+        return np.array(self._values)

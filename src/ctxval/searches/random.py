@@ -1,0 +1,35 @@
+"""The paper's two random baselines (Sec. IV-A)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.errors import InputError
+from ctxval.searches.base import SequentialSearch
+
+
+class Random(SequentialSearch):
+    """Independent uniform points: scenario optimisation, SC. Its estimate of d* is the largest distance."""
+
+    iid = True
+
+    def propose(self, rng: np.random.Generator) -> Array:
+        """Return a uniform draw."""
+        return rng.random(self.dimension)
+
+
+class SamplingDiscarding(Random):
+    """Independent uniform points of which the largest are left out: sampling and discarding, SD.
+
+    Args:
+        discard: how many of the largest distances the estimate of d* leaves out, the paper's k.
+
+    Raises:
+        InputError: it is negative.
+    """
+
+    def __init__(self, discard: int = 5) -> None:
+        if discard < 0:
+            raise InputError(f"discard must not be negative, got {discard}.")
+        self.discard = discard

@@ -1,0 +1,27 @@
+"""A system that is a step function on this computer."""
+
+from __future__ import annotations
+
+from ctxval.controller import Controller
+from ctxval.model import Function, Model, Step
+from ctxval.rollout import rollout
+from ctxval.task import Task
+from ctxval.trajectory import Trajectory
+
+
+class Simulated:
+    """A step function, or a model, as the true system.
+
+    Args:
+        step: ``(x, u) -> x_next``, or an object with such a ``step`` that takes batches.
+        vectorized: whether a plain function takes batches ``(..., n)``, ``(..., m)`` too.
+    """
+
+    batched = True
+
+    def __init__(self, step: Step | Model, *, vectorized: bool = False) -> None:
+        self.model = step if isinstance(step, Model) else Function(step, vectorized=vectorized)
+
+    def execute(self, controller: Controller, task: Task) -> Trajectory:
+        """Run the closed loop from the task's initial state over its horizon."""
+        return rollout(self.model.step, controller, task)

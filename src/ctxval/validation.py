@@ -1,0 +1,264 @@
+"""The pure map from task parameters to the distance d(p) (lines 6 to 9 of the paper's Algorithm 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ctxval.arrays import Array, ArrayLike, as_floats, require_shape
+from ctxval.controller import Controller, Synthesizer
+from ctxval.describe import describe
+from ctxval.distance import Distance
+from ctxval.errors import (
+    CtxvalError,
+    DesignError,
+    DistanceError,
+    ExecutionError,
+    InputError,
+    ModelError,
+    ShapeError,
+)
+from ctxval.model import Model, Step, as_model
+from ctxval.rollout import rollout
+from ctxval.space import Parameters, TaskSpace
+from ctxval.system import System
+from ctxval.task import Task
+from ctxval.trajectory import COMPLETE, Trajectory
+
+_CHUNK = 4096
+"""Tasks in one batched call: enough to be fast, few enough for memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Everything about a task that can be known before S is executed; one task or a batch.
+
+    Attributes:
+        parameters: p.
+        task: the task g_p.
+        controller: pi(x; g_p, M).
+        model_trajectory: the closed loop on the model.
+    """
+
+    parameters: Parameters
+    task: Task
+    controller: Controller
+    model_trajectory: Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A plan after the execution of S.
+
+    Attributes:
+        plan: what was known before.
+        system_trajectory: the closed loop on the system.
+        distance: d(p).
+    """
+
+    plan: Plan
+    system_trajectory: Trajectory
+    distance: float
+
+
+class Validation:
+    """A system, a model of it, and what the model is for: the map p -> d(p).
+
+    Args:
+        space: the task space P.
+        task: ``p -> Task``; called with named parameters, of one task or of a batch.
+        system: the true system S.
+        model: the model M, or a function ``(x, u) -> x_next``.
+        synthesizer: how controllers are designed on M.
+        distance: d between the trajectories of M and S.
+
+    Raises:
+        InputError: one of them is not what it should be; the message says which and what is missing.
+    """
+
+    def __init__(
+        self,
+        *,
+        space: TaskSpace,
+        task: Callable[[Parameters], Task],
+        system: System,
+        model: Model | Step,
+        synthesizer: Synthesizer,
+        distance: Distance,
+    ) -> None:
+        _require("space", space, isinstance(space, TaskSpace), "a TaskSpace")
+        _require("task", task, callable(task), "a function p -> Task")
+        _require("system", system, isinstance(system, System), "a System with execute(controller, task)")
+        _require(
+            "synthesizer", synthesizer, isinstance(synthesizer, Synthesizer), "a Synthesizer with design(task, model)"
+        )
+        _require(
+            "distance", distance, callable(distance), "a function (model_trajectory, system_trajectory, task) -> d"
+        )
+        self.space = space
+        self.task = task
+        self.system = system
+        self.model = as_model(model)
+        self.synthesizer = synthesizer
+        self.distance = distance
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this validation in a store."""
+        parts = ("space", "task", "system", "model", "synthesizer", "distance")
+        return {part: describe(getattr(self, part)) for part in parts}
+
+    # One task, step by step
+
+    def plan(self, point: ArrayLike) -> Plan:
+        """Design the controller for the task at ``(d,)`` and run it on the model; S is not touched.
+
+        Raises:
+            InputError: the task function does not make one task of the point.
+            DesignError: the synthesizer failed.
+            ModelError: the model failed or its closed loop is not finite.
+        """
+        plan = self._plan(self.space.parameters(point))
+        if plan.task.batch_shape:
+            raise ShapeError(f"the task function made a batch of shape {plan.task.batch_shape} of one point.")
+        if not plan.model_trajectory.finite:
+            where = self.space.describe_point(plan.parameters.points)
+            raise ModelError(f"the model's closed loop {plan.model_trajectory.ended} for the task {where}.")
+        return plan
+
+    def execute(self, plan: Plan) -> Trajectory:
+        """Execute S once.
+
+        Raises:
+            ExecutionError: the system raised, or its trajectory is not whole and finite; the message says why.
+        """
+        try:
+            trajectory = self.system.execute(plan.controller, plan.task)
+        except Exception as error:
+            raise ExecutionError(_reason(error)) from error
+        require_execution(plan, trajectory)
+        return trajectory
+
+    def measure(self, plan: Plan, trajectory: Trajectory) -> float:
+        """Return d(p).
+
+        Raises:
+            DistanceError: the distance raised, or is no finite number that is not negative.
+        """
+        value = self._distance(plan, trajectory)
+        if value.shape != () or not np.isfinite(value) or value < 0:
+            where = self.space.describe_point(plan.parameters.points)
+            raise DistanceError(f"the distance must be one finite number >= 0, got {value} for the task {where}.")
+        return float(value)
+
+    def outcome(self, point: ArrayLike) -> Outcome:
+        """Plan, execute and measure the task at ``(d,)``."""
+        plan = self.plan(point)
+        trajectory = self.execute(plan)
+        return Outcome(plan, trajectory, self.measure(plan, trajectory))
+
+    # Many tasks
+
+    @property
+    def batched(self) -> bool:
+        """Whether system and synthesizer take a batch of tasks in one call."""
+        return bool(getattr(self.system, "batched", False) and getattr(self.synthesizer, "batched", False))
+
+    def distances(self, points: ArrayLike) -> Array:
+        """Return d at points ``(N, d)``, shape ``(N,)``; NaN where the execution fails. Executes S N times.
+
+        Raises:
+            InputError, DesignError, ModelError: as in :meth:`plan`.
+            DistanceError: the distance raised or has the wrong shape.
+        """
+        rows = require_shape("points", as_floats("points", points), (self.space.dimension,))
+        if not self.batched:
+            return np.array([self._distance_or_nan(row) for row in rows])
+        chunks = [rows[i : i + _CHUNK] for i in range(0, len(rows), _CHUNK)]
+        return np.concatenate([self._batch_distances(chunk) for chunk in chunks])
+
+    def _distance_or_nan(self, point: Array) -> float:
+        try:
+            return self.outcome(point).distance
+        except ExecutionError:
+            return np.nan
+
+    def _batch_distances(self, points: Array) -> Array:
+        plan = self._plan(self.space.parameters(points))
+        if plan.task.batch_shape != (len(points),):
+            raise ShapeError(
+                f"the task function must make a batch of {len(points)} tasks of as many points, "
+                f"got shape {plan.task.batch_shape}; use the parameters in the task, or broadcast them."
+            )
+        if not plan.model_trajectory.finite.all():
+            where = self.space.describe_point(points[np.argmin(plan.model_trajectory.finite)])
+            raise ModelError(f"the model's closed loop is not finite for the task {where}.")
+        trajectory = self.system.execute(plan.controller, plan.task)
+        with np.errstate(all="ignore"):
+            values = np.broadcast_to(self._distance(plan, trajectory), len(points))
+        return np.where(trajectory.finite & np.isfinite(values), values, np.nan)
+
+    # What both share
+
+    def _plan(self, parameters: Parameters) -> Plan:
+        task = self._task(parameters)
+        try:
+            controller = self.synthesizer.design(task, self.model)
+        except CtxvalError:
+            raise
+        except Exception as error:
+            raise DesignError(f"the synthesizer failed: {_reason(error)}.") from error
+        try:
+            trajectory = rollout(self.model.step, controller, task)
+        except CtxvalError:
+            raise
+        except Exception as error:
+            raise ModelError(f"the closed loop on the model failed: {_reason(error)}.") from error
+        return Plan(parameters, task, controller, trajectory)
+
+    def _task(self, parameters: Parameters) -> Task:
+        try:
+            task = self.task(parameters)
+        except CtxvalError:
+            raise
+        except Exception as error:
+            raise InputError(f"the task function failed: {_reason(error)}.") from error
+        _require("the task function's result", task, isinstance(task, Task), "a Task")
+        return task
+
+    def _distance(self, plan: Plan, trajectory: Trajectory) -> Array:
+        try:
+            return np.asarray(self.distance(plan.model_trajectory, trajectory, plan.task), dtype=np.float64)
+        except Exception as error:
+            raise DistanceError(f"the distance failed: {_reason(error)}.") from error
+
+
+def require_execution(plan: Plan, trajectory: Trajectory) -> None:
+    """Check that a trajectory is a whole and finite execution of the plan.
+
+    Raises:
+        ExecutionError: it is not; the message says why.
+    """
+    if not isinstance(trajectory, Trajectory):
+        raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
+    expected = plan.model_trajectory
+    if trajectory.ended != COMPLETE:
+        raise ExecutionError(trajectory.ended)
+    if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:
+        raise ExecutionError(
+            f"the system returned states {trajectory.states.shape} and inputs {trajectory.inputs.shape} "
+            f"where {expected.states.shape} and {expected.inputs.shape} were expected"
+        )
+    if not trajectory.finite:
+        raise ExecutionError("the system's trajectory is not finite")
+
+
+def _require(name: str, value: object, valid: bool, wanted: str) -> None:
+    if not valid:
+        raise InputError(f"{name} must be {wanted}, got {value!r}.")
+
+
+def _reason(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
