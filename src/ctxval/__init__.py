@@ -7,9 +7,10 @@ Sangiovanni-Vincentelli, Seshia and Tomlin).
 from ctxval.campaign import Campaign, OpenTrial
 from ctxval.experiment import Experiment
 from ctxval.space import Parameters, TaskSpace
-from ctxval.store import Store, Trial
+from ctxval.store import Store
 from ctxval.task import Task
 from ctxval.trajectory import Trajectory, Transitions
+from ctxval.trial import Trial
 from ctxval.truth import Truth, grid_truth
 from ctxval.validation import Outcome, Plan, Validation
 from ctxval.verdict import Verdict

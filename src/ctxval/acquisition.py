@@ -18,8 +18,8 @@ class Acquisition(Protocol):
     def __call__(self, X: Array) -> Array:
         """Return the values at points ``(m, d)`` of the unit cube, shape ``(m,)``."""
 
-    def gradient(self, X: Array) -> Array:
-        """Return the gradients of the values, shape ``(m, d)``."""
+    def with_gradient(self, X: Array) -> tuple[Array, Array]:
+        """Return the values ``(m,)`` and their gradients ``(m, d)``."""
 
 
 _DISTINCT = 1e-6
@@ -42,13 +42,13 @@ class UpperConfidenceBound:
         mean, variance = self.process.predict(X)
         return np.asarray(mean + np.sqrt(self.beta * variance))
 
-    def gradient(self, X: Array) -> Array:
-        """Return the gradient of the bound, shape ``(m, d)``; that of the mean where the variance vanishes."""
-        _, variance = self.process.predict(X)
-        d_mean, d_variance = self.process.predict_gradient(X)
+    def with_gradient(self, X: Array) -> tuple[Array, Array]:
+        """Return the bound ``(m,)`` and its gradient ``(m, d)``; that of the mean where the variance vanishes."""
+        mean, variance, d_mean, d_variance = self.process.predict_with_gradient(X)
         sigma = np.sqrt(variance)[:, None]
         d_sigma = np.divide(d_variance, 2 * sigma, out=np.zeros_like(d_mean), where=sigma > 0)
-        return np.asarray(d_mean + np.sqrt(self.beta) * d_sigma)
+        value = mean + np.sqrt(self.beta) * sigma[:, 0]
+        return np.asarray(value), np.asarray(d_mean + np.sqrt(self.beta) * d_sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +65,10 @@ class Uncertainty:
         """Return the variance at ``(m, d)``, shape ``(m,)``."""
         return self.process.predict(X)[1]
 
-    def gradient(self, X: Array) -> Array:
-        """Return the gradient of the variance, shape ``(m, d)``."""
-        return self.process.predict_gradient(X)[1]
+    def with_gradient(self, X: Array) -> tuple[Array, Array]:
+        """Return the variance ``(m,)`` and its gradient ``(m, d)``."""
+        _, variance, _, d_variance = self.process.predict_with_gradient(X)
+        return variance, d_variance
 
 
 def maximise(acquisition: Acquisition, dimension: int, known: Array, rng: np.random.Generator) -> Array:
@@ -108,11 +109,11 @@ def _climb(acquisition: Acquisition, starts: Array) -> Array:
     """Climb from all starts at once: their sum is separable, so one quasi-Newton search serves them all."""
 
     def negative(flat: Array) -> tuple[float, Array]:
-        X = flat.reshape(starts.shape)
-        return -float(acquisition(X).sum()), -acquisition.gradient(X).ravel()
+        values, gradients = acquisition.with_gradient(flat.reshape(starts.shape))
+        return -float(values.sum()), -gradients.ravel()
 
     bounds = [(0.0, 1.0)] * starts.size
-    result = minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 30})
+    result = minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 20})
     return np.asarray(np.clip(result.x, 0.0, 1.0).reshape(starts.shape))
 
 

@@ -67,7 +67,7 @@ def as_weight(name: str, value: ArrayLike) -> Array:
     array = as_finite(name, value)
     if array.ndim == 1:
         array = np.diag(array)
-    if array.ndim != 2 or array.shape[0] != array.shape[1]:
+    if array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
         raise ShapeError(f"{name} must be a diagonal or a square matrix, got shape {array.shape}.")
     scale = max(1.0, float(np.abs(array).max(initial=0.0)))
     if not np.allclose(array, array.T, rtol=0, atol=1e-10 * scale):

@@ -14,10 +14,10 @@ from ctxval.arrays import Array
 from ctxval.describe import describe
 from ctxval.errors import CtxvalError, DistanceError, ExecutionError, InputError
 from ctxval.searches import GPUCB, Search
-from ctxval.searches.base import Origin
-from ctxval.store import Store, Trial
+from ctxval.store import Store
 from ctxval.surrogate import Surrogate, fit_surrogate
 from ctxval.trajectory import Trajectory
+from ctxval.trial import Origin, Trial
 from ctxval.validation import Plan, Validation, require_execution
 from ctxval.verdict import Verdict, judge
 

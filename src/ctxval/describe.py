@@ -20,6 +20,8 @@ def describe(value: Any, depth: int = _DEPTH) -> Any:
     """Return what identifies an object, as JSON: its type and its public values, or what its ``describe()`` says."""
     if isinstance(value, str | int | bool | type(None)):
         return value
+    if isinstance(value, np.bool_):
+        return bool(value)
     if isinstance(value, float | np.number):
         return float(value) if math.isfinite(value) else str(value)
     if depth == 0:
@@ -28,7 +30,10 @@ def describe(value: Any, depth: int = _DEPTH) -> Any:
         return _describe_array(value)
     if isinstance(value, Mapping):
         return {str(key): describe(item, depth - 1) for key, item in value.items()}
-    if isinstance(value, Sequence | set | frozenset):
+    if isinstance(value, set | frozenset):
+        # Sorted: the order of a set of strings changes from process to process.
+        return sorted((describe(item, depth - 1) for item in value), key=repr)
+    if isinstance(value, Sequence):
         return [describe(item, depth - 1) for item in value]
     if inspect.isroutine(value) or isinstance(value, functools.partial | type):
         return _describe_callable(value, depth)
@@ -93,7 +98,8 @@ def first_difference(stored: Any, present: Any, path: str = "") -> str | None:
 
 def _same(stored: Any, present: Any) -> bool:
     if isinstance(stored, int | float) and isinstance(present, int | float):
-        return math.isclose(stored, present, rel_tol=_TOLERANCE, abs_tol=1e-9)
+        both_nan = math.isnan(stored) and math.isnan(present)
+        return both_nan or math.isclose(stored, present, rel_tol=_TOLERANCE, abs_tol=1e-9)
     return bool(stored == present)
 
 

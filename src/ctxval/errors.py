@@ -15,7 +15,8 @@
     │   ├── StoreAccessError                the file cannot be opened, read or written
     │   ├── ForeignStoreError               the file is not a store that this version can read
     │   └── StoreMismatchError              the store was made by another experiment
-    └── CampaignError                       the campaign cannot go on
+    ├── CampaignError                       the campaign cannot go on
+    └── ConformanceError (also AssertionError)  an own part breaks the contract of its protocol
 """
 
 from __future__ import annotations
@@ -86,3 +87,7 @@ class StoreMismatchError(StoreError):
 
 class CampaignError(CtxvalError):
     """The campaign cannot go on."""
+
+
+class ConformanceError(CtxvalError, AssertionError):
+    """An own model, system, synthesizer, distance or search breaks the contract of its protocol."""

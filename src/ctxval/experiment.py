@@ -20,6 +20,7 @@ class Experiment:
         threshold: tau, unless said otherwise; no verdict without one.
         truth: finds d*, for simulated systems.
         units: the distance's units.
+        states, inputs: names of the states and inputs with their units, for pictures.
     """
 
     name: str
@@ -28,3 +29,5 @@ class Experiment:
     threshold: float | None = None
     truth: Callable[[], Truth] | None = None
     units: str = ""
+    states: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
@@ -21,6 +22,11 @@ LogPrior = Callable[[Array], tuple[float, Array]]
 
 NOISE = 1e-6
 """The least noise variance, for values of unit variance: it keeps the Cholesky factor safe."""
+
+_IMPOSSIBLE = 1e25
+_MANY = 30
+"""Beyond so many observations the likelihood has one clear mode, and one climb finds it."""
+_SMOOTHNESS = np.array([0.25, 0.5, 0.75])
 
 
 def zero_mean(X: Array) -> Array:
@@ -59,12 +65,18 @@ class GaussianProcess:
 
     def predict_gradient(self, X: Array) -> tuple[Array, Array]:
         """Return the gradients of posterior mean and variance with respect to the points, shapes ``(m, d)``."""
+        return self.predict_with_gradient(X)[2:]
+
+    def predict_with_gradient(self, X: Array) -> tuple[Array, Array, Array, Array]:
+        """Return mean and variance ``(m,)`` and their gradients ``(m, d)``, for less than the two one by one."""
         k = self.kernel(self.theta, X, self.X)
         dk = self.kernel.input_gradient(self.theta, X, self.X)
         weights = _solve(self.L, k.T).T
-        d_mean = np.einsum("mnd,n->md", dk, self.alpha)
-        d_variance = self.kernel.diagonal_input_gradient(self.theta, X) - 2 * np.einsum("mnd,mn->md", dk, weights)
-        return d_mean + _mean_gradient(self.mean, X), d_variance
+        variance = np.maximum(self.kernel.diagonal(self.theta, X) - (k * weights).sum(axis=1), 0.0)
+        d_mean = (dk.transpose(0, 2, 1) @ self.alpha) + _mean_gradient(self.mean, X)
+        pull = (dk.transpose(0, 2, 1) @ weights[:, :, None])[:, :, 0]
+        d_variance = self.kernel.diagonal_input_gradient(self.theta, X) - 2 * pull
+        return self.mean(X) + k @ self.alpha, variance, d_mean, d_variance
 
     def log_marginal_likelihood(self) -> float:
         """Return log p(y | X, theta)."""
@@ -101,7 +113,7 @@ def _factor(kernel: Kernel, theta: Array, noise: float, X: Array) -> Array:
     covariance = kernel(theta, X, X)
     covariance[np.diag_indices_from(covariance)] += noise
     L, info = dpotrf(covariance, lower=1, clean=1)
-    if info:
+    if info or np.isnan(np.trace(L)):  # some LAPACKs let NaN pass
         raise InputError(f"the covariance of {len(X)} observations is not positive definite; raise the noise.")
     return np.asarray(L)
 
@@ -113,8 +125,10 @@ def _solve(L: Array, right: Array) -> Array:
 
 def _inverse(L: Array) -> Array:
     """Return ``(L L')^-1``."""
-    lower = dpotri(L, lower=1)[0]
-    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+    lower = dpotri(L, lower=1)[0]  # L is zero above its diagonal, and stays so
+    inverse = lower + lower.T
+    inverse[np.diag_indices_from(inverse)] *= 0.5
+    return np.asarray(inverse)
 
 
 def _log_likelihood(L: Array, alpha: Array, residual: Array) -> float:
@@ -131,8 +145,9 @@ def log_marginal_likelihood(
     """
     L = _factor(kernel, theta, noise, X)
     alpha = _solve(L, residual)
-    inverse = _inverse(L)
-    W = 0.5 * (np.outer(alpha, alpha) - inverse)
+    W = _inverse(L)
+    W -= np.outer(alpha, alpha)
+    W *= -0.5
     gradient = kernel.weighted_gradient(theta, X, W)
     return _log_likelihood(L, alpha, residual), np.append(gradient, noise * np.trace(W))
 
@@ -165,30 +180,30 @@ def fit(
     residual = y - mean(X)
 
     def negative(parameters: Array) -> tuple[float, Array]:
+        theta, variance = parameters[:-1], float(np.exp(parameters[-1]))
         try:
-            value, gradient = log_marginal_likelihood(
-                kernel, parameters[:-1], float(np.exp(parameters[-1])), X, residual
-            )
+            value, gradient = log_marginal_likelihood(kernel, theta, variance, X, residual)
         except InputError:
-            return 1e25, np.zeros_like(parameters)
+            return _IMPOSSIBLE, np.zeros_like(parameters)
         if log_prior is not None:
             prior, prior_gradient = log_prior(parameters)
             value, gradient = value + prior, gradient + prior_gradient
         return -value, -gradient
 
-    best, best_value = None, np.inf
-    for start in _default_starts(bounds) if starts is None else starts:
-        result = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 50})
-        if best is None or result.fun < best_value:
-            best, best_value = result.x, result.fun
-    assert best is not None  # there is at least one start
+    starts = _default_starts(bounds) if starts is None else starts
+    if len(X) > _MANY:
+        starts = starts[[np.argmin([negative(start)[0] for start in starts])]]
+    options: Any = {"maxiter": 50, "ftol": 1e-7}
+    climbs = [
+        minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options) for start in starts
+    ]
+    best = min(climbs, key=lambda climb: float(climb.fun)).x
     return condition(kernel, best[:-1], X, y, noise=float(np.exp(best[-1])), mean=mean)
 
 
 def _default_starts(bounds: list[tuple[float, float]]) -> Array:
-    """Return three starts between the bounds: rough, middling and smooth functions, of middling variance."""
+    """Return starts for rough, middling and smooth functions of middling variance."""
     low, high = np.array(bounds).T
-    middle = 0.5 * (low + high)
-    starts = np.tile(middle, (3, 1))
-    starts[:, 1:-1] = low[1:-1] + np.array([[0.25], [0.5], [0.75]]) * (high[1:-1] - low[1:-1])
+    starts = np.tile(0.5 * (low + high), (len(_SMOOTHNESS), 1))
+    starts[:, 1:-1] = low[1:-1] + _SMOOTHNESS[:, None] * (high - low)[1:-1]
     return starts

@@ -84,13 +84,15 @@ class Matern:
         Y = X / scales
         r = cdist(Y, Y)
         variance = np.exp(theta[0])
-        by_variance = variance * (W * self._profile(r)).sum()
+        profile, slope = self._profile_and_slope(r)
+        by_variance = variance * np.vdot(W, profile)
         # dk/d log l_j = slope(r) * (y_ij - y_kj)^2; the sum over pairs is a quadratic form, without (n, n, d) storage.
-        G = variance * W * self._slope(r)
+        G = W * slope
+        G *= variance
         if self.ard:
             by_scales = 2 * ((G.sum(axis=1)[:, None] * Y**2).sum(axis=0) - (Y * (G @ Y)).sum(axis=0))
         else:
-            by_scales = np.array([(G * r**2).sum()])
+            by_scales = np.array([np.vdot(G, r**2)])
         return np.concatenate([[by_variance], by_scales])
 
     def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
@@ -106,16 +108,18 @@ class Matern:
 
     def _profile(self, r: Array) -> Array:
         """Return k(r) for unit variance and length-scale."""
-        s = np.sqrt(2 * self.nu) * r
-        polynomial = 1 + s if self.nu == 1.5 else 1 + s + s**2 / 3
-        return np.asarray(polynomial * np.exp(-s))
+        return self._profile_and_slope(r)[0]
 
     def _slope(self, r: Array) -> Array:
         """Return ``-k'(r) / r``, which is finite at r = 0."""
+        return self._profile_and_slope(r)[1]
+
+    def _profile_and_slope(self, r: Array) -> tuple[Array, Array]:
         s = np.sqrt(2 * self.nu) * r
+        decay = np.exp(-s)
         if self.nu == 1.5:
-            return np.asarray(3 * np.exp(-s))
-        return np.asarray(5 / 3 * (1 + s) * np.exp(-s))
+            return (1 + s) * decay, 3 * decay
+        return (1 + s + s**2 / 3) * decay, 5 / 3 * (1 + s) * decay
 
 
 @dataclass(frozen=True)

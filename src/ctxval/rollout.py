@@ -27,7 +27,9 @@ def rollout(step: Step, controller: Controller, task: Task) -> Trajectory:
         inputs = np.empty((task.horizon, *u.shape))
         states[0] = x
         for t in range(task.horizon):
-            inputs[t] = u if t == 0 else controller(t, x)
+            if t:
+                u = _require_input(controller(t, x), inputs[0])
+            inputs[t] = u
             x = step(x, inputs[t])
             _require_state(x, states[t])
             states[t + 1] = x
@@ -39,6 +41,12 @@ def _first_input(controller: Controller, x: Array) -> Array:
     u = np.asarray(controller(0, x), dtype=np.float64)
     if u.shape[:-1] != x.shape[:-1] or u.ndim != x.ndim:
         raise ShapeError(f"the controller must return inputs of shape {(*x.shape[:-1], 'm')}, got {u.shape}.")
+    return u
+
+
+def _require_input(u: Array, first: Array) -> Array:
+    if np.shape(u) != first.shape:
+        raise ShapeError(f"the controller must return inputs of shape {first.shape} at every step, got {np.shape(u)}.")
     return u
 
 

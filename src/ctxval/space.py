@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctxval.arrays import Array, ArrayLike, as_finite, as_floats, require_shape
-from ctxval.errors import InputError, UnknownNameError
+from ctxval.errors import InputError, ShapeError, UnknownNameError
 
 Point = float | list[float]
 
@@ -138,11 +138,15 @@ class TaskSpace:
 
         Raises:
             UnknownNameError: a name is not of this space.
+            ShapeError: a value has not the shape of its parameter.
             InputError: a name is missing, or a value is outside the box.
         """
         point = np.full(self.dimension, np.nan)
         for name, value in values.items():
-            point[self.columns(name)] = as_finite(name, value)
+            columns, given = self.columns(name), as_finite(name, value)
+            if given.shape != np.shape(point[columns]):
+                raise ShapeError(f"{name} must have shape {np.shape(point[columns])}, got {given.shape}.")
+            point[columns] = given
         missing = [name for name, value in zip(self.names, point, strict=True) if np.isnan(value)]
         if missing:
             raise InputError(f"no value is given for {', '.join(missing)}.")

@@ -6,21 +6,17 @@ import json
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from ctxval.arrays import Array
 from ctxval.describe import first_difference
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
-from ctxval.searches.base import Origin
-from ctxval.space import Point
 from ctxval.trajectory import Trajectory
+from ctxval.trial import Trial
 
-State = Literal["open", "completed", "failed"]
 Side = Literal["model", "system"]
 
 _APPLICATION = 0x63747876  # "ctxv" in SQLite's application_id: how a file says that it is one of ours
@@ -54,35 +50,6 @@ _MIGRATIONS = (
         """,
     ),
 )
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """One p with everything known of it.
-
-    Attributes:
-        number: from 0, in the order of asking.
-        origin: why it was chosen: iid, initial, acquisition or manual.
-        state: open, completed or failed.
-        unit_point: p in the unit cube, shape ``(d,)``.
-        parameters: p by name.
-        attempts: how often its execution was started.
-        executed: whether an execution of S ended, well or badly; this is what the budget counts.
-        distance: d(p), if completed.
-        failure: why it failed, if it did.
-        seconds: how long the execution took.
-    """
-
-    number: int
-    origin: Origin
-    state: State
-    unit_point: Array
-    parameters: dict[str, Point]
-    attempts: int = 0
-    executed: bool = False
-    distance: float | None = None
-    failure: str | None = None
-    seconds: float | None = None
 
 
 class Store:

@@ -50,7 +50,12 @@ class Task:
             target = np.zeros((1, n))
         if not (np.isfinite(state).all() and np.isfinite(target).all()):
             raise InputError("a task must have a finite initial_state and a finite goal or reference.")
-        self.batch_shape: tuple[int, ...] = np.broadcast_shapes(state.shape[:-1], target.shape[:-2])
+        try:
+            self.batch_shape: tuple[int, ...] = np.broadcast_shapes(state.shape[:-1], target.shape[:-2])
+        except ValueError:
+            raise ShapeError(
+                f"goal or reference are of a batch {target.shape[:-2]}, initial_state of another, {state.shape[:-1]}."
+            ) from None
         self.initial_state: Array = np.broadcast_to(state, (*self.batch_shape, n))
         """Shape ``(..., n)``."""
         self.reference: Array = np.broadcast_to(target, (*self.batch_shape, self.horizon + 1, n))
@@ -70,6 +75,15 @@ class Task:
         """Return one task of the batch."""
         return Task(self.initial_state[index], horizon=self.horizon, dt=self.dt, reference=self.reference[index])
 
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies one task in a store."""
+        return {
+            "horizon": self.horizon,
+            "dt": self.dt,
+            "initial_state": self.initial_state.tolist(),
+            "reference": self.reference,
+        }
+
     def __repr__(self) -> str:
         return (
             f"Task(batch={self.batch_shape}, states={self.initial_state.shape[-1]}, "
@@ -80,7 +94,10 @@ class Task:
 def _components(name: str, value: Any) -> Array:
     if isinstance(value, list | tuple) and len(value):
         parts = [as_floats(f"{name}[{i}]", part) for i, part in enumerate(value)]
-        return np.stack(np.broadcast_arrays(*parts), axis=-1)
+        try:
+            return np.stack(np.broadcast_arrays(*parts), axis=-1)
+        except ValueError:
+            raise ShapeError(f"components of {name} do not fit: shapes {[part.shape for part in parts]}.") from None
     array = as_floats(name, value)
     if array.ndim == 0 or array.size == 0:
         raise ShapeError(f"{name} must be a list of components or an array (..., n), got {value!r}.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,9 @@ from ctxval.arrays import Array, as_floats
 from ctxval.errors import InputError, ShapeError
 
 COMPLETE = "complete"
+
+_UNREADABLE = (OSError, EOFError, ValueError, TypeError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What numpy and zipfile raise for damaged or foreign bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +154,7 @@ class Trajectory:
             with np.load(handle, allow_pickle=False) as arrays:
                 ended = str(arrays["ended"]) if "ended" in arrays else COMPLETE
                 return Trajectory(arrays["times"], arrays["states"], arrays["inputs"], ended)
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except _UNREADABLE as error:
             if isinstance(error, InputError):
                 raise
             name = "these bytes" if isinstance(source, bytes) else str(source)

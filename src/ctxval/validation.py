@@ -108,7 +108,10 @@ class Validation:
     def describe(self) -> dict[str, Any]:
         """Return what identifies this validation in a store."""
         parts = ("space", "task", "system", "model", "synthesizer", "distance")
-        return {part: describe(getattr(self, part)) for part in parts}
+        # A function's name says nothing of the constants in it, three of its tasks do.
+        probes = np.stack([self.space.low, 0.5 * (self.space.low + self.space.high), self.space.high])
+        tasks = [describe(self._task(self.space.parameters(point))) for point in probes]
+        return {**{part: describe(getattr(self, part)) for part in parts}, "tasks": tasks}
 
     # One task, step by step
 
@@ -197,7 +200,9 @@ class Validation:
             raise ModelError(f"the model's closed loop is not finite for the task {where}.")
         trajectory = self.system.execute(plan.controller, plan.task)
         with np.errstate(all="ignore"):
-            values = np.broadcast_to(self._distance(plan, trajectory), len(points))
+            values = self._distance(plan, trajectory)
+        if values.shape != (len(points),):
+            raise DistanceError(f"the distance must have shape ({len(points)},) over the batch, got {values.shape}.")
         return np.where(trajectory.finite & np.isfinite(values), values, np.nan)
 
     # What both share

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ctxval.errors import InputError
-from ctxval.store import Trial
+from ctxval.trial import Trial
 
 Answer = Literal["validated", "falsified", "undecided"]
 

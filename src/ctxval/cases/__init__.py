@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 from typing import Any
 
-from ctxval.errors import InputError, UnknownNameError
+from ctxval.errors import UnknownNameError
 from ctxval.experiment import Experiment
 
 NAMES: dict[str, str] = {
     "pendulum": "inverted pendulum, learned linear model, iLQR to a goal angle (1-D)",
+    "linear": "random linear systems and models with n = 1 to 10 states, random feedback (2 n-D)",
 }
 """The cases that the command line knows, and what each is."""
 
@@ -20,14 +22,15 @@ def by_name(name: str, seed: int = 0, **options: Any) -> Experiment:
     """Return a case; its seed draws the data and so the model.
 
     Raises:
-        UnknownNameError: there is no such case; the message has the nearest name.
-        InputError: the case does not take these options.
+        UnknownNameError: there is no such case, or it has no such option; the message has the nearest name.
+        InputError: the value of an option is not allowed.
     """
     if name not in NAMES:
         raise UnknownNameError.among("case", name, NAMES)
     build = importlib.import_module(f"ctxval.cases.{name}").experiment
-    try:
-        case: Experiment = build(seed, **options)
-    except TypeError as error:
-        raise InputError(f"case {name!r}: {error}.") from error
+    taken = list(inspect.signature(build).parameters)[1:]
+    for option in options:
+        if option not in taken:
+            raise UnknownNameError.among(f"option of the case {name!r}", option, taken)
+    case: Experiment = build(seed, **options)
     return case

@@ -103,5 +103,12 @@ def experiment(seed: int = 0, pendulum: Pendulum | None = None, settings: Settin
         distance=distances.FinalState(norm=1),
     )
     return Experiment(
-        "pendulum", validation, budget=25, threshold=0.5, truth=lambda: grid_truth(validation), units="rad"
+        "pendulum",
+        validation,
+        budget=25,
+        threshold=0.5,
+        truth=lambda: grid_truth(validation),
+        units="rad",
+        states=("angle [rad]", "rate [rad/s]"),
+        inputs=("torque [N m]",),
     )

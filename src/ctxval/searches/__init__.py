@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from ctxval.errors import InputError, UnknownNameError
-from ctxval.searches.base import Origin, Search, SequentialSearch
+from ctxval.searches.base import Search, SequentialSearch
 from ctxval.searches.gp_ucb import GPUCB
 from ctxval.searches.random import Random, SamplingDiscarding
 
-__all__ = ["GPUCB", "NAMES", "Origin", "Random", "SamplingDiscarding", "Search", "SequentialSearch", "by_name"]
+__all__ = ["GPUCB", "NAMES", "Random", "SamplingDiscarding", "Search", "SequentialSearch", "by_name"]
 
 NAMES: dict[str, type[Any]] = {
     "gp-ucb": GPUCB,

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from ctxval.arrays import Array, ArrayLike, as_floats
 from ctxval.errors import InputError, ShapeError
-
-Origin = Literal["iid", "initial", "acquisition", "manual"]
-"""Why a trial was chosen."""
-
 
 @runtime_checkable
 class Search(Protocol):

@@ -1,0 +1,48 @@
+# The two commands of the README: `make demo` and `make test`. Both make a .venv by themselves.
+PYTHON ?= python3
+BIN := .venv/bin
+KILLS ?= 50
+
+# Small dense algebra is faster on one thread.
+export OMP_NUM_THREADS = 1
+
+.PHONY: demo test check reliability bench study pictures clean
+
+demo: .venv/.installed
+	$(BIN)/ctxval run pendulum
+
+test: check
+	$(BIN)/python -m pytest
+
+check: .venv/.test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+reliability: .venv/.test  ## kill -9 and resume, KILLS times
+	$(BIN)/python -m pytest tests/test_kill.py --kills $(KILLS)
+
+bench: .venv/.test  ## speed, as ratios measured in one run
+	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
+
+study: .venv/.test  ## the running example over many seeds; writes docs/main-job.md
+	$(BIN)/python benchmarks/study_main_job.py
+
+pictures: .venv/.installed  ## those of the README
+	$(BIN)/ctxval run pendulum --seed 1 --store docs/pictures/pendulum.sqlite
+	rm docs/pictures/pendulum.sqlite
+
+clean:
+	rm -rf .venv build dist
+
+.venv/bin/python:
+	$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("ctxval needs Python 3.11 or later; say: make PYTHON=python3.11")'
+	$(PYTHON) -m venv .venv
+
+.venv/.installed: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+.venv/.test: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	touch $@ .venv/.installed

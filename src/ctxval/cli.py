@@ -1,0 +1,269 @@
+"""The command line: a thin skin over the public interface."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from ctxval import cases as known_cases
+from ctxval import plot
+from ctxval.campaign import Campaign
+from ctxval.config import Settings, read_settings
+from ctxval.errors import CtxvalError, InputError, StoreError
+from ctxval.experiment import Experiment
+from ctxval.store import Store
+from ctxval.trial import Trial
+from ctxval.truth import Truth
+from ctxval.verdict import Verdict, require_threshold
+
+FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED = 1, 2, 3, 130
+
+app = typer.Typer(
+    name="ctxval",
+    help="Decide whether a learned model of a robot can be trusted for the control tasks it is meant for.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+_out = Console()
+_err = Console(stderr=True)
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+def _command(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Turn ctxval's errors into one sentence and an exit status."""
+
+    @functools.wraps(function)
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return function(*args, **kwargs)
+        except CtxvalError as error:
+            _err.print(f"[bold red]error:[/] {_escaped(str(error))}", highlight=False, soft_wrap=True)
+            raise typer.Exit(BAD_INPUT if isinstance(error, InputError | StoreError) else CANNOT_GO_ON) from None
+        except KeyboardInterrupt:
+            _err.print("stopped; what was executed is stored, run the same command to go on.")
+            raise typer.Exit(INTERRUPTED) from None
+
+    return wrapped
+
+
+@app.command()
+@_command
+def run(
+    target: Annotated[str, typer.Argument(metavar="CASE|FILE.toml|module:attr", help="What to validate.")],
+    budget: Annotated[int | None, typer.Option(help="Executions of the system in all, earlier ones counted.")] = None,
+    search: Annotated[str | None, typer.Option(help="How tasks are chosen: gp-ucb, random, ...")] = None,
+    threshold: Annotated[float | None, typer.Option(help="Largest distance that you can accept.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the data, the model and the search.")] = None,
+    store: Annotated[Path | None, typer.Option(help="File of the trials; it is resumed if it exists.")] = None,
+    truth: Annotated[bool, typer.Option("--truth", help="Find the true maximum too, of a simulated system.")] = False,
+    as_json: AsJson = False,
+    variant: Annotated[str | None, typer.Option(help="Variant of a case.")] = None,
+    model: Annotated[str | None, typer.Option(help="Which learned model of a case.")] = None,
+    dim: Annotated[int | None, typer.Option(help="Number of states of a case.")] = None,
+) -> None:
+    """Search for the task at which the system differs most from its model."""
+    options = {k: v for k, v in {"variant": variant, "model": model, "dim": dim}.items() if v is not None}
+    settings = read_settings(
+        target,
+        {"budget": budget, "search": search, "threshold": threshold, "seed": seed, "store": store, "options": options},
+    )
+    experiment = settings.load()
+    limit = experiment.threshold if settings.threshold is None else require_threshold(settings.threshold)
+    path = settings.store_path(experiment.name)
+    campaign = Campaign(
+        experiment.validation, search=settings.search.build(), store=path, seed=settings.seed, name=experiment.name
+    )
+    total = experiment.budget if settings.budget is None else settings.budget
+    _run_with_progress(campaign, total, show=not as_json)
+    known = _truth(experiment) if truth else None
+    verdict = None if limit is None else campaign.verdict(limit)
+    report = _report(campaign, experiment, settings, total, path, verdict, known)
+    report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path)]
+    if as_json:
+        print(json.dumps(report))
+    else:
+        _print_report(report, verdict)
+    if verdict is not None and verdict.answer == "falsified":
+        raise typer.Exit(FALSIFIED)
+
+
+@app.command()
+@_command
+def status(
+    store: Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials.")],
+    as_json: AsJson = False,
+) -> None:
+    """Say what a store holds; nothing is executed."""
+    opened = Store.existing(store)
+    description, trials = opened.description(), opened.trials()
+    report = {
+        "case": description.get("name"),
+        "search": description.get("search", {}).get("type"),
+        "seed": description.get("seed"),
+        "executions": sum(trial.executed for trial in trials),
+        "failed": sum(trial.state == "failed" for trial in trials),
+        "open": sum(trial.state == "open" for trial in trials),
+        "worst": _worst(
+            max((t for t in trials if t.distance is not None), key=lambda t: t.distance or 0, default=None)
+        ),
+        "store": str(store),
+    }
+    if as_json:
+        print(json.dumps(report))
+    else:
+        _print_table(report)
+
+
+@app.command()
+@_command
+def cases(as_json: AsJson = False) -> None:
+    """List the paper's systems that can be run by name."""
+    if as_json:
+        print(json.dumps(known_cases.NAMES))
+        return
+    _print_table(known_cases.NAMES)
+
+
+def _run_with_progress(campaign: Campaign, budget: int, *, show: bool) -> None:
+    columns = (
+        TextColumn("executions"),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        TextColumn("largest distance {task.fields[best]}  {task.fields[pace]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=_err, disable=not show) as progress:
+        line = progress.add_task("", total=budget, completed=campaign.executions, best="-", pace="")
+
+        def on_trial(trial: Trial) -> None:
+            best = "-" if campaign.worst is None else f"{campaign.worst.distance:.4g}"
+            progress.update(line, completed=campaign.executions, best=best, pace=_pace(trial))
+
+        campaign.run(budget, on_trial)
+
+
+def _pace(trial: Trial) -> str:
+    return "" if trial.seconds is None else f"{trial.seconds:.2g} s/execution"
+
+
+def _truth(experiment: Experiment) -> Truth:
+    if experiment.truth is None:
+        raise InputError(f"the truth of {experiment.name!r} is not known: its system is not simulated here.")
+    return experiment.truth()
+
+
+def _report(
+    campaign: Campaign,
+    experiment: Experiment,
+    settings: Settings,
+    budget: int,
+    path: Path,
+    verdict: Verdict | None,
+    truth: Truth | None,
+) -> dict[str, Any]:
+    report: dict[str, Any] = {
+        "case": experiment.name,
+        **({"options": settings.options} if settings.options else {}),
+        "search": settings.search.name,
+        "seed": settings.seed,
+        "budget": budget,
+        "executions": campaign.executions,
+        "failed": len(campaign.failed),
+        "worst": _worst(campaign.worst),
+        "estimate": campaign.estimate,
+        "units": experiment.units,
+        "verdict": None if verdict is None else verdict.answer,
+        "reason": None if verdict is None else verdict.reason,
+        "threshold": None if verdict is None else verdict.threshold,
+        "store": str(path),
+    }
+    if truth is not None:
+        task = campaign.validation.space.describe_point(truth.parameters.points)
+        report["truth"] = {"distance": truth.distance, "task": task, "method": truth.method}
+        estimate = campaign.estimate
+        report["error_percent"] = None if estimate is None else 100 * (truth.distance - estimate) / truth.distance
+    return report
+
+
+def _worst(trial: Trial | None) -> dict[str, Any] | None:
+    return None if trial is None else {"task": trial.parameters, "distance": trial.distance}
+
+
+def _save_pictures(campaign: Campaign, experiment: Experiment, path: Path) -> list[Path]:
+    if campaign.worst is None:
+        return []
+    drawn = [
+        plot.save(
+            plot.worst_trajectories(campaign, states=experiment.states, inputs=experiment.inputs),
+            path.with_suffix(".worst.png"),
+        )
+    ]
+    if len(campaign.completed) >= 2:
+        figure = plot.surrogate(campaign, truth=_true_curve(experiment), units=experiment.units)
+        drawn.append(plot.save(figure, path.with_suffix(".surrogate.png")))
+    return drawn
+
+
+def _true_curve(experiment: Experiment) -> plot.Curve | None:
+    """Return the distance on a grid, where that is cheap: a simulated system over one parameter."""
+    space = experiment.validation.space
+    if experiment.truth is None or space.dimension > 1:
+        return None
+    points = space.grid(401)
+    return plot.Curve(points[:, 0], experiment.validation.distances(points))
+
+
+def _print_report(report: dict[str, Any], verdict: Verdict | None) -> None:
+    shown = {key: value for key, value in report.items() if key not in ("verdict", "reason", "threshold", "units")}
+    _print_table(shown, units=report["units"])
+    if verdict is not None:
+        _out.print(
+            f"[bold]{verdict.answer}[/] against {verdict.threshold:g}: {_escaped(verdict.reason)}", highlight=False
+        )
+
+
+def _print_table(rows: dict[str, Any], units: str = "") -> None:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for key, value in rows.items():
+        table.add_row(key.replace("_", " "), _escaped(_text(value, units)))
+    _out.print(table, highlight=False)
+
+
+def _text(value: Any, units: str) -> str:
+    match value:
+        case None:
+            return "-"
+        case float():
+            return f"{value:.4g}"
+        case list():
+            return ", ".join(_text(item, units) for item in value)
+        case {"task": dict() as task, "distance": distance, **rest}:
+            at = ", ".join(f"{name} = {_text(item, '')}" for name, item in task.items())
+            how = f" ({rest['method']})" if "method" in rest else ""
+            return f"{distance:.4g} {units} at {at}{how}"
+        case dict():
+            return ", ".join(f"{name} {_text(item, '')}" for name, item in value.items())
+        case _:
+            return str(value)
+
+
+def _escaped(text: str) -> str:
+    return text.replace("[", r"\[")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""Pictures of a campaign. Reads what is known and never executes anything."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.campaign import Campaign
+from ctxval.errors import InputError
+from ctxval.surrogate import Surrogate
+from ctxval.trajectory import Trajectory
+from ctxval.trial import Trial
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours survive colour blindness; the line styles and the markers survive grey print.
+_BLUE, _ORANGE, _BLACK, _GREY = "#0072B2", "#D55E00", "#000000", "#B0B0B0"
+_RESOLUTION = 401
+_NORMAL_95 = 1.96
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A known distance over a one-dimensional task space: points ``(N,)`` in its units and values ``(N,)``."""
+
+    points: Array
+    values: Array
+
+
+def surrogate(campaign: Campaign, *, truth: Curve | None = None, units: str = "") -> Figure:
+    """Draw the GP over the task space with its 95 % band, the samples and the maximum (the paper's converged GP).
+
+    One dimension: the whole function. More: a slice along each axis through the worst task.
+
+    Args:
+        campaign: with at least two distances.
+        truth: the true distance, drawn under the GP of a one-dimensional task space.
+        units: the distance's.
+
+    Raises:
+        InputError: fewer than two distances are known.
+    """
+    fitted = campaign.surrogate()
+    worst = _worst(campaign)
+    space = campaign.validation.space
+    columns = min(space.dimension, 4)
+    rows = int(np.ceil(space.dimension / columns))
+    figure = _figure(max(6.4, 3.2 * columns), max(4.0, 2.6 * rows))
+    for axis in range(space.dimension):
+        axes = figure.add_subplot(rows, columns, axis + 1)
+        _draw_slice(axes, campaign, fitted, worst, axis)
+        if truth is not None and space.dimension == 1:
+            axes.plot(truth.points, truth.values, color=_ORANGE, linestyle="--", linewidth=1.6, label="true distance")
+        axes.set_xlabel(space.labels[axis])
+        if axis % columns == 0:
+            axes.set_ylabel(f"distance [{units}]" if units else "distance")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
+    return figure
+
+
+def _draw_slice(axes: Axes, campaign: Campaign, fitted: Surrogate, worst: Trial, axis: int) -> None:
+    space = campaign.validation.space
+    unit = np.tile(worst.unit_point, (_RESOLUTION, 1))
+    unit[:, axis] = np.linspace(0, 1, _RESOLUTION)
+    x = space.from_unit(unit)[:, axis]
+    mean, deviation = fitted.predict(unit)
+    band = _NORMAL_95 * deviation
+    axes.fill_between(x, mean - band, mean + band, color=_GREY, alpha=0.6, linewidth=0, label="95 % band of the GP")
+    axes.plot(x, mean, color=_BLUE, linewidth=1.8, label="GP mean")
+    if space.dimension == 1:
+        _draw_samples(axes, campaign, axis)
+    at = space.from_unit(worst.unit_point)[axis]
+    axes.plot(
+        [at], [_known(worst)], "*", color=_ORANGE, markeredgecolor=_BLACK, markersize=14, label="worst task executed"
+    )
+
+
+def _draw_samples(axes: Axes, campaign: Campaign, axis: int) -> None:
+    space = campaign.validation.space
+    styles = (
+        ("initial samples", [t for t in campaign.completed if t.origin != "acquisition"], "white"),
+        ("acquired samples", [t for t in campaign.completed if t.origin == "acquisition"], _BLACK),
+    )
+    for label, trials, face in styles:
+        if trials:
+            x = [space.from_unit(trial.unit_point)[axis] for trial in trials]
+            y = [_known(trial) for trial in trials]
+            axes.plot(x, y, "o", markersize=5, markerfacecolor=face, markeredgecolor=_BLACK, label=label)
+
+
+def worst_trajectories(campaign: Campaign, *, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Figure:
+    """Draw the trajectories of M and of S at the worst task executed.
+
+    Args:
+        campaign: with at least one distance.
+        states, inputs: axis labels, with units.
+
+    Raises:
+        InputError: no distance is known.
+    """
+    worst = _worst(campaign)
+    model, system = campaign.trajectories(worst)
+    if model is None or system is None:
+        raise InputError(f"the trajectories of trial {worst.number} are not in the store.")
+    space = campaign.validation.space
+    reference = campaign.validation.task(space.parameters(space.from_unit(worst.unit_point))).reference
+    figure = trajectories(model, system, reference=reference, states=states, inputs=inputs)
+    task = ", ".join(f"{name} = {_compact(value)}" for name, value in worst.parameters.items())
+    figure.suptitle(f"worst task executed: {task} (distance {_known(worst):.4g})", fontsize=10)
+    return figure
+
+
+def trajectories(
+    model: Trajectory,
+    system: Trajectory,
+    *,
+    reference: Array | None = None,
+    states: Sequence[str] = (),
+    inputs: Sequence[str] = (),
+) -> Figure:
+    """Draw two trajectories over time, one panel for each state and input.
+
+    Args:
+        model, system: of one task.
+        reference: states to follow, ``(H + 1, n)``; a state whose reference is all zero has none drawn.
+        states, inputs: axis labels, with units.
+    """
+    n, m = model.states.shape[-1], model.inputs.shape[-1]
+    panels = [
+        *[(states[i] if i < len(states) else f"state {i}", model.states[:, i], system.states[:, i]) for i in range(n)],
+        *[(inputs[i] if i < len(inputs) else f"input {i}", model.inputs[:, i], system.inputs[:, i]) for i in range(m)],
+    ]
+    figure = _figure(6.4, 1.0 + 1.7 * len(panels))
+    first: Axes | None = None
+    for row, (name, of_model, of_system) in enumerate(panels):
+        axes = figure.add_subplot(len(panels), 1, row + 1, sharex=first)
+        first = axes if first is None else first
+        if reference is not None and row < n and reference[:, row].any():
+            axes.plot(model.times, reference[:, row], color=_BLACK, linestyle=":", linewidth=1.2, label="reference")
+        times = model.times[: len(of_model)]
+        axes.plot(times, of_system, color=_ORANGE, linewidth=1.8, label="system S")
+        axes.plot(times, of_model, color=_BLUE, linestyle="--", linewidth=1.6, label="model M")
+        axes.set_ylabel(name)
+        axes.grid(alpha=0.25)
+    figure.axes[-1].set_xlabel("time [s]")
+    figure.axes[0].legend(loc="best", fontsize=8, framealpha=0.9)
+    return figure
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Write a figure as PNG or SVG, by the ending of the path.
+
+    Raises:
+        InputError: the file cannot be written, or the ending is unknown.
+    """
+    try:
+        figure.savefig(path, dpi=150)
+    except (OSError, ValueError) as error:
+        raise InputError(f"the picture {path} cannot be written: {error}.") from error
+    return Path(path)
+
+
+def _figure(width: float, height: float) -> Figure:
+    from matplotlib.figure import Figure  # imported here: loading it takes longer than a short campaign
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _worst(campaign: Campaign) -> Trial:
+    if campaign.worst is None:
+        raise InputError("there is nothing to draw: no distance is known yet.")
+    return campaign.worst
+
+
+def _known(trial: Trial) -> float:
+    return float("nan") if trial.distance is None else trial.distance
+
+
+def _compact(value: float | list[float]) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else "[" + ", ".join(f"{item:.3g}" for item in value) + "]"

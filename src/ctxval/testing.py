@@ -1,0 +1,206 @@
+"""Conformance checks for your own parts, and a rig that fails on command.
+
+Each check raises :class:`ctxval.errors.ConformanceError` with one sentence, and returns nothing where all is well.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.controller import Controller, Synthesizer
+from ctxval.distance import Distance
+from ctxval.errors import ConformanceError
+from ctxval.model import Model, linearize
+from ctxval.rollout import rollout
+from ctxval.searches import Search
+from ctxval.system import System
+from ctxval.task import Task
+from ctxval.trajectory import COMPLETE, Trajectory
+
+_TOLERANCE = 1e-10
+
+
+def check_model(model: Model, *, states: int, inputs: int, seed: int = 0, scale: float = 1.0) -> None:
+    """Check that a model takes batches as it takes single states, and that its Jacobian is its derivative.
+
+    Args:
+        model: with ``step`` and perhaps ``jacobian``.
+        states, inputs: n and m.
+        seed, scale: of the random states and inputs that it is tried on.
+    """
+    rng = np.random.default_rng(seed)
+    x, u = scale * rng.normal(size=(7, states)), scale * rng.normal(size=(7, inputs))
+    batch = np.asarray(model.step(x, u))
+    _require(batch.shape == x.shape, f"step of states {x.shape} must return the same shape, got {batch.shape}")
+    _require(bool(np.isfinite(batch).all()), "step returns values that are not finite")
+    single = np.array([model.step(xi, ui) for xi, ui in zip(x, u, strict=True)])
+    _require_close("step of a batch", batch, "the steps one by one", single, _TOLERANCE)
+    if hasattr(model, "jacobian"):
+        A, B = linearize(model, x, u)
+        A_numeric, B_numeric = linearize(_WithoutJacobian(model), x, u)
+        for name, own, numeric in (("A", A, A_numeric), ("B", B, B_numeric)):
+            _require_close(f"{name} of jacobian", np.broadcast_to(own, numeric.shape), "differences", numeric, 1e-5)
+
+
+def check_system(system: System, controller: Controller, task: Task, *, tolerance: float = _TOLERANCE) -> None:
+    """Check that a system starts where the task says, runs to its horizon, and does the same twice. Executes it twice.
+
+    Args:
+        system: with ``execute``.
+        controller, task: of one task, not a batch.
+        tolerance: by how much two executions may differ: the noise that you expect.
+    """
+    first, second = system.execute(controller, task), system.execute(controller, task)
+    for trajectory in (first, second):
+        _require(isinstance(trajectory, Trajectory), f"execute must return a Trajectory, got {type(trajectory)}")
+        expected = (task.horizon + 1, task.initial_state.shape[-1])
+        got = trajectory.states.shape
+        _require(got == expected, f"states must have shape {expected} for this task, got {got}")
+        _require(trajectory.ended == COMPLETE, f"the execution ended early: {trajectory.ended}")
+        start = np.abs(trajectory.states[0] - task.initial_state).max()
+        _require(start <= tolerance, f"it starts {start:g} away from the task's initial state")
+    _require_close("the first execution", first.states, "the second", second.states, tolerance)
+    if getattr(system, "batched", False):
+        _check_batched_system(system, controller, task, first, tolerance)
+
+
+def _check_batched_system(
+    system: System, controller: Controller, task: Task, single: Trajectory, tolerance: float
+) -> None:
+    twice = Task(
+        np.stack([task.initial_state] * 2), horizon=task.horizon, dt=task.dt, reference=np.stack([task.reference] * 2)
+    )
+    batch = system.execute(controller, twice)
+    _require_close("an execution in a batch", batch.states[1], "the same alone", single.states, tolerance)
+
+
+def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> None:
+    """Check that a synthesizer designs the same controller in a batch as task by task.
+
+    Args:
+        synthesizer: with ``design``.
+        task: a batch of tasks ``(N,)``.
+        model: what it designs on.
+    """
+    singles = []
+    for index in range(task.batch_shape[0]):
+        one = task[index]
+        singles.append(rollout(model.step, synthesizer.design(one, model), one))
+        _require(bool(singles[-1].finite), f"the closed loop on the model is not finite for task {index}")
+    if getattr(synthesizer, "batched", False):
+        batch = rollout(model.step, synthesizer.design(task, model), task)
+        states = np.stack([single.states for single in singles])
+        _require_close("the closed loops of a batch", batch.states, "those one by one", states, 1e-8)
+
+
+def check_distance(distance: Distance, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> None:
+    """Check that a distance is finite, not negative, zero between equals, and the same in a batch.
+
+    Args:
+        distance: ``(model_trajectory, system_trajectory, task) -> d``.
+        model_trajectory, system_trajectory, task: a batch ``(N,)``.
+    """
+    d = np.asarray(distance(model_trajectory, system_trajectory, task), dtype=np.float64)
+    _require(d.shape == task.batch_shape, f"the distance of a batch {task.batch_shape} has shape {d.shape}")
+    _require(bool(np.isfinite(d).all() and (d >= 0).all()), f"the distance must be finite and >= 0, got {d}")
+    pairs = [(model_trajectory[i], system_trajectory[i], task[i]) for i in range(len(d))]
+    singles = np.array([distance(*pair) for pair in pairs], dtype=np.float64)
+    _require_close("the distances of a batch", d, "those one by one", singles, _TOLERANCE)
+
+
+def check_search(search: Search, *, dimension: int = 2, seed: int = 3, budget: int = 12) -> None:
+    """Check that a search stays in the unit cube, resumes from what it was told, and survives failures.
+
+    Args:
+        search: with ``reset``, ``ask`` and ``tell``.
+        dimension, seed, budget: of the trial run.
+    """
+    history = _trial_run(search, dimension, seed, budget)
+    again = _trial_run(search, dimension, seed, budget)
+    _require(np.array_equal(history[0], again[0]), "the same seed and values must give the same points")
+    for told in range(1, budget):
+        search.reset(dimension, seed)
+        search.tell(history[0][:told], history[1][:told])
+        resumed = search.ask(1)[0]
+        _require(
+            np.array_equal(resumed, history[0][told]),
+            f"told the first {told} trials again, it must ask for the same next point, {history[0][told]}, "
+            f"but asks for {resumed}",
+        )
+
+
+def _trial_run(search: Search, dimension: int, seed: int, budget: int) -> tuple[Array, Array]:
+    search.reset(dimension, seed)
+    points, values = np.empty((0, dimension)), np.empty(0)
+    for number in range(budget):
+        point = np.asarray(search.ask(1), dtype=np.float64)
+        _require(point.shape == (1, dimension), f"ask(1) must return shape (1, {dimension}), got {point.shape}")
+        _require(bool(((point >= 0) & (point <= 1)).all()), f"a point must be in the unit cube, got {point[0]}")
+        # Every fourth evaluation fails.
+        value = np.nan if number % 4 == 3 else float(np.sin(3 * point).sum())
+        failed = points[np.isnan(values)]
+        _require(not (failed == point).all(axis=1).any(), f"a failed point must not be asked again: {point[0]}")
+        search.tell(point, [value])
+        points, values = np.concatenate([points, point]), np.append(values, value)
+    return points, values
+
+
+Fault = Literal["raise", "nan", "short", "wrong shape"]
+
+
+class FaultyRig:
+    """A system that does what another does, slowly, and fails where it is told to: for trying out what happens.
+
+    Args:
+        system: what it does where it does not fail.
+        faults: which execution, counted from 0, fails in which way.
+        delay: seconds that each execution takes on top.
+    """
+
+    def __init__(self, system: System, faults: Mapping[int, Fault] | None = None, delay: float = 0.0) -> None:
+        self.system = system
+        self.faults = dict(faults or {})
+        self.delay = delay
+        self._executions = 0
+
+    def execute(self, controller: Controller, task: Task) -> Trajectory:
+        """Run one task, or fail."""
+        fault = self.faults.get(self._executions)
+        self._executions += 1
+        time.sleep(self.delay)
+        if fault == "raise":
+            raise RuntimeError("the motor cut out")
+        whole = self.system.execute(controller, task)
+        if fault == "nan":
+            return Trajectory(whole.times, whole.states * np.nan, whole.inputs)
+        if fault == "short":
+            return Trajectory(whole.times[:-1], whole.states[:-1], whole.inputs[:-1], ended="stopped by the operator")
+        if fault == "wrong shape":
+            return Trajectory(whole.times, whole.states[:, :1], whole.inputs)
+        return whole
+
+
+class _WithoutJacobian:
+    """A model of which only the steps are seen, so that its Jacobian is found by differences."""
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+
+    def step(self, x: Array, u: Array) -> Array:
+        return self._model.step(x, u)
+
+
+def _require(condition: bool, sentence: str) -> None:
+    if not condition:
+        raise ConformanceError(f"{sentence}.")
+
+
+def _require_close(name: str, value: Array, other_name: str, other: Array, tolerance: float) -> None:
+    _require(value.shape == other.shape, f"{name} has shape {value.shape}, {other_name} {other.shape}")
+    gap = float((np.abs(value - other) / np.maximum(1.0, np.abs(other))).max(initial=0.0))
+    _require(gap <= tolerance, f"{name} differs from {other_name} by {gap:.2g}, more than {tolerance:g}")

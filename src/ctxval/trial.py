@@ -1,0 +1,43 @@
+"""A trial: one p with everything known of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from ctxval.arrays import Array
+from ctxval.space import Point
+
+Origin = Literal["iid", "initial", "acquisition", "manual"]
+"""Why a trial was chosen. Only iid trials enter a scenario bound."""
+
+State = Literal["open", "completed", "failed"]
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One p with everything known of it.
+
+    Attributes:
+        number: from 0, in the order of asking.
+        origin: why it was chosen: iid, initial, acquisition or manual.
+        state: open, completed or failed.
+        unit_point: p in the unit cube, shape ``(d,)``.
+        parameters: p by name.
+        attempts: how often its execution was started.
+        executed: whether an execution of S ended, well or badly; this is what the budget counts.
+        distance: d(p), if completed.
+        failure: why it failed, if it did.
+        seconds: how long the execution took.
+    """
+
+    number: int
+    origin: Origin
+    state: State
+    unit_point: Array
+    parameters: dict[str, Point]
+    attempts: int = 0
+    executed: bool = False
+    distance: float | None = None
+    failure: str | None = None
+    seconds: float | None = None

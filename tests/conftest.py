@@ -1,0 +1,44 @@
+"""What several tests share: small experiments on the pendulum."""
+
+from __future__ import annotations
+
+import os
+
+# Before numpy is imported: small algebra is faster on one thread.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+from ctxval import Task, TaskSpace, Validation, controllers, distances, models, systems
+from ctxval.cases import pendulum
+
+settings.register_profile("ctxval", deadline=None, derandomize=True)
+settings.load_profile("ctxval")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--kills", type=int, default=10, help="how many campaigns are killed and resumed")
+
+
+def make_validation(
+    system: object = None, model: object = None, distance: object = None, horizon: int = 25
+) -> Validation:
+    """Return a short pendulum validation, with parts replaced."""
+    settings_ = pendulum.Settings(horizon=horizon)
+    rod = pendulum.Pendulum()
+    step = systems.rk4(rod.derivative, settings_.dt)
+    return Validation(
+        space=TaskSpace(goal=(-3.0, 3.0, "rad")),
+        task=lambda p: Task([np.pi, 0.0], goal=[p.goal, 0.0], horizon=horizon, dt=0.02),
+        system=system or systems.Simulated(step, vectorized=True),
+        model=model or models.Linear.fit(pendulum.record(rod, settings_, seed=1)),
+        synthesizer=controllers.LQR([1.0, 0.1], [1e-2], [10.0, 1.0]),
+        distance=distance or distances.FinalState(norm=1),
+    )
+
+
+@pytest.fixture
+def validation() -> Validation:
+    return make_validation()

@@ -1,0 +1,259 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conftest import make_validation
+from ctxval import Campaign, TaskSpace, Validation, searches
+from ctxval.errors import DistanceError, ExecutionError, InputError, ModelError, StoreMismatchError, UnknownNameError
+from ctxval.testing import FaultyRig
+from ctxval.trial import Trial
+
+
+def facts(trials: tuple[Trial, ...]) -> list[tuple[object, ...]]:
+    """What a resumed campaign must share with one never stopped, bit for bit."""
+    return [(t.number, t.origin, t.state, t.unit_point.tobytes(), t.distance, t.failure) for t in trials]
+
+
+def test_gp_ucb_finds_the_worst_task(validation: Validation) -> None:
+    campaign = Campaign(validation, seed=4).run(20)
+    grid = validation.space.grid(2001)
+    truth = validation.distances(grid).max()
+    assert campaign.worst is not None
+    assert campaign.worst.distance == pytest.approx(truth, rel=0.01)
+    assert [t.origin for t in campaign.trials] == ["initial"] * 5 + ["acquisition"] * 15
+    assert campaign.estimate == campaign.worst.distance
+
+
+def test_a_surrogate_needs_two_distances_and_then_interpolates(validation: Validation) -> None:
+    campaign = Campaign(validation, search=searches.Random())
+    with pytest.raises(InputError, match="two known distances"):
+        campaign.run(1).surrogate()
+    campaign.run(8)
+    mean, deviation = campaign.surrogate().predict(np.array([t.unit_point for t in campaign.trials]))
+    np.testing.assert_allclose(mean, [t.distance for t in campaign.trials], atol=1e-3)
+    assert (deviation < 1e-2).all()
+
+
+@pytest.mark.parametrize("search", ["gp-ucb", "random", "sampling-discarding"])
+def test_running_in_pieces_equals_running_at_once(validation: Validation, tmp_path: Path, search: str) -> None:
+    whole = Campaign(validation, search=searches.by_name(search), seed=2).run(12)
+    for budget in (3, 4, 9, 12):
+        pieces = Campaign(validation, search=searches.by_name(search), seed=2, store=tmp_path / "a.sqlite").run(budget)
+        assert pieces.executions == budget
+    assert facts(pieces.trials) == facts(whole.trials)
+
+
+def test_the_budget_is_a_total(validation: Validation) -> None:
+    campaign = Campaign(validation).run(5)
+    assert len(campaign.run(5).trials) == 5
+    assert len(campaign.run(3).trials) == 5
+
+
+def test_the_first_five_points_are_the_same_for_every_search(validation: Validation) -> None:
+    first = [Campaign(validation, search=searches.by_name(n), seed=5).run(5) for n in ("gp-ucb", "random")]
+    points = [[t.unit_point.tolist() for t in campaign.trials] for campaign in first]
+    assert points[0] == points[1]
+
+
+def test_discarding_lowers_the_estimate_but_not_the_facts(validation: Validation) -> None:
+    campaign = Campaign(validation, search=searches.SamplingDiscarding(discard=2), seed=1)
+    assert campaign.run(2).estimate is None
+    distances = sorted(t.distance or 0 for t in campaign.run(10).trials)
+    assert campaign.estimate == distances[-3]
+    assert campaign.worst is not None
+    assert campaign.worst.distance == distances[-1]
+
+
+def test_failures_are_data(validation: Validation) -> None:
+    rig = FaultyRig(validation.system, {1: "raise", 3: "nan", 6: "short", 8: "wrong shape"})
+    campaign = Campaign(make_validation(system=rig), seed=3).run(15)
+    reasons = [t.failure for t in campaign.failed]
+    assert campaign.executions == 15
+    assert [t.number for t in campaign.failed] == [1, 3, 6, 8]
+    for reason, expected in zip(reasons, ["motor cut out", "not finite", "operator", "where"], strict=True):
+        assert reason is not None
+        assert expected in reason
+    failed = np.array([t.unit_point for t in campaign.failed])
+    others = np.array([t.unit_point for t in campaign.completed])
+    assert np.abs(failed[:, None] - others[None]).min() > 0
+
+
+def test_failures_do_not_change_what_a_resumed_campaign_chooses(validation: Validation, tmp_path: Path) -> None:
+    def campaign(store: Path | None, done: int) -> Campaign:
+        faults = {k - done: "raise" for k in (1, 6) if k >= done}
+        return Campaign(make_validation(system=FaultyRig(validation.system, faults)), seed=3, store=store)
+
+    # The store describes the rig too, so one rig stands for both: what failed before stays failed.
+    whole = campaign(None, 0).run(12)
+    shared = FaultyRig(validation.system, {1: "raise", 6: "raise"})
+    first = Campaign(make_validation(system=shared), seed=3, store=tmp_path / "a.sqlite").run(7)
+    second = Campaign(make_validation(system=shared), seed=3, store=first.store).run(12)
+    assert facts(second.trials) == facts(whole.trials)
+
+
+def test_an_interrupted_execution_is_repeated_as_the_same_trial(validation: Validation, tmp_path: Path) -> None:
+    class Interrupting(FaultyRig):
+        def execute(self, controller, task):  # type: ignore[no-untyped-def]
+            if self._executions == 6:
+                self._executions += 1
+                raise KeyboardInterrupt
+            return super().execute(controller, task)
+
+    whole = Campaign(make_validation(system=FaultyRig(validation.system)), seed=1).run(10)
+    stopped = make_validation(system=Interrupting(validation.system))
+    store = tmp_path / "a.sqlite"
+    with pytest.raises(KeyboardInterrupt):
+        Campaign(stopped, seed=1, store=store).run(10)
+    resumed = Campaign(stopped, seed=1, store=store).run(10)
+    assert facts(resumed.trials) == facts(whole.trials)
+    assert [t.attempts for t in resumed.trials] == [1] * 6 + [2] + [1] * 3
+
+
+def test_asking_and_telling_by_hand_equals_running(validation: Validation) -> None:
+    by_hand = Campaign(validation, seed=6)
+    for _ in range(9):
+        opened = by_hand.ask()
+        by_hand.tell(opened, validation.system.execute(opened.plan.controller, opened.plan.task))
+    assert facts(by_hand.trials) == facts(Campaign(validation, seed=6).run(9).trials)
+
+
+def test_a_trial_can_be_told_later_by_its_number(validation: Validation, tmp_path: Path) -> None:
+    first = Campaign(validation, store=tmp_path / "a.sqlite")
+    opened = first.ask()
+    trajectory = validation.execute(opened.plan)
+    second = Campaign(validation, store=tmp_path / "a.sqlite")
+    assert second.trials[0].state == "open"
+    assert second.tell(0, trajectory).distance == validation.measure(opened.plan, trajectory)
+
+
+def test_running_leaves_trials_that_were_asked_by_hand_open(validation: Validation) -> None:
+    campaign = Campaign(validation)
+    opened = campaign.ask()
+    campaign.run(4)
+    assert campaign.trials[0].state == "open"
+    assert campaign.executions == 4
+    campaign.tell(opened, failed="the battery was empty")
+    assert campaign.trials[0].failure == "the battery was empty"
+
+
+def test_a_manual_task_is_told_to_the_search_and_is_no_iid_draw(validation: Validation) -> None:
+    campaign = Campaign(validation, search=searches.Random())
+    opened = campaign.ask({"goal": 1.25})
+    assert opened.trial.origin == "manual"
+    assert opened.trial.parameters == {"goal": pytest.approx(1.25)}
+    with pytest.raises(UnknownNameError, match="did you mean 'goal'"):
+        campaign.ask({"gaol": 1.0})
+
+
+def test_a_short_trajectory_told_by_hand_leaves_the_trial_open(validation: Validation) -> None:
+    campaign = Campaign(validation)
+    opened = campaign.ask()
+    whole = validation.execute(opened.plan)
+    short = type(whole)(whole.times[:-1], whole.states[:-1], whole.inputs[:-1])
+    with pytest.raises(ExecutionError, match="expected"):
+        campaign.tell(opened, short)
+    assert campaign.tell(opened, whole).state == "completed"
+
+
+@pytest.mark.parametrize(
+    ("told", "sentence"),
+    [((99,), "there is no trial 99"), ((0,), "either a trajectory or the reason")],
+)
+def test_telling_nonsense_is_refused(validation: Validation, told: tuple[int, ...], sentence: str) -> None:
+    campaign = Campaign(validation)
+    campaign.ask()
+    with pytest.raises(InputError, match=sentence):
+        campaign.tell(*told)
+
+
+def test_a_model_that_fails_stops_the_campaign_and_the_next_run_goes_on_behind_it(validation: Validation) -> None:
+    class Bad:
+        fails = True
+
+        def step(self, x, u):  # type: ignore[no-untyped-def]
+            known = validation.model.step(x, u)
+            return known * np.nan if self.fails else known
+
+        def jacobian(self, x, u):  # type: ignore[no-untyped-def]
+            return validation.model.jacobian(x, u)  # type: ignore[attr-defined]
+
+        def describe(self) -> dict[str, object]:
+            return {}
+
+    model = Bad()
+    campaign = Campaign(make_validation(model=model))
+    with pytest.raises(ModelError, match="model's closed loop diverged at step 1"):
+        campaign.run(3)
+    assert (campaign.executions, len(campaign.failed)) == (0, 1)
+    model.fails = False
+    assert campaign.run(3).executions == 3
+    assert len(campaign.trials) == 4
+
+
+def test_a_distance_of_nan_stops_the_campaign_but_keeps_the_execution(validation: Validation) -> None:
+    campaign = Campaign(make_validation(distance=lambda a, b, task: np.nan))
+    with pytest.raises(DistanceError, match="one finite number"):
+        campaign.run(3)
+    assert campaign.executions == 1
+    assert campaign.trajectories(campaign.trials[0])[1] is not None
+
+
+def test_verdicts_are_executed_facts_or_undecided(validation: Validation) -> None:
+    campaign = Campaign(validation).run(8)
+    assert campaign.worst is not None
+    worst = campaign.worst.distance or 0
+    falsified = campaign.verdict(worst * 0.9)
+    assert falsified.answer == "falsified"
+    assert falsified.witness is campaign.worst
+    assert campaign.verdict(worst).answer == "undecided"
+    for threshold in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="positive number"):
+            campaign.verdict(threshold)
+
+
+def test_a_store_of_another_experiment_is_refused(validation: Validation, tmp_path: Path) -> None:
+    Campaign(validation, store=tmp_path / "a.sqlite").run(2)
+    longer = make_validation(horizon=26)
+    with pytest.raises(StoreMismatchError, match="horizon was 25 and is now 26"):
+        Campaign(longer, store=tmp_path / "a.sqlite")
+    with pytest.raises(StoreMismatchError, match="seed was 0 and is now 1"):
+        Campaign(validation, store=tmp_path / "a.sqlite", seed=1)
+    assert Campaign(validation, store=tmp_path / "a.sqlite").executions == 2
+
+
+@pytest.mark.parametrize("budget", [0, -3, 2.5, True, None])
+def test_a_budget_is_a_positive_integer(validation: Validation, budget: object) -> None:
+    with pytest.raises(InputError, match="positive integer"):
+        Campaign(validation).run(budget)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("arguments", [{"seed": -1}, {"seed": 1.5}, {"search": object()}])
+def test_bad_arguments_are_named(validation: Validation, arguments: dict[str, object]) -> None:
+    with pytest.raises(InputError, match=next(iter(arguments))):
+        Campaign(validation, **arguments)  # type: ignore[arg-type]
+
+
+def test_a_search_that_leaves_the_cube_is_told_so(validation: Validation) -> None:
+    class Outside(searches.Random):
+        def propose(self, rng: np.random.Generator) -> np.ndarray:
+            return np.array([1.5])
+
+    with pytest.raises(InputError, match="unit cube"):
+        Campaign(validation, search=Outside()).run(1)
+
+
+def test_the_sketch_of_the_readme_runs() -> None:
+    validation = make_validation()
+    space = TaskSpace(goal=(-3.0, 3.0))
+    again = Validation(
+        space=space,
+        task=validation.task,
+        system=validation.system,
+        model=validation.model.step,
+        synthesizer=validation.synthesizer,
+        distance=validation.distance,
+    )
+    assert Campaign(again, search=searches.GPUCB(beta=2.0), seed=7).run(budget=6).executions == 6

@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from ctxval.cli import app
+
+EXPERIMENT = """
+from conftest import make_validation
+from ctxval import Experiment, truth
+
+validation = make_validation()
+
+def experiment(seed=0, horizon=25):
+    made = make_validation(horizon=horizon)
+    return Experiment("short", made, budget=6, truth=lambda: truth.grid_truth(made, 101), units="rad")
+
+def slow(seed):
+    raise KeyboardInterrupt
+
+broken = make_validation(model=lambda x, u: x * float("nan"))
+number = 3
+"""
+
+
+@pytest.fixture
+def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+    """Run the command line in an empty folder with one module in it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    (tmp_path / "rig.py").write_text(EXPERIMENT)
+    sys.modules.pop("rig", None)
+
+    def run(*arguments: str) -> Result:
+        return CliRunner().invoke(app, list(arguments))
+
+    return run
+
+
+def test_json_is_one_object_with_everything_asked_for(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:experiment", "--budget", "8", "--seed", "3", "--truth", "--threshold", "9", "--json")
+    report = json.loads(result.stdout)
+    assert result.exit_code == 0
+    assert report["case"] == "short"
+    assert (report["search"], report["seed"], report["budget"], report["executions"]) == ("gp-ucb", 3, 8, 8)
+    assert report["failed"] == 0
+    assert list(report["worst"]["task"]) == ["goal"]
+    assert report["truth"]["distance"] >= report["worst"]["distance"] * (1 - 1e-9)
+    error = 100 * (report["truth"]["distance"] - report["estimate"]) / report["truth"]["distance"]
+    assert report["error_percent"] == pytest.approx(error)
+    assert (report["verdict"], report["threshold"]) == ("undecided", 9.0)
+    assert report["store"] == "runs/short-gp-ucb-seed3.sqlite"
+    assert all(Path(picture).stat().st_size > 1000 for picture in report["pictures"])
+
+
+def test_running_again_resumes(invoke) -> None:  # type: ignore[no-untyped-def]
+    first = json.loads(invoke("run", "rig:experiment", "--budget", "5", "--json").stdout)
+    again = json.loads(invoke("run", "rig:experiment", "--budget", "5", "--json").stdout)
+    assert first == again
+    assert json.loads(invoke("run", "rig:experiment", "--budget", "7", "--json").stdout)["executions"] == 7
+
+
+def test_a_falsified_model_exits_with_1(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:experiment", "--threshold", "0.001", "--json")
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["verdict"] == "falsified"
+
+
+def test_the_human_report_names_the_worst_task_and_the_verdict(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:validation", "--budget", "6", "--threshold", "5")
+    assert result.exit_code == 0
+    assert "goal =" in result.stdout
+    assert "undecided against 5" in result.stdout
+
+
+@pytest.mark.parametrize("search", ["random", "sampling-discarding"])
+def test_the_random_baselines_run(invoke, search: str) -> None:  # type: ignore[no-untyped-def]
+    report = json.loads(invoke("run", "rig:experiment", "--search", search, "--budget", "7", "--json").stdout)
+    assert report["search"] == search
+    assert (report["estimate"] == report["worst"]["distance"]) == (search == "random")
+
+
+def test_an_experiment_file_runs_and_the_command_line_wins(invoke) -> None:  # type: ignore[no-untyped-def]
+    Path("e.toml").write_text(
+        'experiment = "rig:experiment"\nbudget = 9\nseed = 2\nstore = "x.sqlite"\n'
+        '[options]\nhorizon = 20\n[search]\nname = "gp-ucb"\nbeta = 3.0\n'
+    )
+    report = json.loads(invoke("run", "e.toml", "--budget", "6", "--json").stdout)
+    assert (report["executions"], report["seed"], report["store"]) == (6, 2, "x.sqlite")
+    assert report["options"] == {"horizon": 20}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["run", "pendulm"], "did you mean 'pendulum'"),
+        (["run", "rig:experiment", "--search", "gpucb"], "did you mean 'gp-ucb'"),
+        (["run", "rig:experiment", "--budget", "0"], "budget"),
+        (["run", "rig:experiment", "--threshold", "nan"], "threshold"),
+        (["run", "rig:experiment", "--threshold", "-1"], "threshold"),
+        (["run", "rig:experiment", "--seed", "-1"], "seed"),
+        (["run", "rig:nothing"], "cannot be loaded"),
+        (["run", "nowhere:nothing"], "cannot be loaded"),
+        (["run", "rig:number"], "must be an Experiment or a Validation"),
+        (["run", "rig:experiment", "--dim", "3"], "callable with a seed and its options"),
+        (["run", "pendulum", "--dim", "3"], "no option of the case 'pendulum' is called 'dim'"),
+        (["run", "none.toml"], "cannot be read"),
+        (["run", "rig:validation", "--truth"], "truth of 'validation' is not known"),
+        (["run", "rig:experiment", "--store", "/proc/none/x.sqlite"], "cannot be used as a store"),
+        (["run", "rig:experiment", "--store", "rig.py"], "cannot be read as a store"),
+        (["status", "none.sqlite"], "there is no store"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_status_2(invoke, arguments: list[str], sentence: str) -> None:  # type: ignore[no-untyped-def]
+    result = invoke(*arguments)
+    assert result.exit_code == 2
+    assert sentence in result.stderr.replace("\n", " ")
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("toml", "sentence"),
+    [
+        ('experiment = "pendulum"\nbudgit = 3', "budgit"),
+        ('experiment = "pendulum"\nbudget = "many"', "budget"),
+        ("budget = 3", "experiment"),
+        ("not toml at all", "not valid TOML"),
+        ('experiment = "pendulum"\noptions = 3', "[options] must be a table"),
+        ('experiment = "pendulum"\nsearch = 3', "search"),
+        ('experiment = "pendulum"\n[search]\nname = "gp-ucb"\nbetta = 1', "betta"),
+    ],
+)
+def test_bad_experiment_files_are_named_with_what_is_wrong(invoke, toml: str, sentence: str) -> None:  # type: ignore[no-untyped-def]
+    Path("e.toml").write_text(toml)
+    result = invoke("run", "e.toml")
+    assert result.exit_code == 2
+    assert sentence in result.stderr.replace("\n", " ")
+
+
+def test_a_store_of_another_seed_is_refused_and_kept(invoke) -> None:  # type: ignore[no-untyped-def]
+    invoke("run", "rig:experiment", "--store", "a.sqlite", "--budget", "5", "--json")
+    result = invoke("run", "rig:experiment", "--store", "a.sqlite", "--seed", "4")
+    assert result.exit_code == 2
+    assert "another experiment: seed was 0 and is now 4" in result.stderr
+    assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 5
+
+
+def test_a_campaign_that_cannot_go_on_exits_with_3(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:broken")
+    assert result.exit_code == 3
+    assert "Jacobian is not finite" in result.stderr
+
+
+def test_an_interrupt_says_how_to_go_on(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:slow")
+    assert result.exit_code == 130
+    assert "run the same command to go on" in result.stderr
+
+
+def test_status_and_cases_speak_to_people_and_to_programs(invoke) -> None:  # type: ignore[no-untyped-def]
+    invoke("run", "rig:experiment", "--store", "a.sqlite", "--json")
+    assert "executions  6" in invoke("status", "a.sqlite").stdout
+    assert "pendulum" in invoke("cases").stdout
+    assert "pendulum" in json.loads(invoke("cases", "--json").stdout)
+
+
+def test_every_command_is_in_the_readme() -> None:
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    commands = [c.name or (c.callback.__name__ if c.callback else "") for c in app.registered_commands]
+    for command in commands:
+        assert f"ctxval {command}" in readme
+
+
+def test_the_installed_command_runs_without_a_traceback(tmp_path: Path) -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "ctxval.cli", "run", "nothing"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr

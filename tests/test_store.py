@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ctxval import Store, Trajectory, Trial
+from ctxval.errors import ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
+
+TRAJECTORY = Trajectory(np.arange(4.0), np.random.default_rng(0).normal(size=(4, 2)), np.ones((3, 1)))
+
+
+def trial(number: int = 0) -> Trial:
+    point = np.array([1 / 3, np.nextafter(0.5, 1)])
+    return Trial(number, "iid", "open", point, {"a": 0.1, "b": [1.0, 2.0]}, attempts=1)
+
+
+def test_a_trial_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    store.open_trial(trial(), TRAJECTORY)
+    ended = replace(trial(), state="completed", executed=True, distance=0.1 + 0.2, seconds=1.5)
+    store.close_trial(ended, TRAJECTORY)
+    store.close()
+    (back,) = Store(tmp_path / "a.sqlite").trials()
+    np.testing.assert_array_equal(back.unit_point, ended.unit_point)
+    assert (back.distance, back.origin, back.state, back.parameters) == (
+        0.1 + 0.2,
+        "iid",
+        "completed",
+        ended.parameters,
+    )
+    assert (back.attempts, back.executed, back.failure, back.seconds) == (1, True, None, 1.5)
+
+
+def test_trajectories_come_back_bit_for_bit_and_absent_ones_as_none() -> None:
+    store = Store()
+    store.open_trial(trial(), TRAJECTORY)
+    back = store.trajectory(0, "model")
+    assert back is not None
+    np.testing.assert_array_equal(back.states, TRAJECTORY.states)
+    assert store.trajectory(0, "system") is None
+
+
+def test_an_ended_trial_cannot_end_again() -> None:
+    store = Store()
+    store.open_trial(trial(), TRAJECTORY)
+    store.close_trial(replace(trial(), state="failed", failure="x"), None)
+    with pytest.raises(InputError, match="not open"):
+        store.close_trial(replace(trial(), state="completed", distance=1.0), TRAJECTORY)
+    assert store.trials()[0].state == "failed"
+
+
+def test_two_writers_of_one_trial_collide_with_a_clear_error(tmp_path: Path) -> None:
+    first, second = Store(tmp_path / "a.sqlite"), Store(tmp_path / "a.sqlite")
+    first.open_trial(trial(), TRAJECTORY)
+    with pytest.raises(StoreAccessError, match="written by another process"):
+        second.open_trial(trial(), TRAJECTORY)
+    assert len(second.trials()) == 1
+
+
+def test_another_experiment_is_refused_and_the_difference_named() -> None:
+    store = Store()
+    store.identify({"seed": 1, "validation": {"model": {"A": [1.0, 2.0]}}})
+    store.identify({"seed": 1, "validation": {"model": {"A": [1.0, 2.0 + 1e-9]}}})
+    with pytest.raises(StoreMismatchError, match=r"validation.model.A\[1\] was 2.0 and is now 2.1"):
+        store.identify({"seed": 1, "validation": {"model": {"A": [1.0, 2.1]}}})
+
+
+def test_a_foreign_database_is_refused_and_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "photos.sqlite"
+    with sqlite3.connect(path) as other:
+        other.execute("CREATE TABLE photos (name TEXT)")
+    other.close()
+    before = path.read_bytes()
+    with pytest.raises(ForeignStoreError, match="not a ctxval store"):
+        Store(path)
+    assert path.read_bytes() == before
+
+
+def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("just some notes, long enough to be read as a page header by anyone who tries. " * 20)
+    with pytest.raises(ForeignStoreError, match="cannot be read"):
+        Store(path)
+
+
+def test_a_newer_schema_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    Store(path).close()
+    connection = sqlite3.connect(path)
+    connection.execute("PRAGMA user_version = 99")
+    connection.close()
+    with pytest.raises(ForeignStoreError, match="newer ctxval"):
+        Store(path)
+
+
+def test_an_impossible_path_is_an_access_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreAccessError, match="cannot be used"):
+        Store(tmp_path / "file" / "a.sqlite")
+    with pytest.raises(StoreAccessError, match="there is no store"):
+        Store.existing(tmp_path / "none.sqlite")
+
+
+def test_a_full_disk_loses_nothing_that_was_stored(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    store.open_trial(trial(), TRAJECTORY)
+    pages = store._connection.execute("PRAGMA page_count").fetchone()[0]
+    store._connection.execute(f"PRAGMA max_page_count = {pages}")
+    big = Trajectory(np.arange(5001.0), np.random.default_rng(1).normal(size=(5001, 4)), np.zeros((5000, 1)))
+    with pytest.raises(StoreAccessError, match="full"):
+        store.open_trial(trial(1), big)
+    store.close()
+    assert [t.number for t in Store(tmp_path / "a.sqlite").trials()] == [0]
+
+
+def test_migrations_are_recorded(tmp_path: Path) -> None:
+    Store(tmp_path / "a.sqlite").close()
+    connection = sqlite3.connect(tmp_path / "a.sqlite")
+    rows = connection.execute("SELECT version, title FROM migrations").fetchall()
+    version = connection.execute("PRAGMA user_version").fetchone()[0]
+    connection.close()
+    assert [row[0] for row in rows] == list(range(1, version + 1))
