@@ -27,6 +27,8 @@ def as_floats(name: str, value: ArrayLike) -> Array:
     Raises:
         InputError: it is not numeric.
     """
+    if np.iscomplexobj(value):
+        raise InputError(f"{name} must be real numbers, got {value!r}.")
     try:
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

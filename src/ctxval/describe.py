@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 import math
@@ -58,6 +59,9 @@ def _describe_callable(value: Any, depth: int) -> Any:
     bound = {"of": describe(owner, depth - 1)} if owner is not None and not inspect.ismodule(owner) else {}
     closed_over = inspect.getclosurevars(value).nonlocals if inspect.isfunction(value) else {}
     enclosed = {key: describe(item, depth - 1) for key, item in closed_over.items()}
+    defaults = getattr(value, "__defaults__", None)
+    if defaults:
+        enclosed["defaults"] = describe(defaults, depth - 1)
     return {"function": name, **bound, **enclosed} if bound or enclosed else name
 
 
@@ -68,6 +72,8 @@ def _describe_object(value: Any, depth: int) -> Any:
 
 
 def _attributes(value: Any) -> dict[str, Any]:
+    if dataclasses.is_dataclass(value):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     try:
         return dict(vars(value))
     except TypeError:

@@ -5,7 +5,7 @@
     CtxvalError
     ├── InputError (also ValueError)        a value given by the user cannot be used
     │   ├── ShapeError                      ... because of its shape
-    │   └── UnknownNameError                ... because nothing has that name
+    │   └── UnknownNameError                ... because nothing has that name (also AttributeError)
     ├── ModelError                          the model M gave something unusable
     ├── DesignError                         no controller could be designed for a task
     ├── ExecutionError                      an execution of S failed; a campaign records it as a failed trial
@@ -37,7 +37,7 @@ class ShapeError(InputError):
     """An array has the wrong shape."""
 
 
-class UnknownNameError(InputError):
+class UnknownNameError(InputError, AttributeError):
     """Nothing has the name that was given."""
 
     @classmethod

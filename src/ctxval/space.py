@@ -53,7 +53,7 @@ class TaskSpace:
     ('goal', 'offset[0]', 'offset[1]')
 
     Raises:
-        InputError: no parameter at all; bounds reversed, equal, NaN or infinite.
+        InputError: no parameter at all; a name that is taken; bounds reversed, equal, NaN or infinite.
     """
 
     def __init__(self, **bounds: tuple[Any, ...]) -> None:
@@ -65,6 +65,8 @@ class TaskSpace:
         lows: list[Array] = []
         highs: list[Array] = []
         for name, bound in bounds.items():
+            if name == "points" or name.startswith("_"):
+                raise InputError(f"a task parameter cannot be called {name!r}; that name is taken.")
             low, high, self._units[name] = _bounds(name, bound)
             start = len(names)
             if low.ndim == 0:

@@ -29,7 +29,7 @@ class Task:
     def __init__(self, initial_state: Any, *, horizon: int, dt: float, goal: Any = None, reference: Any = None) -> None:
         if not isinstance(horizon, int | np.integer) or isinstance(horizon, bool) or horizon < 1:
             raise InputError(f"horizon must be a positive integer, got {horizon!r}.")
-        if not isinstance(dt, int | float | np.number) or not (np.isfinite(dt) and dt > 0):
+        if not isinstance(dt, int | float | np.number) or isinstance(dt, bool) or not (np.isfinite(dt) and dt > 0):
             raise InputError(f"dt must be a positive number of seconds, got {dt!r}.")
         if goal is not None and reference is not None:
             raise InputError("a task has a goal or a reference, not both.")

@@ -7,12 +7,12 @@ import io
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from ctxval.arrays import Array, as_floats
+from ctxval.arrays import Array, Mask, as_floats
 from ctxval.errors import InputError, ShapeError
 
 COMPLETE = "complete"
@@ -109,27 +109,21 @@ class Trajectory:
         return self.states[..., -1, :]
 
     @property
-    def finite(self) -> Array:
+    def finite(self) -> Mask:
         """Whether every state and input is finite, shape ``(...)``."""
         whole = np.isfinite(self.states).all(axis=(-1, -2)) & np.isfinite(self.inputs).all(axis=(-1, -2))
         return np.asarray(whole)
 
     def __getitem__(self, index: int) -> Trajectory:
-        """Return one trajectory of the batch."""
-        return Trajectory(self.times, self.states[index], self.inputs[index], self.ended)
+        """Return one trajectory of the batch; how the batch ended is said of those that are not finite."""
+        one = Trajectory(self.times, self.states[index], self.inputs[index])
+        return one if self.ended == COMPLETE or one.finite.all() else replace(one, ended=self.ended)
 
     def transitions(self) -> Transitions:
         """Return every step as a transition, all tasks of a batch in one."""
         n, m = self.states.shape[-1], self.inputs.shape[-1]
         return Transitions(
             self.states[..., :-1, :].reshape(-1, n), self.inputs.reshape(-1, m), self.states[..., 1:, :].reshape(-1, n)
-        )
-
-    @staticmethod
-    def stacked(parts: Sequence[Trajectory]) -> Trajectory:
-        """Return single trajectories of one horizon as a batch."""
-        return Trajectory(
-            parts[0].times, np.stack([part.states for part in parts]), np.stack([part.inputs for part in parts])
         )
 
     # Files
@@ -186,7 +180,7 @@ class Trajectory:
             InputError: the file cannot be read, or a column is missing, or a cell is no number.
         """
         try:
-            with open(path, newline="", encoding="utf-8") as file:
+            with open(path, newline="", encoding="utf-8-sig") as file:
                 rows = list(csv.DictReader(file))
         except (OSError, UnicodeDecodeError, csv.Error) as error:
             raise InputError(f"{path} cannot be read as CSV: {error}.") from error
@@ -205,9 +199,11 @@ class Trajectory:
 
 
 def _numbered_columns(row: dict[str, str], letter: str) -> list[str]:
-    names: list[str] = []
-    while (name := f"{letter}{len(names)}") in row:
-        names.append(name)
+    found = [name for name in row if name and name[0] == letter and name[1:].isdigit()]
+    names = [f"{letter}{i}" for i in range(len(found))]
+    missing = [name for name in names if name not in row]
+    if missing:
+        raise InputError(f"the column {missing[0]} is missing; there are {', '.join(found)}.")
     return names
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
-from ctxval.arrays import Array, ArrayLike, as_floats, require_shape
+from ctxval.arrays import Array, ArrayLike, Mask, as_floats, require_shape
 from ctxval.controller import Controller, Synthesizer
 from ctxval.describe import describe
 from ctxval.distance import Distance
@@ -152,8 +152,7 @@ class Validation:
         """
         value = self._distance(plan, trajectory)
         if value.shape != () or not np.isfinite(value) or value < 0:
-            where = self.space.describe_point(plan.parameters.points)
-            raise DistanceError(f"the distance must be one finite number >= 0, got {value} for the task {where}.")
+            self._refuse_distance(value, plan.parameters.points)
         return float(value)
 
     def outcome(self, point: ArrayLike) -> Outcome:
@@ -177,7 +176,7 @@ class Validation:
             DistanceError: the distance raised or has the wrong shape.
         """
         rows = require_shape("points", as_floats("points", points), (self.space.dimension,))
-        if not self.batched:
+        if not self.batched or not len(rows):
             return np.array([self._distance_or_nan(row) for row in rows])
         chunks = [rows[i : i + _CHUNK] for i in range(0, len(rows), _CHUNK)]
         return np.concatenate([self._batch_distances(chunk) for chunk in chunks])
@@ -198,12 +197,19 @@ class Validation:
         if not plan.model_trajectory.finite.all():
             where = self.space.describe_point(points[np.argmin(plan.model_trajectory.finite)])
             raise ModelError(f"the model's closed loop is not finite for the task {where}.")
-        trajectory = self.system.execute(plan.controller, plan.task)
-        with np.errstate(all="ignore"):
-            values = self._distance(plan, trajectory)
+        try:
+            trajectory = self.system.execute(plan.controller, plan.task)
+        except Exception:
+            # Which task it was, only one by one can tell.
+            return np.array([self._distance_or_nan(point) for point in points])
+        values = self._distance(plan, trajectory)
         if values.shape != (len(points),):
             raise DistanceError(f"the distance must have shape ({len(points)},) over the batch, got {values.shape}.")
-        return np.where(trajectory.finite & np.isfinite(values), values, np.nan)
+        executed = _executed(plan.model_trajectory, trajectory)
+        wrong = executed & ~(np.isfinite(values) & (values >= 0))
+        if wrong.any():
+            self._refuse_distance(values[np.argmax(wrong)], points[np.argmax(wrong)])
+        return np.where(executed, values, np.nan)
 
     # What both share
 
@@ -235,9 +241,14 @@ class Validation:
 
     def _distance(self, plan: Plan, trajectory: Trajectory) -> Array:
         try:
-            return np.asarray(self.distance(plan.model_trajectory, trajectory, plan.task), dtype=np.float64)
+            with np.errstate(all="ignore"):
+                return np.asarray(self.distance(plan.model_trajectory, trajectory, plan.task), dtype=np.float64)
         except Exception as error:
             raise DistanceError(f"the distance failed: {_reason(error)}.") from error
+
+    def _refuse_distance(self, value: Array, point: Array) -> NoReturn:
+        where = self.space.describe_point(point)
+        raise DistanceError(f"the distance must be one finite number >= 0, got {value} for the task {where}.")
 
 
 def require_execution(plan: Plan, trajectory: Trajectory) -> None:
@@ -258,6 +269,14 @@ def require_execution(plan: Plan, trajectory: Trajectory) -> None:
         )
     if not trajectory.finite:
         raise ExecutionError("the system's trajectory is not finite")
+
+
+def _executed(expected: Trajectory, batch: Trajectory) -> Mask:
+    """Return which tasks of a batch have a whole and finite trajectory, shape ``(N,)``."""
+    same = batch.states.shape == expected.states.shape and batch.inputs.shape == expected.inputs.shape
+    # Where the batch ended early but nothing in it is broken, it is not known which task that was.
+    unknown = batch.ended != COMPLETE and bool(batch.finite.all())
+    return batch.finite if same and not unknown else np.zeros(expected.finite.shape, dtype=bool)
 
 
 def _require(name: str, value: object, valid: bool, wanted: str) -> None:

@@ -17,6 +17,7 @@ from ctxval.task import Task
 _STEP_LENGTHS = 0.5 ** np.arange(12)
 _SUFFICIENT_DECREASE = 1e-4
 _DAMPING_MIN, _DAMPING_MAX = 1e-6, 1e10
+_ROUNDING = 1e12  # a cost that falls by less leaves the states with a relative error below 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +105,7 @@ class _Descent:
         if not np.isfinite(self.J).all():
             raise DesignError("iLQR cannot start: the model diverges under zero input within the horizon.")
         self.damping = np.zeros(batch)
+        self.refused = np.zeros(batch, dtype=bool)  # the line search failed from the present iterate
         self.iterations = np.zeros(batch, dtype=int)
         self.converged = np.zeros(batch, dtype=bool)
 
@@ -121,11 +123,14 @@ class _Descent:
         arrived = gain <= self.settings.tolerance * (np.abs(self.J[rows]) + self.settings.tolerance)
         # A damped step is small by itself: only an undamped one may declare arrival.
         self.converged[rows] = arrived & (self.damping[rows] == 0)
-        self.damping[rows[arrived]] = 0.0
+        # ... and where that one was refused, no step improves the cost.
+        self.damping[rows[arrived]] = np.where(self.refused[rows[arrived]], np.inf, 0.0)
+        before = self.J[rows]
         moved = self._line_search(rows, policy, change, ~arrived)
         if A.ndim == 2 and B.ndim == 2:
-            # The model is linear: the step was the exact minimiser, and its gains hold everywhere.
-            self.converged[rows[moved]] = True
+            # The model is linear: the step was the exact minimiser, and its gains hold everywhere. Only where the cost
+            # fell from very far, as on an unstable model, rounding calls for another look.
+            self.converged[rows[moved]] = (before <= _ROUNDING * self.J[rows])[moved]
 
     def _backward(self, rows: Rows, A: Array, B: Array) -> tuple[_Policy, _Change]:
         """Minimise the quadratic expansion of the cost-to-go ``v'dx + 1/2 dx'V dx``, from the horizon to the start."""
@@ -137,7 +142,7 @@ class _Descent:
         slope, curvature = np.zeros(len(rows)), np.zeros(len(rows))
         gains, feedforward = [], []
         for t in reversed(range(len(inputs))):
-            A_t, B_t = (A, B) if A.ndim == 2 else (A[t], B[t])
+            A_t, B_t = A if A.ndim == 2 else A[t], B if B.ndim == 2 else B[t]
             VA, VB = V @ A_t, V @ B_t
             Q_x, Q_u = deviations[t] @ self.cost.Q + _times(v, A_t), inputs[t] @ self.cost.R + _times(v, B_t)
             Q_ux, Q_uu = _T(B_t) @ VA, self.cost.R + _T(B_t) @ VB
@@ -167,6 +172,7 @@ class _Descent:
             waiting = waiting[~accepted]
         failed = rows[waiting]
         self.damping[failed] = np.maximum(_DAMPING_MIN, 10 * self.damping[failed])
+        self.refused[failed] = True
         moved = wanted.copy()
         moved[waiting] = False
         return np.flatnonzero(moved)
@@ -174,6 +180,7 @@ class _Descent:
     def _accept(self, rows: Rows, X: Array, U: Array, J: Array) -> None:
         self.X[:, rows], self.U[:, rows], self.J[rows] = X, U, J
         self.iterations[rows] += 1
+        self.refused[rows] = False
         self.damping[rows] = np.where(self.damping[rows] > _DAMPING_MIN, self.damping[rows] / 10, 0.0)
 
     def _forward(self, rows: Rows, policy: _Policy, lengths: Array) -> tuple[Array, Array, Array]:

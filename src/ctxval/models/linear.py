@@ -41,9 +41,11 @@ class Linear:
         """Fit A, B and, with an intercept, c by least squares on recorded transitions.
 
         Raises:
-            InputError: the data do not determine the model.
+            InputError: the data do not determine the model, or are not finite.
         """
         n, m = data.x.shape[1], data.u.shape[1]
+        if not all(np.isfinite(array).all() for array in (data.x, data.u, data.x_next)):
+            raise InputError("a linear model needs finite transitions, got NaN or infinity.")
         columns = [data.x, data.u, *([np.ones((len(data), 1))] if intercept else [])]
         regressors = np.concatenate(columns, axis=1)
         with single_threaded():

@@ -51,6 +51,7 @@ class SequentialSearch(ABC):
 
     def ask(self, n: int = 1) -> Array:
         """Return the next points, shape ``(n, d)``; they are pending until told."""
+        self._require_reset()
         if n < 1:
             raise InputError(f"a search is asked for at least one point, got n = {n}.")
         proposals = []
@@ -66,12 +67,16 @@ class SequentialSearch(ABC):
 
         Raises:
             ShapeError: points and values do not fit together or the dimension.
+            InputError: a point is outside the unit cube, or the search was never reset.
         """
+        self._require_reset()
         rows, scalars = as_floats("points", points), as_floats("values", values)
         if rows.ndim != 2 or rows.shape[1] != self._dimension or scalars.shape != (len(rows),):
             raise ShapeError(
                 f"tell needs points (n, {self._dimension}) and values (n,), got {rows.shape} and {scalars.shape}."
             )
+        if not ((rows >= 0) & (rows <= 1)).all():
+            raise InputError(f"a search is told points of the unit cube, got {rows.tolist()}.")
         for point, value in zip(rows, scalars.tolist(), strict=True):
             slot = self._waiting_slot(point)
             if slot is None:
@@ -79,6 +84,10 @@ class SequentialSearch(ABC):
                 self._values.append(value)
             else:
                 self._values[slot] = value
+
+    def _require_reset(self) -> None:
+        if not hasattr(self, "_points"):
+            raise InputError("reset(dimension, seed) must come before ask and tell.")
 
     def _waiting_slot(self, point: Array) -> int | None:
         for slot, (known, value) in enumerate(zip(self._points, self._values, strict=True)):

@@ -41,8 +41,8 @@ class GPUCB(SequentialSearch):
         noise: tuple[float, float] = (gp.NOISE, gp.NOISE),
         prior_mean: gp.Mean | None = None,
     ) -> None:
-        if not beta >= 0:
-            raise InputError(f"beta must not be negative, got {beta!r}.")
+        if not 0 <= beta < float("inf"):
+            raise InputError(f"beta must not be negative or infinite, got {beta!r}.")
         if initial < 1:
             raise InputError(f"GP-UCB needs at least one initial point, got {initial}.")
         self.beta = beta

@@ -1,0 +1,98 @@
+"""What every certificate says of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.errors import CertificateError
+from ctxval.trial import Origin, State
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Executed trials, as far as a certificate may know of them: numbers and why they were chosen.
+
+    Attributes:
+        points: of the unit cube, shape ``(n, d)``.
+        distances: shape ``(n,)``; NaN where the execution failed.
+        origins: n reasons why a trial was chosen.
+        states: n states; open trials are refused by every certificate.
+
+    Raises:
+        CertificateError: the parts do not fit together, or a trial is still open.
+    """
+
+    points: Array
+    distances: Array
+    origins: Sequence[Origin]
+    states: Sequence[State]
+
+    def __post_init__(self) -> None:
+        lengths = {len(self.points), len(self.distances), len(self.origins), len(self.states)}
+        if len(lengths) != 1:
+            raise CertificateError(
+                f"points, distances, origins and states must be equally many, got {sorted(lengths)}."
+            )
+        if "open" in self.states:
+            raise CertificateError(
+                f"{list(self.states).count('open')} trials are open; tell how they ended before certifying."
+            )
+
+    def __len__(self) -> int:
+        return len(self.distances)
+
+    @property
+    def failed(self) -> int:
+        """How many executions failed."""
+        return int(np.isnan(self.distances).sum())
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A statement on d*, with everything it rests on.
+
+    Attributes:
+        kind: which theory.
+        statement: what it says, in one sentence.
+        upper_bound: h, in the distance's units.
+        confidence: the probability of the statement, over what ``assumptions`` say is random.
+        volume: the share of the task space that the statement leaves out; 0 where it covers all of it.
+        trials: n.
+        assumptions: what must hold, in plain words.
+        details: the numbers behind it.
+        version: of ctxval.
+    """
+
+    kind: str
+    statement: str
+    upper_bound: float
+    confidence: float
+    volume: float
+    trials: int
+    assumptions: tuple[str, ...]
+    details: dict[str, Any] = field(default_factory=dict)
+    version: str = ""
+
+    def covers(self, threshold: float) -> bool:
+        """Return whether the bound is at most the threshold."""
+        return self.upper_bound <= threshold
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything, ready for JSON."""
+        return asdict(self)
+
+
+def require_probability(name: str, value: float) -> float:
+    """Return a probability strictly between 0 and 1.
+
+    Raises:
+        CertificateError: it is not.
+    """
+    if not 0 < value < 1:
+        raise CertificateError(f"{name} must be strictly between 0 and 1, got {value!r}.")
+    return float(value)

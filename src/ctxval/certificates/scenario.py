@@ -1,0 +1,117 @@
+r"""Scenario and sampling-and-discarding bounds, exact (the paper's Sec. IV-A; Campi and Garatti 2011 with d = 1).
+
+Of N independent draws from the task space, discard the k largest distances; h is the largest that is left. The volume
+V = Pr(d(p) > h) then has, for a continuous distribution of d, the law of the (k+1)-th smallest of N uniform draws,
+Beta(k + 1, N - k), so that
+
+    Pr(V > eps) = sum_{i=0}^{k} binom(N, i) eps^i (1 - eps)^(N - i),
+
+and for any distribution Pr(V > eps) is at most that. The paper's sum ends at k - 1, which is too small a probability:
+already for k = 0 it would be empty, and claim that one draw bounds everything.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import bdtr, betaincinv
+
+from ctxval.certificates.base import Certificate, Sample, require_probability
+from ctxval.errors import CertificateError
+
+_MOST_SAMPLES = 2**40
+
+
+def tail(n: int, discarded: int, volume: float) -> float:
+    """Return Pr(V > volume) after n draws of which the k largest are discarded.
+
+    Raises:
+        CertificateError: k is negative or not below n, or the volume not a probability.
+    """
+    _require_counts(n, discarded)
+    return float(bdtr(discarded, n, require_probability("volume", volume)))
+
+
+def volume_bound(n: int, discarded: int, beta: float) -> float:
+    """Return the least eps with ``Pr(V > eps) <= beta``.
+
+    Raises:
+        CertificateError: k is negative or not below n, or beta not a probability.
+    """
+    _require_counts(n, discarded)
+    return float(betaincinv(discarded + 1, n - discarded, 1 - require_probability("beta", beta)))
+
+
+def samples_needed(volume: float, beta: float, discarded: int = 0) -> int:
+    """Return the least N with ``Pr(V > volume) <= beta``; for k = 0 it is ``log(beta) / log(1 - volume)``, rounded up.
+
+    Raises:
+        CertificateError: volume or beta are not probabilities, or N would be beyond all use.
+    """
+    require_probability("beta", beta)
+    low, high = discarded, discarded + 1
+    while tail(high, discarded, volume) > beta:
+        low, high = high, 2 * high
+        if high > _MOST_SAMPLES:
+            raise CertificateError(f"a volume of {volume:g} needs more than {_MOST_SAMPLES:g} samples.")
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if tail(middle, discarded, volume) > beta else (low, middle)
+    return high
+
+
+def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 0) -> Certificate:
+    """Bound the volume of the tasks whose distance exceeds the largest one left after discarding.
+
+    A failed execution counts as a violation, larger than any distance, so it must be among the discarded.
+
+    Args:
+        sample: independent uniform draws alone.
+        confidence: 1 - beta.
+        discarded: k; 0 is scenario optimisation. It must be chosen before the distances are looked at.
+
+    Raises:
+        CertificateError: a trial is no independent draw, too few are left, or more failed than are discarded.
+    """
+    beta = 1 - require_probability("confidence", confidence)
+    foreign = [origin for origin in sample.origins if origin != "iid"]
+    if foreign:
+        raise CertificateError(
+            f"a {_name(discarded)} bound takes independent draws alone, but {len(foreign)} of {len(sample)} trials "
+            f"were chosen otherwise ({', '.join(sorted(set(foreign)))}); run --search random, or audit."
+        )
+    _require_counts(len(sample), discarded)
+    if sample.failed > discarded:
+        raise CertificateError(
+            f"{sample.failed} of {len(sample)} executions failed and count as violations, more than the {discarded} "
+            "discarded; nothing bounds them."
+        )
+    ordered = np.sort(np.nan_to_num(sample.distances, nan=np.inf))
+    h = float(ordered[len(sample) - 1 - discarded])
+    volume = volume_bound(len(sample), discarded, beta)
+    return Certificate(
+        kind=_name(discarded),
+        statement=(
+            f"With confidence {confidence:g}, at most {100 * volume:.3g} % of the task space "
+            f"has a distance above {h:.4g}."
+        ),
+        upper_bound=h,
+        confidence=confidence,
+        volume=volume,
+        trials=len(sample),
+        assumptions=(
+            "the trials are independent and uniform over the task space",
+            "the number discarded was chosen before the distances were known",
+            "each task has one distance: the system is deterministic",
+            "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
+        ),
+        details={"discarded": discarded, "failed": sample.failed},
+    )
+
+
+def _name(discarded: int) -> str:
+    return "sampling-discarding" if discarded else "scenario"
+
+
+def _require_counts(n: int, discarded: int) -> None:
+    if not 0 <= discarded < n:
+        raise CertificateError(f"of {n} trials, from 0 to {max(n - 1, 0)} can be discarded, not {discarded}.")

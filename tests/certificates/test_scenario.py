@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctxval.certificates import Certificate, Sample, certify_scenario, samples_needed, tail, volume_bound
+from ctxval.errors import CertificateError
+
+DRAWS = 100_000
+betas = st.floats(1e-6, 0.5)
+volumes = st.floats(1e-3, 0.5)
+
+
+def sample(distances: list[float], origin: str = "iid") -> Sample:
+    n = len(distances)
+    states = ["failed" if np.isnan(d) else "completed" for d in distances]
+    return Sample(np.full((n, 2), 0.5), np.array(distances), [origin] * n, states)  # type: ignore[list-item, arg-type]
+
+
+@pytest.mark.parametrize(("n", "discarded"), [(10, 0), (20, 1), (60, 5), (100, 5)])
+@pytest.mark.parametrize("volume", [0.02, 0.05, 0.1])
+def test_the_tail_is_the_simulated_one_and_the_papers_sum_is_not(n: int, discarded: int, volume: float) -> None:
+    # With uniform d, the volume above the (k+1)-th largest of n draws is one minus it.
+    rng = np.random.default_rng([n, discarded])
+    kept = np.partition(rng.random((DRAWS, n)), n - 1 - discarded, axis=1)[:, n - 1 - discarded]
+    simulated = (1 - kept > volume).mean()
+    exact = tail(n, discarded, volume)
+    assert abs(simulated - exact) < 4.5 * np.sqrt(exact * (1 - exact) / DRAWS) + 1e-5
+    printed = tail(n, discarded - 1, volume) if discarded else 0.0
+    if exact - printed > 0.01:
+        assert abs(simulated - printed) > 4.5 * np.sqrt(exact * (1 - exact) / DRAWS)
+
+
+@given(volumes, betas)
+def test_without_discarding_the_number_needed_is_the_closed_form(volume: float, beta: float) -> None:
+    n = samples_needed(volume, beta)
+    assert (1 - volume) ** n <= beta * (1 + 1e-9)
+    assert n == 1 or (1 - volume) ** (n - 1) > beta * (1 - 1e-9)
+
+
+@given(st.integers(1, 400), st.integers(0, 10), betas)
+def test_the_volume_bound_inverts_the_tail(n: int, discarded: int, beta: float) -> None:
+    if discarded < n:
+        assert tail(n, discarded, volume_bound(n, discarded, beta)) == pytest.approx(beta, rel=1e-6)
+
+
+@given(st.integers(12, 300), st.integers(0, 10), betas)
+def test_more_samples_never_widen_and_more_confidence_or_discarding_never_tighten(n: int, k: int, beta: float) -> None:
+    bound = volume_bound(n, k, beta)
+    assert volume_bound(n + 1, k, beta) <= bound + 1e-12
+    assert volume_bound(n, k, beta / 2) >= bound - 1e-12
+    assert volume_bound(n, k + 1, beta) >= bound - 1e-12
+
+
+@given(volumes, betas, st.integers(0, 6))
+def test_the_number_needed_is_the_least(volume: float, beta: float, discarded: int) -> None:
+    n = samples_needed(volume, beta, discarded)
+    assert tail(n, discarded, volume) <= beta
+    assert n == discarded + 1 or tail(n - 1, discarded, volume) > beta
+
+
+@pytest.mark.parametrize("discarded", [0, 3])
+def test_the_stated_confidence_is_the_measured_coverage(discarded: int) -> None:
+    rng = np.random.default_rng(discarded)
+    held, runs, n = 0, 4000, 40
+    for _ in range(runs):
+        certificate = certify_scenario(sample(rng.random(n).tolist()), 0.9, discarded)
+        held += 1 - certificate.upper_bound <= certificate.volume
+    assert abs(held / runs - 0.9) < 4.5 * np.sqrt(0.09 / runs)
+
+
+def test_a_certificate_says_everything() -> None:
+    certificate = certify_scenario(sample([0.1, 0.4, 0.2]), 0.95)
+    assert isinstance(certificate, Certificate)
+    assert certificate.upper_bound == 0.4
+    assert certificate.volume == pytest.approx(1 - 0.05 ** (1 / 3))
+    assert "no bound on d*" in " ".join(certificate.assumptions)
+    assert certificate.to_json()["kind"] == "scenario"
+    assert certificate.covers(0.4)
+    assert not certificate.covers(0.39)
+
+
+def test_a_failed_execution_counts_as_a_violation() -> None:
+    with pytest.raises(CertificateError, match="count as violations"):
+        certify_scenario(sample([0.1, np.nan, 0.3]))
+    assert certify_scenario(sample([0.1, np.nan, 0.3]), discarded=1).upper_bound == 0.3
+
+
+@pytest.mark.parametrize("origin", ["acquisition", "initial", "manual"])
+def test_adaptive_trials_are_refused(origin: str) -> None:
+    with pytest.raises(CertificateError, match="independent draws alone"):
+        certify_scenario(sample([0.1, 0.2], origin))
+
+
+@pytest.mark.parametrize(("confidence", "discarded"), [(0.0, 0), (1.0, 0), (1.5, 0), (0.9, -1), (0.9, 2)])
+def test_nonsense_is_refused(confidence: float, discarded: int) -> None:
+    with pytest.raises(CertificateError):
+        certify_scenario(sample([0.1, 0.2]), confidence, discarded)
+
+
+def test_open_trials_and_unequal_parts_are_refused() -> None:
+    with pytest.raises(CertificateError, match="are open"):
+        Sample(np.zeros((1, 1)), np.zeros(1), ["iid"], ["open"])
+    with pytest.raises(CertificateError, match="equally many"):
+        Sample(np.zeros((2, 1)), np.zeros(1), ["iid"], ["completed"])

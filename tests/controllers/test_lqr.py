@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ctxval import Task
+from ctxval.controllers import LQR
+from ctxval.errors import InputError, ShapeError
+from ctxval.model import Function, linearize
+from ctxval.models import Linear
+from ctxval.rollout import rollout
+
+SIZES = [(1, 1, 3), (2, 1, 10), (3, 2, 7), (4, 4, 5), (2, 3, 12)]
+
+
+def gram(rng: np.random.Generator, size: int, ridge: float) -> np.ndarray:
+    factor = rng.normal(size=(size, size))
+    return factor @ factor.T + ridge * np.eye(size)
+
+
+def problem(n: int, m: int, horizon: int, seed: int, batch: tuple[int, ...] = ()) -> tuple[LQR, Linear, Task]:
+    """Return a random tracking problem with an offset, neither strongly stable nor strongly unstable."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(n, n))
+    A *= 1.05 / np.abs(np.linalg.eigvals(A)).max()
+    model = Linear(A, rng.normal(size=(n, m)), rng.normal(size=n))
+    reference = rng.normal(size=(*batch, horizon + 1, n))
+    task = Task(rng.normal(size=(*batch, n)), horizon=horizon, dt=0.1, reference=reference)
+    return LQR(gram(rng, n, 0.0), gram(rng, m, 0.1), gram(rng, n, 0.0)), model, task
+
+
+def dense_optimum(regulator: LQR, model: Linear, x0: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Return the inputs ``(H, m)`` that solve the equality-constrained quadratic program by its KKT system.
+
+    The variables are u_0, x_1, u_1, ..., x_H, as they come; one multiplier belongs to each step of the model.
+    """
+    (n, m), horizon, cost = model.B.shape, len(reference) - 1, regulator.cost
+    size, k = horizon * (n + m), n + m
+    P, q = np.zeros((size, size)), np.zeros(size)
+    G, h = np.zeros((horizon * n, size)), np.tile(model.c, horizon)
+    h[:n] += model.A @ x0
+    for t in range(horizon):
+        u, x, row = slice(t * k, t * k + m), slice(t * k + m, (t + 1) * k), slice(t * n, (t + 1) * n)
+        Q = cost.Q_final if t == horizon - 1 else cost.Q
+        P[u, u], P[x, x], q[x] = cost.R, Q, -Q @ reference[t + 1]
+        G[row, x], G[row, u] = np.eye(n), -model.B
+        if t:
+            G[row, slice((t - 1) * k + m, t * k)] = -model.A
+    kkt = np.block([[P, G.T], [G, np.zeros((len(h), len(h)))]])
+    return np.linalg.solve(kkt, np.concatenate([-q, h]))[:size].reshape(horizon, k)[:, :m]
+
+
+def assert_close(actual: np.ndarray, desired: np.ndarray, relative: float) -> None:
+    assert np.abs(actual - desired).max() <= relative * np.abs(desired).max()
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("n", "m", "horizon"), SIZES)
+def test_the_inputs_are_the_dense_optimum(n: int, m: int, horizon: int, seed: int) -> None:
+    regulator, model, task = problem(n, m, horizon, seed)
+    inputs = rollout(model.step, regulator.design(task, model), task).inputs
+    assert_close(inputs, dense_optimum(regulator, model, task.initial_state, task.reference), 1e-9)
+
+
+@pytest.mark.parametrize("start", [1, 4, 9])
+def test_from_any_state_at_any_time_the_rest_is_optimal(start: int) -> None:
+    regulator, model, task = problem(2, 1, 10, 7)
+    controller = regulator.design(task, model)
+    x = here = np.array([3.0, -2.0])
+    inputs = []
+    for t in range(start, 10):
+        inputs.append(controller(t, x))
+        x = model.step(x, inputs[-1])
+    assert_close(np.array(inputs), dense_optimum(regulator, model, here, task.reference[start:]), 1e-9)
+
+
+def test_the_weight_of_the_last_state_is_that_of_the_others_unless_given() -> None:
+    _, model, task = problem(2, 1, 6, 0)
+    Q, R = [[2.0, 0.3], [0.3, 1.0]], [0.5]
+    default, explicit = LQR(Q, R).design(task, model), LQR(Q, R, Q).design(task, model)
+    np.testing.assert_array_equal(default.gains, explicit.gains)
+    assert not np.allclose(default.gains, LQR(Q, R, [9.0, 9.0]).design(task, model).gains)
+
+
+def test_far_from_the_end_the_gain_solves_the_algebraic_riccati_equation() -> None:
+    from scipy.linalg import solve_discrete_are
+
+    _, model, _ = problem(3, 2, 1, 3)
+    task = Task(np.zeros(3), horizon=300, dt=0.1)
+    P = solve_discrete_are(model.A, model.B, np.eye(3), np.eye(2))
+    stationary = -np.linalg.solve(np.eye(2) + model.B.T @ P @ model.B, model.B.T @ P @ model.A)
+    np.testing.assert_allclose(LQR(np.ones(3), np.ones(2)).design(task, model).gains[0], stationary, atol=1e-10)
+
+
+@pytest.mark.parametrize("batch", [(5,), (2, 3)])
+def test_a_batch_of_tasks_is_the_loop_over_them(batch: tuple[int, ...]) -> None:
+    regulator, model, task = problem(3, 2, 8, 1, batch)
+    whole = rollout(model.step, regulator.design(task, model), task)
+    for i in np.ndindex(batch):
+        one = Task(task.initial_state[i], horizon=8, dt=0.1, reference=task.reference[i])
+        alone = rollout(model.step, regulator.design(one, model), one)
+        np.testing.assert_allclose(whole.states[i], alone.states, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(whole.inputs[i], alone.inputs, rtol=0, atol=1e-10)
+
+
+def bend(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return x + 0.1 * np.stack([x[..., 1], np.sin(x[..., 0]) + (1 + x[..., 1] ** 2) * u[..., 0]], axis=-1)
+
+
+def test_a_nonlinear_model_is_linearised_at_the_initial_state_and_zero_input() -> None:
+    model, task = Function(bend), Task([1.0, -0.5], goal=[0.2, 0.0], horizon=9, dt=0.1)
+    A, B = linearize(model, task.initial_state, np.zeros(1))
+    tangent = Linear(A, B, model.step(task.initial_state, np.zeros(1)) - A @ task.initial_state)
+    regulator = LQR([1.0, 0.1], [0.01])
+    on_model, on_tangent = regulator.design(task, model), regulator.design(task, tangent)
+    np.testing.assert_allclose(on_model.gains, on_tangent.gains, rtol=1e-12)
+    np.testing.assert_allclose(on_model.inputs, on_tangent.inputs, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("vectorized", [False, True])
+def test_each_task_of_a_batch_has_the_gains_of_its_own_initial_state(vectorized: bool) -> None:
+    model, regulator = Function(bend, vectorized=vectorized), LQR([1.0, 0.1], [0.01])
+    task = Task([np.linspace(-2, 2, 4), 0.5], goal=[np.linspace(0, 1, 4), 0.0], horizon=9, dt=0.1)
+    whole = regulator.design(task, model)
+    assert whole.gains.shape == (4, 9, 1, 2)
+    for i in range(4):
+        alone = regulator.design(task[i], model)
+        np.testing.assert_allclose(whole[i].gains, alone.gains, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(whole[i].inputs, alone.inputs, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("weights", "sentence"),
+    [
+        (([1, -1], [1]), r"Q must have no negative eigenvalue, got \[\[1\.0, 0\.0\], \[0\.0, -1\.0\]\]"),
+        (([1, 1], [0]), r"R must be positive definite, got \[\[0\.0\]\]"),
+        (([1, 1], [-1]), r"R must have no negative eigenvalue, got \[\[-1\.0\]\]"),
+        (([1, 1], [1], [1, -3]), r"Q_final must have no negative eigenvalue, got \[\[1\.0, 0\.0\], \[0\.0, -3\.0\]\]"),
+        (([1, 1], [1], [1, 1, 1]), r"Q_final must have the shape of Q, \(2, 2\), got \(3, 3\)"),
+        (([1, np.nan], [1]), r"Q must be finite, got \[1\.0, nan\]"),
+        (([[1, 1], [0, 1]], [1]), r"Q must be symmetric, got \[\[1\.0, 1\.0\], \[0\.0, 1\.0\]\]"),
+    ],
+)
+def test_bad_weights_are_refused_by_value(weights: tuple[object, ...], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        LQR(*weights)
+
+
+def test_a_task_with_other_states_than_the_weights_is_refused() -> None:
+    _, model, task = problem(3, 1, 5, 0)
+    with pytest.raises(ShapeError, match=r"Q must weigh the task's 3 states, got shape \(2, 2\)"):
+        LQR([1, 1], [1]).design(task, model)

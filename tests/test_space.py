@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from ctxval import TaskSpace
+from ctxval.errors import InputError, ShapeError, UnknownNameError
+
+
+@st.composite
+def spaces(draw: st.DrawFn) -> TaskSpace:
+    """Draw a space of scalar and vector parameters, no narrower than a thousandth of its magnitude."""
+    bounds = {}
+    for i in range(draw(st.integers(1, 3))):
+        size = draw(st.sampled_from([None, 1, 2]))
+        shape = () if size is None else (size,)
+        low = draw(arrays(np.float64, shape, elements=st.floats(-1e3, 1e3)))
+        width = draw(arrays(np.float64, shape, elements=st.floats(1, 1e3)))
+        bounds[f"p{i}"] = (low, low + width, draw(st.sampled_from(["", "rad"])))
+    return TaskSpace(**bounds)
+
+
+@st.composite
+def spaces_and_unit_points(draw: st.DrawFn) -> tuple[TaskSpace, np.ndarray]:
+    space = draw(spaces())
+    batch = draw(st.sampled_from([(), (1,), (4,), (2, 3)]))
+    return space, draw(arrays(np.float64, (*batch, space.dimension), elements=st.floats(0, 1)))
+
+
+@pytest.fixture
+def space() -> TaskSpace:
+    return TaskSpace(goal=(-3, 3, "rad"), offset=([0, 10], [1, 20], "m"), mass=(1, 2))
+
+
+@settings(max_examples=40, deadline=None)
+@given(spaces_and_unit_points())
+def test_the_unit_cube_and_the_box_map_onto_each_other(given_: tuple[TaskSpace, np.ndarray]) -> None:
+    space, unit = given_
+    points = space.from_unit(unit)
+    assert points.shape == unit.shape
+    assert ((points >= space.low) & (points <= space.high)).all()
+    np.testing.assert_allclose(space.to_unit(points), unit, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(space.from_unit(space.to_unit(points)), points, rtol=1e-11, atol=1e-8)
+
+
+@settings(max_examples=40, deadline=None)
+@given(spaces())
+def test_the_corners_of_the_unit_cube_are_exactly_those_of_the_box(space: TaskSpace) -> None:
+    np.testing.assert_array_equal(space.from_unit(np.zeros(space.dimension)), space.low)
+    np.testing.assert_allclose(space.from_unit(np.ones(space.dimension)), space.high, rtol=1e-12, atol=1e-9)
+    np.testing.assert_array_equal(space.to_unit(space.low), 0)
+    np.testing.assert_array_equal(space.to_unit(space.high), 1)
+
+
+@settings(max_examples=40, deadline=None)
+@given(spaces_and_unit_points())
+def test_a_described_point_is_found_again_from_its_json(given_: tuple[TaskSpace, np.ndarray]) -> None:
+    space, unit = given_
+    point = space.from_unit(unit.reshape(-1, space.dimension)[0])
+    np.testing.assert_array_equal(space.point(json.loads(json.dumps(space.describe_point(point)))), point)
+
+
+def test_points_outside_the_unit_cube_are_clipped_to_the_box(space: TaskSpace) -> None:
+    np.testing.assert_array_equal(space.from_unit([-1.0, 2.0, 0.5, 3.0]), [-3, 1, 15, 2])
+
+
+def test_names_columns_and_labels_follow_the_order_of_the_keywords(space: TaskSpace) -> None:
+    assert space.names == ("goal", "offset[0]", "offset[1]", "mass")
+    assert space.labels == ("goal [rad]", "offset[0] [m]", "offset[1] [m]", "mass")
+    assert space.dimension == 4
+    assert space.columns("goal") == 0
+    assert space.columns("offset") == slice(1, 3)
+    assert space.columns("mass") == 3
+    assert space.low.tolist() == [-3, 0, 10, 1]
+    assert space.high.tolist() == [3, 1, 20, 2]
+
+
+def test_a_vector_parameter_of_one_component_stays_a_vector() -> None:
+    space = TaskSpace(a=([0], [1]))
+    assert space.names == ("a[0]",)
+    assert space.parameters(np.zeros((5, 1))).a.shape == (5, 1)
+
+
+def test_parameters_are_read_by_name_in_one_task_and_in_a_batch(space: TaskSpace) -> None:
+    points = np.arange(8.0).reshape(2, 4)
+    one, batch = space.parameters(points[0]), space.parameters(points)
+    assert one.goal == 0.0
+    assert one.offset.tolist() == [1.0, 2.0]
+    assert one["mass"] == 3.0
+    np.testing.assert_array_equal(batch.goal, [0, 4])
+    np.testing.assert_array_equal(batch.offset, [[1, 2], [5, 6]])
+    np.testing.assert_array_equal(batch.points, points)
+
+
+def test_parameters_show_their_values(space: TaskSpace) -> None:
+    assert repr(space.parameters([1, 2, 3, 4])) == "Parameters({'goal': 1.0, 'offset': [2.0, 3.0], 'mass': 4.0})"
+    assert repr(space.parameters(np.zeros((2, 4)))) == "Parameters(batch)"
+
+
+def test_an_unknown_parameter_is_refused_with_the_nearest_name(space: TaskSpace) -> None:
+    parameters = space.parameters(np.zeros(4))
+    for ask in (lambda: parameters.gaol, lambda: parameters["gaol"], lambda: space.columns("gaol")):
+        with pytest.raises(UnknownNameError, match=r"no task parameter is called 'gaol'; did you mean 'goal'\?"):
+            ask()
+
+
+def test_an_unknown_parameter_like_no_other_is_refused_with_all_names(space: TaskSpace) -> None:
+    with pytest.raises(UnknownNameError, match=r"known: goal, mass, offset\."):
+        space.columns("zzz")
+
+
+def test_python_may_probe_parameters_for_special_methods(space: TaskSpace) -> None:
+    assert not hasattr(space.parameters(np.zeros(4)), "__array_interface__")
+
+
+def test_the_description_has_the_bounds_by_scalar_name(space: TaskSpace) -> None:
+    expected = {"goal": [-3.0, 3.0], "offset[0]": [0.0, 1.0], "offset[1]": [10.0, 20.0], "mass": [1.0, 2.0]}
+    assert json.loads(json.dumps(space.describe())) == expected
+    assert repr(TaskSpace(goal=(-3, 3))) == "TaskSpace(goal=(-3, 3))"
+
+
+@pytest.mark.parametrize(
+    ("bound", "sentence"),
+    [
+        ((1, -1), "low < high"),
+        ((1, 1), "low < high"),
+        (([0, 1], [1, 1]), "low < high"),
+        ((np.nan, 1), "lower bound of goal must be finite"),
+        ((0, np.nan), "upper bound of goal must be finite"),
+        ((0, np.inf), "upper bound of goal must be finite"),
+        ((None, 1), "lower bound of goal must be finite"),
+        (("a", 1), "lower bound of goal must be numbers"),
+        ((0,), r"\(low, high\)"),
+        ((0, 1, "rad", 3), r"\(low, high\)"),
+        (3.0, r"\(low, high\)"),
+        ((0, 1, 2), "unit of goal must be a string, got 2"),
+        (([0, 0], [1, 1, 1]), "equally long"),
+        ((0, [1, 1]), "equally long"),
+        (([], []), "equally long"),
+        (([[0]], [[1]]), "equally long"),
+    ],
+)
+def test_unusable_bounds_are_refused_by_name(bound: object, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as caught:
+        TaskSpace(goal=bound)
+    assert "goal" in str(caught.value)
+
+
+def test_a_space_without_parameters_is_refused() -> None:
+    with pytest.raises(InputError, match="at least one parameter"):
+        TaskSpace()
+
+
+def test_a_point_needs_every_parameter_and_no_other(space: TaskSpace) -> None:
+    with pytest.raises(InputError, match=r"no value is given for offset\[0\], offset\[1\], mass\."):
+        space.point({"goal": 0})
+    with pytest.raises(UnknownNameError, match="did you mean 'mass'"):
+        space.point({"goal": 0, "offset": [0, 10], "mas": 1})
+
+
+@pytest.mark.parametrize(("goal", "sentence"), [(3.1, r"goal = 3\.1 is outside the task space, \[-3, 3\]")])
+def test_a_point_outside_the_box_is_refused_with_its_value(space: TaskSpace, goal: float, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        space.point({"goal": goal, "offset": [0, 10], "mass": 1})
+    with pytest.raises(InputError, match=r"offset\[1\] = 5 is outside"):
+        space.point({"goal": 0, "offset": [0, 5], "mass": 1})
+
+
+@pytest.mark.parametrize("goal", [np.nan, np.inf, "far"])
+def test_a_point_of_no_finite_number_is_refused_by_name(space: TaskSpace, goal: object) -> None:
+    with pytest.raises(InputError, match=r"^goal must be"):
+        space.point({"goal": goal, "offset": [0, 10], "mass": 1})
+
+
+@pytest.mark.parametrize("offset", [[0, 10, 0], [0], 0.5])
+def test_a_value_of_another_length_is_refused_with_both_shapes(space: TaskSpace, offset: object) -> None:
+    with pytest.raises(ShapeError, match=r"offset must have shape \(2,\), got \("):
+        space.point({"goal": 0, "offset": offset, "mass": 1})
+
+
+def test_points_of_another_dimension_are_refused_with_both_shapes(space: TaskSpace) -> None:
+    for convert in (space.to_unit, space.from_unit, space.parameters):
+        with pytest.raises(ShapeError, match=r"points must have shape \(\.\.\., 4\), got \(2, 3\)"):
+            convert(np.zeros((2, 3)))
+
+
+def test_iid_points_are_a_function_of_the_generator(space: TaskSpace) -> None:
+    first, again = (space.iid(50, np.random.default_rng(7)) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert first.shape == (50, 4)
+    assert not np.array_equal(first, space.iid(50, np.random.default_rng(8)))
+
+
+def test_iid_points_are_uniform_over_the_box(space: TaskSpace) -> None:
+    unit = space.to_unit(space.iid(20_000, np.random.default_rng(0)))
+    np.testing.assert_allclose(unit.mean(axis=0), 0.5, atol=0.01)
+    np.testing.assert_allclose(unit.var(axis=0), 1 / 12, atol=0.003)
+    np.testing.assert_allclose(np.corrcoef(unit.T), np.eye(4), atol=0.03)
+
+
+@pytest.mark.parametrize("n", [0, 1, 3, 8, 100])
+def test_sobol_points_are_a_prefix_of_one_seeded_sequence(space: TaskSpace, n: int) -> None:
+    points = space.sobol(n, seed=3)
+    assert points.shape == (n, 4)
+    np.testing.assert_array_equal(points, space.sobol(128, seed=3)[:n])
+    assert ((points >= space.low) & (points <= space.high)).all()
+
+
+def test_sobol_points_of_a_power_of_two_fill_every_slice_once() -> None:
+    unit = TaskSpace(a=(0, 1), b=(0, 1)).sobol(16, seed=0)
+    for column in np.floor(16 * unit).astype(int).T:
+        assert sorted(column) == list(range(16))
+
+
+def test_sobol_points_differ_between_seeds(space: TaskSpace) -> None:
+    assert not np.array_equal(space.sobol(8, seed=0), space.sobol(8, seed=1))
+
+
+def test_a_grid_has_both_ends_and_every_combination() -> None:
+    grid = TaskSpace(a=(0, 2), b=(-1, 1)).grid(3)
+    assert grid.tolist() == [[a, b] for a in (0.0, 1.0, 2.0) for b in (-1.0, 0.0, 1.0)]
+
+
+@pytest.mark.parametrize("per_axis", [1, 0, -2])
+def test_a_grid_of_fewer_than_two_points_an_axis_is_refused(space: TaskSpace, per_axis: int) -> None:
+    with pytest.raises(InputError, match=rf"at least 2 points an axis, got {per_axis}"):
+        space.grid(per_axis)
+
+
+def test_a_function_of_parameters_becomes_one_of_unit_points(space: TaskSpace) -> None:
+    function = space.unit_function(lambda p: p.goal**2 + p.offset[..., 1] * p.mass)
+    unit = np.random.default_rng(0).random((6, 4))
+    points = space.from_unit(unit)
+    np.testing.assert_allclose(function(unit), points[:, 0] ** 2 + points[:, 2] * points[:, 3], rtol=1e-14)
+
+
+def test_a_constant_function_of_parameters_has_one_value_a_point(space: TaskSpace) -> None:
+    np.testing.assert_array_equal(space.unit_function(lambda p: 2)(np.zeros((3, 4))), [2.0, 2.0, 2.0])

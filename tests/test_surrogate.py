@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ctxval import gp
+from ctxval.errors import InputError
+from ctxval.kernels import Linear, Matern
+from ctxval.surrogate import fit_surrogate
+
+
+def data(n: int = 15, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    X = np.random.default_rng(seed).random((n, 2))
+    return X, np.sin(5 * X[:, 0]) + X[:, 1]
+
+
+def where() -> np.ndarray:
+    return np.random.default_rng(99).random((30, 2))
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(-1e3, 1e3), st.floats(1e-3, 1e3))
+def test_predictions_are_in_the_units_of_the_values(shift: float, scale: float) -> None:
+    X, y = data()
+    mean, deviation = fit_surrogate(X, y).predict(where())
+    moved, widened = fit_surrogate(X, shift + scale * y).predict(where())
+    np.testing.assert_allclose(moved, shift + scale * mean, rtol=0, atol=1e-3 * scale + 1e-9 * abs(shift))
+    np.testing.assert_allclose(widened, scale * deviation, rtol=1e-2, atol=1e-3 * scale)
+
+
+def test_the_surrogate_goes_through_noise_free_values() -> None:
+    X, y = data()
+    mean, deviation = fit_surrogate(X, y).predict(X)
+    np.testing.assert_allclose(mean, y, atol=1e-3)
+    assert deviation.max() < 0.01
+
+
+def test_the_surrogate_is_close_to_the_function_between_many_values() -> None:
+    X, y = data(60)
+    mean, deviation = fit_surrogate(X, y, Matern(2.5, ard=True)).predict(where())
+    truth = np.sin(5 * where()[:, 0]) + where()[:, 1]
+    np.testing.assert_allclose(mean, truth, atol=0.05)
+    assert (np.abs(mean - truth) <= 4 * deviation + 1e-3).all()
+
+
+def test_the_given_kernel_and_noise_are_used() -> None:
+    X, y = data()
+    surrogate = fit_surrogate(X, y, Linear(), noise=(0.3, 0.3))
+    assert surrogate.process.kernel == Linear()
+    assert surrogate.process.noise == pytest.approx(0.3)
+
+
+def test_points_of_unknown_value_narrow_the_surrogate_and_move_nothing() -> None:
+    X, y = data()
+    pending = np.array([[0.95, 0.05], [0.05, 0.95]])
+    alone = fit_surrogate(X, y)
+    with_pending = fit_surrogate(np.concatenate([X, pending]), np.append(y, [np.nan, np.nan]))
+    np.testing.assert_allclose(with_pending.predict(where())[0], alone.predict(where())[0], atol=1e-6)
+    assert (with_pending.predict(where())[1] <= alone.predict(where())[1] + 1e-9).all()
+    assert (with_pending.predict(pending)[1] < 0.1 * alone.predict(pending)[1]).all()
+
+
+def test_equal_values_make_a_flat_surrogate_in_their_own_units() -> None:
+    X, _ = data()
+    mean, deviation = fit_surrogate(X, np.full(15, 7.0)).predict(where())
+    np.testing.assert_allclose(mean, 7.0, rtol=1e-12)
+    assert np.isfinite(deviation).all()
+
+
+def test_an_exact_prior_mean_is_predicted_everywhere() -> None:
+    X, y = data(4)
+    prior = lambda X: np.sin(5 * X[:, 0]) + X[:, 1]  # noqa: E731
+    np.testing.assert_allclose(fit_surrogate(X, y, prior_mean=prior).predict(where())[0], prior(where()), atol=1e-12)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(1e-2, 1e2))
+def test_a_prior_mean_is_in_the_units_of_the_values(scale: float) -> None:
+    X, y = data()
+    prior = lambda X: X[:, 1]  # noqa: E731
+    mean, deviation = fit_surrogate(X, y, prior_mean=prior).predict(where())
+    scaled, widened = fit_surrogate(X, scale * y, prior_mean=lambda X: scale * prior(X)).predict(where())
+    np.testing.assert_allclose(scaled, scale * mean, rtol=0, atol=1e-3 * scale)
+    np.testing.assert_allclose(widened, scale * deviation, rtol=1e-2, atol=1e-3 * scale)
+
+
+@pytest.mark.parametrize("known", [0, 1])
+def test_fewer_than_two_known_values_are_refused(known: int) -> None:
+    X, y = data(3)
+    y[known:] = np.nan
+    with pytest.raises(InputError, match=rf"at least two known distances, got {known}"):
+        fit_surrogate(X, y)
+
+
+@pytest.mark.parametrize("prior", [lambda X: np.full(len(X), np.nan), lambda X: X, lambda X: 0.0])
+def test_a_prior_mean_without_one_finite_value_a_point_is_refused(prior: gp.Mean) -> None:
+    with pytest.raises(InputError, match="one finite value for each point"):
+        fit_surrogate(*data(), prior_mean=prior)
