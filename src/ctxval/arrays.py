@@ -27,9 +27,9 @@ def as_floats(name: str, value: ArrayLike) -> Array:
     Raises:
         InputError: it is not numeric.
     """
-    if np.iscomplexobj(value):
-        raise InputError(f"{name} must be real numbers, got {value!r}.")
     try:
+        if np.iscomplexobj(value):
+            raise TypeError
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must be numbers, got {value!r}.") from error
