@@ -138,6 +138,32 @@ def cases(as_json: AsJson = False) -> None:
     _print_table(known_cases.NAMES)
 
 
+@app.command()
+@_command
+def reproduce(
+    name: Annotated[str, typer.Argument(metavar="STUDY|all", help="Which of the paper's figures, or all.")],
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer trials, coarser grids.")] = False,
+    out: Annotated[
+        Path, typer.Option(help="Folder of results, figures and data; what is in it is not run again.")
+    ] = Path("reproduction"),
+    workers: Annotated[int, typer.Option(help="Processes.")] = 2,
+) -> None:
+    """Run the paper's experiments: figures, their data, and the table of its claims."""
+    from ctxval import reproduce as paper  # imported here: the other commands do not need it
+
+    with Progress(TextColumn("runs"), *Progress.get_default_columns(), console=_err) as progress:
+        line = progress.add_task("")
+        table = paper.reproduce(
+            name,
+            out,
+            scale=paper.QUICK if quick else paper.FULL,
+            workers=workers,
+            on_start=lambda missing: progress.update(line, total=missing),
+            on_done=lambda job: progress.update(line, advance=1, description=job.key),
+        )
+    _out.print(f"table: {table}\nfigures and data: {out}", highlight=False)
+
+
 def _run_with_progress(campaign: Campaign, budget: int, *, show: bool) -> None:
     columns = (
         TextColumn("executions"),

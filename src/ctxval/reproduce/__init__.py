@@ -1,0 +1,81 @@
+"""Every experiment of the paper, from the systems' equations to its eight figures and the table of its claims."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from ctxval.errors import InputError, UnknownNameError
+from ctxval.reproduce.arm import ArmModels, ArmSamples
+from ctxval.reproduce.dubins import DubinsMedians
+from ctxval.reproduce.jobs import Job, Results
+from ctxval.reproduce.linear import LinearComplexity
+from ctxval.reproduce.pendulum import ConvergedGP, Frameworks, Techniques, Trajectories
+from ctxval.reproduce.study import FULL, QUICK, Scale, Study
+from ctxval.reproduce.table import write_table
+
+__all__ = ["FULL", "QUICK", "STUDIES", "Scale", "Study", "reproduce", "studies_named"]
+
+STUDIES: tuple[Study, ...] = (
+    Frameworks(),
+    Trajectories(),
+    Techniques(),
+    ConvergedGP(),
+    DubinsMedians(),
+    ArmSamples(),
+    ArmModels(),
+    LinearComplexity(),
+)
+"""The paper's figures, in its order."""
+
+
+def studies_named(name: str) -> list[Study]:
+    """Return one study by its name, or all.
+
+    Raises:
+        UnknownNameError: there is no such study.
+    """
+    if name == "all":
+        return list(STUDIES)
+    found = [study for study in STUDIES if study.name == name]
+    if not found:
+        raise UnknownNameError.among("study", name, ["all", *(study.name for study in STUDIES)])
+    return found
+
+
+def reproduce(
+    name: str,
+    out: Path,
+    *,
+    scale: Scale = FULL,
+    workers: int = 2,
+    on_start: Callable[[int], None] = lambda missing: None,
+    on_done: Callable[[Job], None] = lambda job: None,
+) -> Path:
+    """Run what is not stored yet, draw the figures, and write the table of claims; return the table's path.
+
+    The table has every study whose runs are stored, not only the one that was asked for.
+
+    Args:
+        name: one study, or ``all``.
+        out: folder of results, figures (PNG) and their data (CSV); the table is written beside it, ``<out>.md``.
+        scale: full, or quick with fewer trials and coarser grids.
+        workers: processes.
+        on_start: called with the number of runs that are missing.
+        on_done: called after each.
+
+    Raises:
+        InputError: there is no such study, or no worker.
+    """
+    if workers < 1:
+        raise InputError(f"workers must be at least 1, got {workers}.")
+    chosen = studies_named(name)
+    results = Results(out / f"results-{scale.name}")
+    jobs = [job for study in chosen for job in study.jobs(scale)]
+    on_start(len([job for job in dict.fromkeys(jobs) if job not in results]))
+    results.fill(jobs, workers, on_done)
+    for study in chosen:
+        study.draw(results, scale).savefig(out / f"{study.name}.png", dpi=150)
+        study.data(results, scale).write(out / f"{study.name}.csv")
+    complete = [study for study in STUDIES if all(job in results for job in study.jobs(scale))]
+    return write_table(out, complete, results, scale)

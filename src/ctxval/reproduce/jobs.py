@@ -1,0 +1,233 @@
+"""The single runs that the paper's figures are made of: each stored in a file of its own, run in parallel processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctxval import cases, searches
+from ctxval.arrays import Array, single_threaded
+from ctxval.campaign import Campaign
+from ctxval.errors import InputError
+from ctxval.experiment import Experiment
+
+Result = dict[str, Any]
+
+DISCARDED = 5
+"""The paper's k in sampling and discarding."""
+
+_DIGITS = 10
+"""Significant digits that are stored: more than any figure shows, and half the size."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run, fully said by its fields.
+
+    Attributes:
+        kind: a key of :data:`KINDS`.
+        case: which system.
+        seed: of the data, the model and the search.
+        options: of the case, as pairs.
+        search: which search, for the kind ``search``.
+        budget: executions, or grid points on each axis.
+    """
+
+    kind: str
+    case: str
+    seed: int
+    options: tuple[tuple[str, Any], ...] = ()
+    search: str = ""
+    budget: int = 0
+
+    @property
+    def key(self) -> str:
+        """A readable name, for the file of the result."""
+        options = [f"{name}-{value}" for name, value in self.options]
+        parts = [
+            self.kind,
+            self.case,
+            *options,
+            self.search,
+            f"{self.budget}" if self.budget else "",
+            f"seed{self.seed}",
+        ]
+        return re.sub(r"[^a-zA-Z0-9._-]+", "-", "_".join(part for part in parts if part))
+
+    def experiment(self) -> Experiment:
+        """Return the case that the job runs on."""
+        return cases.by_name(self.case, self.seed, **dict(self.options))
+
+
+# The kinds of jobs
+
+
+def _search(job: Job) -> Result:
+    """Return the points and distances of one campaign, in order; of independent draws only the records."""
+    experiment = job.experiment()
+    search = searches.by_name(job.search)
+    if getattr(search, "iid", False):
+        # The points depend on no distance, so all of them are executed in one batch.
+        search.reset(experiment.validation.space.dimension, job.seed)
+        unit = search.ask(job.budget)
+        points = experiment.validation.space.from_unit(unit)
+        return {"executions": job.budget, "records": records(experiment.validation.distances(points))}
+    campaign = Campaign(experiment.validation, search=search, seed=job.seed, name=experiment.name).run(job.budget)
+    points = experiment.validation.space.from_unit(np.array([trial.unit_point for trial in campaign.trials]))
+    distances = [np.nan if trial.distance is None else trial.distance for trial in campaign.trials]
+    return {"points": points.tolist(), "distances": distances}
+
+
+def records(distances: Array) -> list[list[float]]:
+    """Return ``[index, distance]`` of each one that was among the six largest when it came.
+
+    These are all that the estimates of SC and of SD with k = 5 ever look at.
+    """
+    largest: list[float] = []
+    found = []
+    for index, distance in enumerate(distances.tolist()):
+        if distance > (largest[-1] if len(largest) > DISCARDED else -np.inf):
+            largest = sorted([*largest, distance], reverse=True)[: DISCARDED + 1]
+            found.append([index, distance])
+    return found
+
+
+def distances_of(result: Result) -> Array:
+    """Return the distances of a search in order; NaN for those that were no records."""
+    if "distances" in result:
+        return np.array(result["distances"], dtype=np.float64)
+    distances = np.full(result["executions"], np.nan)
+    for index, distance in result["records"]:
+        distances[int(index)] = distance
+    return distances
+
+
+def _truth(job: Job) -> Result:
+    """Return the largest distance, as well as the case can find it."""
+    experiment = job.experiment()
+    if experiment.truth is None:
+        raise InputError(f"the case {job.case!r} knows no truth.")
+    truth = experiment.truth()
+    return {"distance": truth.distance, "point": truth.parameters.points.tolist(), "method": truth.method}
+
+
+def _profile(job: Job) -> Result:
+    """Return the distance on a grid of a one-dimensional task space."""
+    validation = job.experiment().validation
+    points = validation.space.grid(job.budget)
+    return {"points": points[:, 0].tolist(), "distances": validation.distances(points).tolist()}
+
+
+def _frameworks(job: Job) -> Result:
+    """Return the four frameworks of the paper's Example 1."""
+    from ctxval.cases.frameworks import frameworks
+
+    found = frameworks(job.seed, per_axis=job.budget)
+    return {
+        "goals": found.goals.tolist(),
+        "ccdt": found.ccdt.tolist(),
+        "custom": found.custom.tolist(),
+        "oldt": found.oldt.restarts.tolist(),
+        "olcd": found.olcd.restarts.tolist(),
+        "bound": found.bound,
+        "closed_loop_torque": found.closed_loop_torque,
+    }
+
+
+def _aspects(job: Job) -> Result:
+    """Return how far model and system end from their targets, on a grid of targets (Remark 1)."""
+    from ctxval.cases.arm import aspects
+
+    found = aspects(job.seed, **dict(job.options), per_axis=job.budget)
+    return {"model_error": found.model_error.tolist(), "system_error": found.system_error.tolist()}
+
+
+KINDS: dict[str, Callable[[Job], Result]] = {
+    "search": _search,
+    "truth": _truth,
+    "profile": _profile,
+    "frameworks": _frameworks,
+    "aspects": _aspects,
+}
+"""What can be run."""
+
+
+def run_job(job: Job) -> Result:
+    """Run one job on one thread.
+
+    Raises:
+        InputError: there is no such kind.
+    """
+    if job.kind not in KINDS:
+        raise InputError(f"there is no kind of job {job.kind!r}.")
+    with single_threaded():
+        return KINDS[job.kind](job)
+
+
+class Results:
+    """A folder of results, one JSON file for each job.
+
+    Args:
+        folder: made if it does not exist.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __contains__(self, job: Job) -> bool:
+        return self._path(job).exists()
+
+    def __getitem__(self, job: Job) -> Result:
+        result: Result = json.loads(self._path(job).read_text())
+        return result
+
+    def fill(self, jobs: Iterable[Job], workers: int, on_done: Callable[[Job], None]) -> None:
+        """Run what is not stored yet, in parallel; each result is stored as soon as it is there.
+
+        Args:
+            jobs: which; those already stored cost nothing.
+            workers: how many processes.
+            on_done: called with each job that has been run.
+        """
+        missing = [job for job in dict.fromkeys(jobs) if job not in self]
+        if not missing:
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        # Fresh interpreters: a forked one would inherit locks of threads that it does not have.
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            waiting = {pool.submit(run_job, job): job for job in missing}
+            try:
+                for future in as_completed(waiting):
+                    self._store(waiting[future], future.result())
+                    on_done(waiting[future])
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+    def _path(self, job: Job) -> Path:
+        return self.folder / f"{job.key}.json"
+
+    def _store(self, job: Job, result: Result) -> None:
+        path = self._path(job)
+        partial = path.with_suffix(".partial")
+        partial.write_text(json.dumps(_rounded(result)))
+        os.replace(partial, path)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.{_DIGITS}g}")
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return value

@@ -1,0 +1,103 @@
+"""The figure of the linear systems: executions until within 5 % against the dimension of the task space."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.reproduce.jobs import Job, Results, distances_of
+from ctxval.reproduce.study import TECHNIQUES, Claim, Columns, Scale, counted, executions_within, new_figure, spread
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_PERCENT = 5.0
+_ACTIVE, _RANDOM = 100, 20_000
+_STATES = tuple(range(1, 11))
+
+
+class LinearComplexity:
+    """The paper's Fig. 8: the effect of dimensionality."""
+
+    name = "linear"
+    title = "Linear systems: executions until within 5 %"
+    case = "linear"
+
+    def _budget(self, search: str, scale: Scale) -> int:
+        return _ACTIVE if search == "gp-ucb" else scale.of(_RANDOM)
+
+    def _job(self, search: str, states: int, seed: int, scale: Scale) -> Job:
+        budget = self._budget(search, scale)
+        return Job("search", "linear", seed, (("dim", states),), search, budget)
+
+    def jobs(self, scale: Scale) -> list[Job]:
+        """Return one campaign a technique, dimension and trial, and the exact truths."""
+        pairs = [(states, seed) for states in _STATES for seed in range(scale.trials)]
+        # SD looks at the same samples as SC: one run serves both.
+        searches = [self._job(name, *pair, scale) for name in ("gp-ucb", "random") for pair in pairs]
+        return searches + [Job("truth", "linear", seed, (("dim", states),)) for states, seed in pairs]
+
+    def executions(self, results: Results, scale: Scale, search: str) -> Array:
+        """Return executions until within 5 %, shape ``(dimensions, trials)``; infinity for never."""
+        ran = "gp-ucb" if search == "gp-ucb" else "random"
+        rows = []
+        for states in _STATES:
+            row = []
+            for seed in range(scale.trials):
+                truth = results[Job("truth", "linear", seed, (("dim", states),))]["distance"]
+                found = distances_of(results[self._job(ran, states, seed, scale)])
+                row.append(executions_within(found, search, truth, _PERCENT))
+            rows.append(row)
+        return np.array(rows)
+
+    def draw(self, results: Results, scale: Scale) -> Figure:
+        """Return the medians; where the median never got there, an arrow at the budget."""
+        figure = new_figure()
+        axes = figure.add_subplot()
+        for search, (label, colour, line, marker) in TECHNIQUES.items():
+            medians = np.array([spread(row)[0] for row in self.executions(results, scale, search)])
+            dimensions = 2 * np.array(_STATES)
+            never = np.isinf(medians)
+            axes.semilogy(dimensions[~never], medians[~never], color=colour, linestyle=line, marker=marker, label=label)
+            budget = self._budget(search, scale)
+            axes.semilogy(
+                dimensions[never], np.full(never.sum(), budget), "^", color=colour, markersize=9, fillstyle="none"
+            )
+        axes.plot([], [], "^", color="#000000", fillstyle="none", label="not within the budget")
+        axes.set_xlabel("dimension of the task space")
+        axes.set_ylabel(f"executions until within {_PERCENT:g} % of d*, median")
+        axes.set_xticks(2 * np.array(_STATES))
+        axes.grid(alpha=0.25)
+        figure.legend(loc="outside upper center", ncols=2, fontsize=8)
+        return figure
+
+    def data(self, results: Results, scale: Scale) -> Columns:
+        """Return median, least and largest for each technique and dimension."""
+        names: list[str] = ["dimension"]
+        values: list[list[float]] = [[2.0 * states for states in _STATES]]
+        for search in TECHNIQUES:
+            spreads = np.array([spread(row) for row in self.executions(results, scale, search)])
+            names += [f"{search}_{part}" for part in ("median", "min", "max")]
+            values += spreads.T.tolist()
+        return Columns(names, values)
+
+    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+        """Return what the paper says of the dimension."""
+        said = {}
+        for search in TECHNIQUES:
+            medians = [spread(row)[0] for row in self.executions(results, scale, search)]
+            said[search] = (medians[0], medians[4], medians[-1])
+        texts = [
+            f"{TECHNIQUES[search][0]}: " + ", ".join(counted(value, self._budget(search, scale)) for value in row)
+            for search, row in said.items()
+        ]
+        ucb, sc = said["gp-ucb"], said["random"]
+        return [
+            Claim(
+                "growth with the dimension is modest for CuSTOM, drastic for SC and SD (within 5 %)",
+                f"executions in 2-D, 10-D, 20-D: {'; '.join(texts)}",
+                "yes" if ucb[2] <= _ACTIVE and sc[2] > 10 * ucb[2] else "partly",
+            )
+        ]

@@ -1,0 +1,143 @@
+"""What every figure of the paper is made from: the jobs it needs, its picture, its data, and the claims about it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.reproduce.jobs import DISCARDED, Job, Results
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+BLUE, ORANGE, GREEN, PINK, BLACK, GREY = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#000000", "#999999"
+"""Okabe and Ito's colours; line styles and markers differ too, for grey print."""
+
+TECHNIQUES = {
+    "gp-ucb": ("CuSTOM (GP-UCB)", BLUE, "-", "o"),
+    "random": ("scenario (SC)", ORANGE, "--", "s"),
+    "sampling-discarding": ("sampling and discarding (SD, k = 5)", GREEN, ":", "^"),
+}
+"""The paper's three techniques: label, colour, line, marker."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much is run.
+
+    Attributes:
+        name: full or quick.
+        trials: trials behind each median.
+        share: of the grids and the budgets.
+    """
+
+    name: str
+    trials: int
+    share: float
+
+    def of(self, full: int) -> int:
+        """Return this scale's share of a grid or a budget."""
+        return max(2, round(self.share * full))
+
+
+FULL, QUICK = Scale("full", 10, 1.0), Scale("quick", 3, 0.3)
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One thing that the paper says, and what was measured.
+
+    Attributes:
+        paper: the claim.
+        measured: the figures.
+        agrees: yes, partly or no.
+        remark: why it differs, as far as is known.
+    """
+
+    paper: str
+    measured: str
+    agrees: str
+    remark: str = ""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The data behind a figure, as columns of equal length."""
+
+    names: Sequence[str]
+    values: Sequence[Sequence[float | str]] = field(default_factory=list)
+
+    def write(self, path: Path) -> None:
+        """Write them as CSV."""
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(self.names)
+            writer.writerows(zip(*self.values, strict=True))
+
+
+class Study(Protocol):
+    """One figure of the paper."""
+
+    name: str
+    title: str
+    case: str
+
+    def jobs(self, scale: Scale) -> list[Job]:
+        """Return what must be run."""
+
+    def draw(self, results: Results, scale: Scale) -> Figure:
+        """Return the picture."""
+
+    def data(self, results: Results, scale: Scale) -> Columns:
+        """Return what the picture shows, as numbers."""
+
+    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+        """Return what the paper says of it, and what was measured."""
+
+
+def new_figure(width: float = 6.4, height: float = 4.2) -> Figure:
+    """Return an empty figure."""
+    from matplotlib.figure import Figure  # loaded only where something is drawn
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def running_estimate(distances: Sequence[float] | Array, search: str) -> Array:
+    """Return the estimate of d* after 1, 2, ... executions: the largest distance, after discarding for SD.
+
+    NaN while there is none. Failed executions count and add nothing.
+    """
+    discard = DISCARDED if search == "sampling-discarding" else 0
+    largest: list[float] = []
+    estimates = np.full(len(distances), np.nan)
+    for k, distance in enumerate(distances):
+        if not np.isnan(distance):
+            largest = sorted([*largest, distance], reverse=True)[: discard + 1]
+        if len(largest) > discard:
+            estimates[k] = largest[discard]
+    return estimates
+
+
+def executions_within(distances: Sequence[float] | Array, search: str, truth: float, percent: float) -> float:
+    """Return after how many executions the estimate is within so many per cent of d*; infinity if never."""
+    reached = running_estimate(distances, search) >= truth * (1 - percent / 100)
+    return float(np.argmax(reached) + 1) if reached.any() else np.inf
+
+
+def spread(values: Sequence[float] | Array) -> tuple[float, float, float]:
+    """Return median, least and largest."""
+    array = np.asarray(values, dtype=np.float64)
+    # Infinity stands for "never": a median between a number and never is never.
+    ordered = np.sort(array)
+    return float(ordered[len(ordered) // 2] if np.isinf(array).any() else np.median(array)), ordered[0], ordered[-1]
+
+
+def counted(value: float, budget: int) -> str:
+    """Return a number of executions as text; ``> budget`` for never."""
+    return f"> {budget:,}" if np.isinf(value) else f"{value:,.4g}"
