@@ -17,6 +17,7 @@ from ctxval.reproduce.study import (
     Columns,
     Scale,
     counted,
+    draw_executions,
     executions_within,
     new_figure,
     running_estimate,
@@ -81,19 +82,13 @@ class ArmSamples:
         """Return the medians; where the median never got there, an open triangle at the budget."""
         figure = new_figure()
         axes = figure.add_subplot()
-        for search, (label, colour, line, marker) in TECHNIQUES.items():
-            medians = np.array([spread(row)[0] for row in self.executions(results, scale, search)])
-            percents, never = np.array(_PERCENTS), np.isinf(medians)
-            axes.semilogy(percents[~never], medians[~never], color=colour, linestyle=line, marker=marker, label=label)
-            budget = _ACTIVE if search == "gp-ucb" else _RANDOM
-            axes.semilogy(
-                percents[never], np.full(never.sum(), budget), "^", color=colour, fillstyle="none", markersize=9
-            )
-        axes.plot([], [], "^", color="#000000", fillstyle="none", label="not within the budget")
+        rows = {search: self.executions(results, scale, search) for search in TECHNIQUES}
+        medians = {search: np.array([spread(row)[0] for row in found]) for search, found in rows.items()}
+        budgets = {search: _ACTIVE if search == "gp-ucb" else _RANDOM for search in TECHNIQUES}
+        draw_executions(axes, np.array(_PERCENTS), medians, budgets, dodge=0.3)
         axes.invert_xaxis()
         axes.set_xlabel("within so many per cent of d*")
         axes.set_ylabel("executions of S, median")
-        axes.grid(alpha=0.25)
         figure.legend(loc="outside upper center", ncols=2, fontsize=8)
         return figure
 

@@ -8,7 +8,17 @@ import numpy as np
 
 from ctxval.arrays import Array
 from ctxval.reproduce.jobs import Job, Results, distances_of
-from ctxval.reproduce.study import TECHNIQUES, Claim, Columns, Scale, counted, executions_within, new_figure, spread
+from ctxval.reproduce.study import (
+    TECHNIQUES,
+    Claim,
+    Columns,
+    Scale,
+    counted,
+    draw_executions,
+    executions_within,
+    new_figure,
+    spread,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -56,20 +66,13 @@ class LinearComplexity:
         """Return the medians; where the median never got there, an arrow at the budget."""
         figure = new_figure()
         axes = figure.add_subplot()
-        for search, (label, colour, line, marker) in TECHNIQUES.items():
-            medians = np.array([spread(row)[0] for row in self.executions(results, scale, search)])
-            dimensions = 2 * np.array(_STATES)
-            never = np.isinf(medians)
-            axes.semilogy(dimensions[~never], medians[~never], color=colour, linestyle=line, marker=marker, label=label)
-            budget = self._budget(search, scale)
-            axes.semilogy(
-                dimensions[never], np.full(never.sum(), budget), "^", color=colour, markersize=9, fillstyle="none"
-            )
-        axes.plot([], [], "^", color="#000000", fillstyle="none", label="not within the budget")
+        rows = {search: self.executions(results, scale, search) for search in TECHNIQUES}
+        medians = {search: np.array([spread(row)[0] for row in found]) for search, found in rows.items()}
+        budgets = {search: self._budget(search, scale) for search in TECHNIQUES}
+        draw_executions(axes, 2.0 * np.array(_STATES), medians, budgets, dodge=0.25)
         axes.set_xlabel("dimension of the task space")
         axes.set_ylabel(f"executions until within {_PERCENT:g} % of d*, median")
         axes.set_xticks(2 * np.array(_STATES))
-        axes.grid(alpha=0.25)
         figure.legend(loc="outside upper center", ncols=2, fontsize=8)
         return figure
 

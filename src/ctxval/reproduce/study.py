@@ -14,6 +14,7 @@ from ctxval.arrays import Array
 from ctxval.reproduce.jobs import DISCARDED, Job, Results
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 BLUE, ORANGE, GREEN, PINK, BLACK, GREY = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#000000", "#999999"
@@ -136,6 +137,21 @@ def spread(values: Sequence[float] | Array) -> tuple[float, float, float]:
     # Infinity stands for "never": a median between a number and never is never.
     ordered = np.sort(array)
     return float(ordered[len(ordered) // 2] if np.isinf(array).any() else np.median(array)), ordered[0], ordered[-1]
+
+
+def draw_executions(axes: Axes, x: Array, medians: dict[str, Array], budgets: dict[str, int], dodge: float) -> None:
+    """Draw the median executions of each technique; open triangles at the budget stand for never.
+
+    ``dodge`` moves the triangles of one technique beside those of another.
+    """
+    for i, (search, (label, colour, line, marker)) in enumerate(TECHNIQUES.items()):
+        never = np.isinf(medians[search])
+        known = medians[search][~never]
+        axes.semilogy(x[~never], known, color=colour, linestyle=line, marker=marker, label=label)
+        at = np.full(int(never.sum()), budgets[search])
+        axes.semilogy(x[never] + (i - 1) * dodge, at, "^", color=colour, markersize=8, fillstyle="none")
+    axes.plot([], [], "^", color=BLACK, fillstyle="none", label="not within the budget")
+    axes.grid(alpha=0.25)
 
 
 def counted(value: float, budget: int) -> str:

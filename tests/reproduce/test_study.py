@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ctxval.errors import InputError, UnknownNameError
+from ctxval.reproduce import QUICK, STUDIES, reproduce, studies_named
+from ctxval.reproduce.study import Columns, executions_within, running_estimate, spread
+
+
+def test_the_estimate_of_sc_is_the_largest_and_that_of_sd_the_sixth() -> None:
+    distances = [3.0, 1.0, np.nan, 5.0, 2.0, 4.0, 6.0, 0.5]
+    np.testing.assert_array_equal(running_estimate(distances, "random"), [3, 3, 3, 5, 5, 5, 6, 6])
+    np.testing.assert_array_equal(running_estimate(distances, "sampling-discarding")[-3:], [np.nan, 1, 1])
+
+
+def test_executions_within_counts_from_one_and_never_is_infinite() -> None:
+    assert executions_within([1.0, 9.6, 10.0], "random", 10.0, 5.0) == 2
+    assert executions_within([1.0, 9.6, 10.0], "random", 11.0, 5.0) == np.inf
+
+
+def test_a_median_that_touches_never_is_never() -> None:
+    assert spread([1.0, 2.0, np.inf, np.inf]) == (np.inf, 1.0, np.inf)
+    assert spread([1.0, 2.0, 3.0, np.inf])[0] == 3.0
+    assert spread([1.0, 2.0])[0] == 1.5
+
+
+def test_there_are_the_papers_eight_figures() -> None:
+    assert len(STUDIES) == 8
+    assert len({study.name for study in STUDIES}) == 8
+    assert studies_named("all") == list(STUDIES)
+    with pytest.raises(UnknownNameError, match="did you mean 'frameworks'"):
+        studies_named("framework")
+
+
+def test_columns_are_written_as_csv(tmp_path: Path) -> None:
+    Columns(["a", "b"], [[1.0, 2.0], ["x", "y"]]).write(tmp_path / "a.csv")
+    with (tmp_path / "a.csv").open() as file:
+        assert list(csv.reader(file)) == [["a", "b"], ["1.0", "x"], ["2.0", "y"]]
+
+
+def test_a_study_runs_is_drawn_and_enters_the_table_and_a_second_call_reuses_it(tmp_path: Path) -> None:
+    started: list[int] = []
+    done: list[object] = []
+    out = tmp_path / "paper"
+    for _ in range(2):
+        table = reproduce("converged-gp", out, scale=QUICK, workers=1, on_start=started.append, on_done=done.append)
+    assert started == [2, 0]
+    assert len(done) == 2
+    assert (out / "converged-gp.png").stat().st_size > 10_000
+    with (out / "converged-gp.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 801
+    text = table.read_text()
+    assert "95 % band" in text
+    assert "`torque_weight` = 0.0001" in text
+    assert "Dubins" not in text
+
+
+def test_no_workers_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="at least 1"):
+        reproduce("converged-gp", tmp_path, workers=0)
