@@ -6,7 +6,7 @@ KILLS ?= 50
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test check reliability bench study pictures clean
+.PHONY: demo test check reliability bench study reproduce pictures clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -46,3 +46,6 @@ clean:
 .venv/.test: pyproject.toml | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	touch $@ .venv/.installed
+
+reproduce: .venv/.test  ## the paper's experiments in full; writes docs/reproduction.md, and resumes
+	$(BIN)/ctxval reproduce all --out docs/reproduction

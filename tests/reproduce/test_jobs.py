@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ctxval import Campaign, cases, searches
 from ctxval.errors import InputError
-from ctxval.reproduce.jobs import DISCARDED, Job, Results, distances_of, records, run_job
+from ctxval.reproduce.jobs import DISCARDED, Job, Results, case_digest, distances_of, records, run_job
 from ctxval.reproduce.study import running_estimate
 
 PROFILE = Job("profile", "pendulum", 0, budget=21)
@@ -39,6 +39,16 @@ def test_results_are_stored_once_and_reused(tmp_path: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "results").iterdir()} == before
     case = cases.by_name("pendulum", 0)
     assert results[PROFILE]["distances"] == pytest.approx(case.validation.distances(case.validation.space.grid(21)))
+
+
+def test_a_result_of_a_case_that_has_changed_is_run_again(tmp_path: Path) -> None:
+    results, done = Results(tmp_path), []
+    results.fill([PROFILE], 1, done.append)
+    (path,) = tmp_path.iterdir()
+    path.write_text(path.read_text().replace(case_digest("pendulum"), "0" * 16))
+    assert PROFILE not in results
+    results.fill([PROFILE], 1, done.append)
+    assert done == [PROFILE, PROFILE]
 
 
 def test_every_job_has_its_own_file() -> None:

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import functools
+import hashlib
+import importlib
+import inspect
 import json
 import os
 import re
@@ -174,7 +179,7 @@ def run_job(job: Job) -> Result:
 
 
 class Results:
-    """A folder of results, one JSON file for each job.
+    """A folder of results, one JSON file for each job; a result of a case that has changed since is not there.
 
     Args:
         folder: made if it does not exist.
@@ -184,7 +189,8 @@ class Results:
         self.folder = folder
 
     def __contains__(self, job: Job) -> bool:
-        return self._path(job).exists()
+        path = self._path(job)
+        return path.exists() and json.loads(path.read_text())["case_digest"] == case_digest(job.case)
 
     def __getitem__(self, job: Job) -> Result:
         result: Result = json.loads(self._path(job).read_text())
@@ -219,8 +225,16 @@ class Results:
     def _store(self, job: Job, result: Result) -> None:
         path = self._path(job)
         partial = path.with_suffix(".partial")
-        partial.write_text(json.dumps(_rounded(result)))
+        partial.write_text(json.dumps({**_rounded(result), "case_digest": case_digest(job.case)}))
         os.replace(partial, path)
+
+
+@functools.cache
+def case_digest(case: str) -> str:
+    """Return a digest of a case's source, whatever its comments and its layout."""
+    module = importlib.import_module(f"ctxval.cases.{case}")
+    tree = ast.dump(ast.parse(inspect.getsource(module)))
+    return hashlib.sha256(tree.encode()).hexdigest()[:16]
 
 
 def _rounded(value: Any) -> Any:
