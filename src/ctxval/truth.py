@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
+import inspect
+import json
+import math
+import os
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.optimize import Bounds, differential_evolution, minimize
 
 from ctxval.arrays import Array
+from ctxval.describe import describe
 from ctxval.errors import InputError
 from ctxval.space import Parameters
 from ctxval.validation import Validation
@@ -62,3 +74,177 @@ def _around(centres: Array, cell: Array, low: Array, high: Array) -> Array:
     offsets = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * len(cell), indexing="ij"), axis=-1)
     points = centres[:, None, :] + offsets.reshape(-1, len(cell)) * cell
     return np.clip(points.reshape(-1, len(cell)), low, high)
+
+
+def search_truth(
+    validation: Validation,
+    *,
+    seed: int = 0,
+    agreement: float = 1e-3,
+    repeats: int = 6,
+    population: int = 20,
+    generations: int = 150,
+) -> Truth:
+    """Return the best value known after a large search, for spaces with too many dimensions for a grid.
+
+    Differential evolution (Storn and Price 1997) and a climb from its best point, repeated with other random numbers
+    until the two best repeats agree. Executes S some ten thousand times, in batches.
+
+    Args:
+        validation: the map p -> d(p).
+        seed: of the random numbers.
+        agreement: relative difference of the two best repeats at which the search ends.
+        repeats: how many there are at most.
+        population: points in a generation, for each dimension.
+        generations: the most in one repeat.
+
+    Raises:
+        InputError: every execution failed.
+    """
+    search = _TruthSearch(validation, population, generations)
+    found: list[tuple[float, Array]] = []
+    while len(found) < repeats and not _gap(found) <= agreement:
+        found.append(search.repeat(np.random.default_rng(np.random.SeedSequence([seed, len(found)]))))
+    distance, unit_point = max(found, key=lambda repeat: repeat[0])
+    if not math.isfinite(distance):
+        raise InputError("the truth is unknown: every execution of the search failed.")
+    doubt = "" if _gap(found) <= agreement else ", so the maximum may well be larger"
+    method = (
+        f"best known value of {search.evaluations:,} evaluations: differential evolution and a local climb, "
+        f"{len(found)} repeats, of which the two best differ by {_gap(found):.2%}{doubt}"
+    )
+    return Truth(distance, validation.space.parameters(validation.space.from_unit(unit_point)), method)
+
+
+class _TruthSearch:
+    """Maximises d over the unit cube, a whole generation in one batch."""
+
+    def __init__(self, validation: Validation, population: int, generations: int) -> None:
+        self.validation = validation
+        self.population, self.generations = population, generations
+        self.dimension = validation.space.dimension
+        self.evaluations = 0
+
+    def values(self, unit_points: Array) -> Array:
+        """Return d at points ``(N, d)`` of the cube, minus infinity where the execution fails."""
+        self.evaluations += len(unit_points)
+        values = self.validation.distances(self.validation.space.from_unit(unit_points))
+        return np.where(np.isnan(values), -np.inf, values)
+
+    def repeat(self, rng: np.random.Generator) -> tuple[float, Array]:
+        """Return the largest value of one search, and its point ``(d,)``."""
+
+        def losses(columns: Array) -> Any:
+            return -self.values(columns.T)
+
+        evolved = differential_evolution(
+            losses,
+            Bounds(np.zeros(self.dimension), np.ones(self.dimension)),
+            popsize=self.population,
+            maxiter=self.generations,
+            tol=1e-4,
+            polish=False,
+            updating="deferred",
+            vectorized=True,
+            rng=rng,
+        )
+        point = self._climb(-float(evolved.fun), np.asarray(evolved.x))
+        # A loop that diverges amplifies the rounding of a batch: what counts is the task executed alone.
+        return float(self.values(point[None])[0]), point
+
+    def _climb(self, value: float, point: Array) -> Array:
+        scale = value if 0 < value < np.inf else 1.0  # L-BFGS-B's tolerances suit values about 1
+
+        def negative(x: Array) -> tuple[float, Array]:
+            return self._loss_and_slope(x, scale)
+
+        bounds = [(0.0, 1.0)] * self.dimension
+        with np.errstate(all="ignore"):
+            climbed = minimize(negative, point, jac=True, method="L-BFGS-B", bounds=bounds)
+        return np.asarray(climbed.x) if -float(climbed.fun) * scale > value else point
+
+    def _loss_and_slope(self, point: Array, scale: float) -> tuple[float, Array]:
+        moves = 1e-6 * np.eye(self.dimension)
+        up, down = np.clip(point + moves, 0, 1), np.clip(point - moves, 0, 1)
+        losses = -self.values(np.concatenate([point[None], up, down])) / scale
+        widths = np.diagonal(up) - np.diagonal(down)
+        slope = (losses[1 : self.dimension + 1] - losses[self.dimension + 1 :]) / widths
+        return float(losses[0]), np.where(np.isfinite(slope), slope, 0.0)
+
+
+def _gap(found: list[tuple[float, Array]]) -> float:
+    """Return by what share of the best value the second best differs; infinity where there are not two."""
+    values = sorted((value for value, _ in found if math.isfinite(value)), reverse=True)
+    if len(values) < 2:
+        return math.inf
+    return (values[0] - values[1]) / values[0] if values[0] > 0 else 0.0
+
+
+# A truth found once
+
+
+def cached_truth(
+    validation: Validation, compute: Callable[[Validation], Truth], folder: str | Path = "runs/truth"
+) -> Truth:
+    """Return a truth from its file in a folder, or find it and write that file.
+
+    The file's name is a hash of what identifies the validation and the method. A stored truth is believed only where
+    executing S once more, at its task, gives its distance again.
+
+    Args:
+        validation: the map p -> d(p).
+        compute: finds the truth; its settings, such as those of ``functools.partial(search_truth, seed=1)``, are
+            part of the hash.
+        folder: made if it is missing.
+    """
+    path = Path(folder) / f"{_fingerprint(validation, compute)}.json"
+    stored = _read_truth(path, validation)
+    if stored is not None:
+        return stored
+    truth = compute(validation)
+    # A folder that cannot be written costs the next caller time, but not this one the answer.
+    with suppress(OSError):
+        _write_truth(path, truth, validation)
+    return truth
+
+
+def _fingerprint(validation: Validation, compute: Callable[[Validation], Truth]) -> str:
+    # The signature has the defaults that the description of a function leaves out.
+    known = [validation.describe(), describe(compute), str(inspect.signature(compute))]
+    return hashlib.sha256(json.dumps(_rounded(known), sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _rounded(value: Any) -> Any:
+    """Return a description without the last bits of its floats, in which machines differ."""
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return [_rounded(item) for item in value] if isinstance(value, list) else value
+
+
+def _read_truth(path: Path, validation: Validation) -> Truth | None:
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        distance, method = float(stored["distance"]), str(stored["method"])
+        point = validation.space.point(dict(stored["parameters"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if not math.isclose(validation.distances(point[None])[0], distance, rel_tol=1e-6, abs_tol=1e-12):
+        return None
+    return Truth(distance, validation.space.parameters(point), method)
+
+
+def _write_truth(path: Path, truth: Truth, validation: Validation) -> None:
+    """Write a file that is whole or not there, also when two processes write it at once."""
+    parameters = validation.space.describe_point(truth.parameters.points)
+    content = {"distance": truth.distance, "parameters": parameters, "method": truth.method}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            json.dump(content, file, indent=1)
+        os.replace(temporary, path)
+    except OSError:
+        os.unlink(temporary)
+        raise

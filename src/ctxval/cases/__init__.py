@@ -11,6 +11,8 @@ from ctxval.experiment import Experiment
 
 NAMES: dict[str, str] = {
     "pendulum": "inverted pendulum, learned linear model, iLQR to a goal angle (1-D)",
+    "arm": "2-DoF arm in MuJoCo; network, Gaussian process or linear model; iLQR to a point on the table (2-D)",
+    "dubins": "Dubins car, learned linear model, LQR along ten sine waves (11-D)",
     "linear": "random linear systems and models with n = 1 to 10 states, random feedback (2 n-D)",
 }
 """The cases that the command line knows, and what each is."""

@@ -1,4 +1,4 @@
-"""The paper's Dubins car (Sec. V-A): a linear model learned from it, LQR to follow sums of ten sine waves."""
+"""The paper's Dubins car (Sec. VI-A): a linear model learned from it, LQR to follow sums of ten sine waves."""
 
 from __future__ import annotations
 
@@ -7,8 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 
 import ctxval.truth
-from ctxval import Experiment, Parameters, Task, TaskSpace, Transitions, Validation, controllers, distances, models
-from ctxval import systems
+from ctxval import (
+    Experiment,
+    Parameters,
+    Task,
+    TaskSpace,
+    Trajectory,
+    Transitions,
+    Validation,
+    controllers,
+    distances,
+    models,
+    systems,
+)
 from ctxval.arrays import Array
 from ctxval.errors import UnknownNameError
 
@@ -16,52 +27,158 @@ WAVES = 10
 """Sine components of the reference, as in the paper."""
 
 
+def root_mean_square(model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+    """Return ``||xi_S - xi_M||_2 / sqrt(H)``, the root mean square over time of the gap between the states.
+
+    It is ``sqrt(H)`` = 10 times the printed formula: the same task is the worst, and a search chooses the same tasks.
+    """
+    whole = distances.WholeTrajectory(norm=2)(model_trajectory, system_trajectory, task)
+    return np.asarray(whole / np.sqrt(task.horizon))
+
+
+DISTANCES: dict[str, distances.Distance] = {
+    "printed": distances.WholeTrajectory(norm=2, per_step=True),
+    "root-mean-square": root_mean_square,
+    "mean-deviation": distances.MeanDeviation(norm=2, components=(0, 1)),
+}
+"""The formula as printed, ``||xi_S - xi_M||_2 / H``, and two readings of the "average deviation in metres" that the
+text makes of it. The first two count a radian of heading as a metre; the last is the mean over time of the distance
+between the positions alone."""
+
+
 @dataclass(frozen=True)
 class Dubins:
-    """A car that cannot slip: ``y' = v cos phi``, ``z' = v sin phi``, ``phi' = w``."""
+    """A car that cannot slip sideways: ``y' = v cos phi``, ``z' = v sin phi``, ``phi' = w`` (eq. 13)."""
 
     def derivative(self, x: Array, u: Array) -> Array:
-        """Return (y', z', phi') in m/s and rad/s for states ``(..., 3)`` in m and rad and inputs (v, w) ``(..., 2)``."""
+        """Return (y', z', phi') in m/s and rad/s for states (y, z, phi) ``(..., 3)`` and inputs (v, w) ``(..., 2)``."""
         heading, speed, turn_rate = x[..., 2], u[..., 0], u[..., 1]
-        parts = speed * np.cos(heading), speed * np.sin(heading), turn_rate
-        return np.stack(np.broadcast_arrays(*parts), axis=-1)
+        rates = speed * np.cos(heading), speed * np.sin(heading), turn_rate
+        return np.stack(np.broadcast_arrays(*rates), axis=-1)
 
 
 @dataclass(frozen=True)
 class Settings:
     """Every free parameter of the case, with the reason for its value; the defaults are the variant ``paper``.
 
-    The paper gives the horizon, the start and the task space, and that the maximum is an average deviation of 3.5 m
-    which GP-UCB, but not 500 random tasks, comes near to.
+    The paper gives the horizon, the start and the task space. It reports a largest average deviation of 3.5 m, found
+    in 100 executions, and that 500 random tasks stay below 2 to 3 m. So it is here, in the median over seeds, where
+    the average is the root mean square: 3.6 m, of which GP-UCB finds 3.2 m and random tasks 1.8 m. The printed formula
+    gives a tenth of that. The mean deviation of the position is at most 1.4 m; 3.5 m of it, three times the mean
+    height of the waves, would need a loop on S that is nearly unstable.
 
     Attributes:
         horizon: steps, the paper's H.
-        dt: s; the ten waves then have 0.1 to 1 Hz. Slower (0.2 s and more), the loop on S loses stability.
-        heading_weight: of the deviation, 1/rad^2, where positions weigh 1/m^2. A reference of heading 0 is at odds
-            with its own waves, so little; with 1 the car hardly turns and no task is much worse than another.
-        input_weight: s^2/m^2 and s^2/rad^2. Below 0.05 the loop on S loses stability in many tasks.
-        samples: recorded transitions. With many more, all models are the same one, and the paper learns ten.
-        data_heading: rad; recorded headings are uniform in plus or minus this. A quarter turn either way: over a
-            full turn, the average effect of the speed vanishes, and with it the model's hold on y.
-        data_speed: m/s; recorded speeds are uniform from 0 to this. The model steers z at their mean; the slower it
-            believes the car to be, the harder it turns, and the worse is the worst task: d* is about 1.2 m with 2,
-            3.5 m with 1.25, 5 m with 1.
-        data_turn_rate: rad/s; recorded turn rates are uniform in plus or minus this. They enter linearly: any do.
-        data_position: m; recorded positions are uniform in plus or minus this, the size of one wave.
+        dt: s; the ten waves then have 0.1 to 1 Hz. From 0.2 s on the loop on S begins to lose stability.
+        heading_weight: of the deviation, 1/rad^2, where a position weighs 1/m^2. Small, as a heading of 0 is not that
+            of the waves; with 1 the car hardly turns, and no task is much worse than most.
+        input_weight: s^2/m^2 and s^2/rad^2. From 0.05 down the loop on S loses stability in some tasks.
+        samples: recorded steps; enough that the models of all seeds are much alike, and their loops on S stable.
+        heading: rad; recorded ones are uniform in plus or minus a quarter turn. Over a full turn the effect of the
+            speed cancels, and the model believes that nothing moves y.
+        speed: m/s; recorded ones are uniform from 0 to this. The model takes their mean for the car's speed when it
+            steers z: the slower it believes the car to be, the harder it turns. This sets the root mean square d*:
+            2.9 m for 2, 3.6 m for 1.75, 5 m for 1.5, 8 m for 1.25.
+        turn_rate: rad/s; recorded ones are uniform in plus or minus this. The heading is linear in it, so any would do.
+        position: m; recorded ones are uniform in plus or minus this. Nothing depends on them but the model's errors.
+        first_seed: added to the seed of the data.
         distance: a name of ``DISTANCES``.
-        threshold: in the units of the distance: twice what 500 random tasks find is more than they ever show.
+        threshold: in m, for that distance: in the gap between what random tasks show and d*.
     """
 
     horizon: int = 100
     dt: float = 0.1
     heading_weight: float = 0.1
     input_weight: float = 0.1
-    samples: int = 400
-    data_heading: float = np.pi / 2
-    data_speed: float = 1.25
-    data_turn_rate: float = 1.0
-    data_position: float = 1.0
-    distance: str = "mean-deviation"
-    threshold: float = 2.5
+    samples: int = 1000
+    heading: float = np.pi / 2
+    speed: float = 1.75
+    turn_rate: float = 1.0
+    position: float = 1.0
+    first_seed: int = 0
+    distance: str = "printed"
+    threshold: float = 0.25
 
 
+VARIANTS: dict[str, Settings] = {
+    "paper": Settings(),
+    # Fewer data make models of more kinds. Those of some seeds, the first here among them, have a wide local maximum
+    # at the end point 0, where half of all climbs end.
+    "basin": Settings(samples=400, speed=2.0, first_seed=25, threshold=0.2),
+    # Cheap inputs: the loop on S loses stability in a few corners of the task space, so much that rounding decides
+    # the distance there. Data of small headings and a heavier weight of the heading keep those corners few.
+    "heavy-tail": Settings(
+        heading_weight=0.3, input_weight=0.01, samples=2000, heading=np.pi / 4, speed=2.0, threshold=0.2
+    ),
+}
+"""``paper`` resembles what the paper reports; the other two are hard for a search, and for a surrogate."""
+
+
+def record(car: Dubins, settings: Settings, seed: int) -> Transitions:
+    """Return single steps of the car from seeded random states under seeded random inputs."""
+    rng = np.random.default_rng(seed)
+    far = np.array([settings.position, settings.position, settings.heading])
+    x = rng.uniform(-far, far, (settings.samples, 3))
+    u = rng.uniform([0.0, -settings.turn_rate], [settings.speed, settings.turn_rate], (settings.samples, 2))
+    return Transitions(x, u, systems.rk4(car.derivative, settings.dt)(x, u))
+
+
+def reference(end: Array, amplitudes: Array, horizon: int) -> Array:
+    """Return the states to follow, ``(..., H + 1, 3)``, for ends a_0 ``(...)`` and amplitudes a_j ``(..., 10)`` in m.
+
+    In the paper ``z(t) = sum_j a_j sin(2 pi j y(t) / a_0)`` with ``y(t) = t a_0 / H``: a_0 cancels, and may be 0.
+    """
+    share = np.arange(horizon + 1) / horizon
+    waves = np.sin(2 * np.pi * np.arange(1, WAVES + 1)[:, None] * share)
+    y, z = end[..., None] * share, amplitudes @ waves
+    return np.stack([y, z, np.zeros_like(y)], axis=-1)
+
+
+def experiment(
+    seed: int = 0, variant: str = "paper", distance: str | None = None, settings: Settings | None = None
+) -> Experiment:
+    """Return the case; the seed draws the data that the linear model is learned from.
+
+    Args:
+        seed: of the data, not negative.
+        variant: a name of ``VARIANTS``.
+        distance: a name of ``DISTANCES``; the variant's own, which alone has a threshold, by default.
+        settings: in place of the variant's.
+
+    Raises:
+        UnknownNameError: nothing has the name of the variant or of the distance.
+    """
+    if settings is None:
+        if variant not in VARIANTS:
+            raise UnknownNameError.among("variant of the case 'dubins'", variant, VARIANTS)
+        settings = VARIANTS[variant]
+    name = settings.distance if distance is None else distance
+    if name not in DISTANCES:
+        raise UnknownNameError.among("distance of the case 'dubins'", name, DISTANCES)
+    validation = tracking(seed, settings, DISTANCES[name])
+    return Experiment(
+        "dubins",
+        validation,
+        budget=100,
+        threshold=settings.threshold if name == settings.distance else None,
+        truth=lambda: ctxval.truth.cached_truth(validation, ctxval.truth.search_truth),
+        units="m",
+    )
+
+
+def tracking(seed: int, settings: Settings, distance: distances.Distance) -> Validation:
+    """Return the car, a linear model learned from it, and the task to follow ten waves."""
+    car = Dubins()
+
+    def follow(p: Parameters) -> Task:
+        states = reference(p.end, p.amplitudes, settings.horizon)
+        return Task([0.0, 0.0, 0.0], reference=states, horizon=settings.horizon, dt=settings.dt)
+
+    return Validation(
+        space=TaskSpace(end=(0.0, 2.0, "m"), amplitudes=(np.zeros(WAVES), np.ones(WAVES), "m")),
+        task=follow,
+        system=systems.Simulated(systems.rk4(car.derivative, settings.dt), vectorized=True),
+        model=models.Linear.fit(record(car, settings, settings.first_seed + seed)),
+        synthesizer=controllers.LQR([1.0, 1.0, settings.heading_weight], [settings.input_weight] * 2),
+        distance=distance,
+    )

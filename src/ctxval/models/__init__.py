@@ -1,6 +1,18 @@
 """Learned models M: ready-made ones and adapters."""
 
 from ctxval.model import Function, Model, linearize
+from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
 from ctxval.models.linear import Linear
+from ctxval.models.neural_network import FeedforwardReLU
+from ctxval.models.scaling import IncrementScaling
 
-__all__ = ["Function", "Linear", "Model", "linearize"]
+__all__ = [
+    "FeedforwardReLU",
+    "Function",
+    "GaussianProcessModel",
+    "IncrementScaling",
+    "Linear",
+    "Model",
+    "SquaredExponential",
+    "linearize",
+]

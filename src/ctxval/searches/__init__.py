@@ -5,13 +5,27 @@ from __future__ import annotations
 from typing import Any
 
 from ctxval.errors import InputError, UnknownNameError
+from ctxval.searches.annealing import Annealing
 from ctxval.searches.base import Search, SequentialSearch
+from ctxval.searches.cma_es import CMAES
 from ctxval.searches.gp_ucb import GPUCB
 from ctxval.searches.random import Random, SamplingDiscarding
 
-__all__ = ["GPUCB", "NAMES", "Random", "SamplingDiscarding", "Search", "SequentialSearch", "by_name"]
+__all__ = [
+    "CMAES",
+    "GPUCB",
+    "NAMES",
+    "Annealing",
+    "Random",
+    "SamplingDiscarding",
+    "Search",
+    "SequentialSearch",
+    "by_name",
+]
 
 NAMES: dict[str, type[Any]] = {
+    "annealing": Annealing,
+    "cma-es": CMAES,
     "gp-ucb": GPUCB,
     "random": Random,
     "sampling-discarding": SamplingDiscarding,

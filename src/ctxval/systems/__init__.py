@@ -2,6 +2,7 @@
 
 from ctxval.integrate import rk4
 from ctxval.system import System
+from ctxval.systems.mujoco import MuJoCo
 from ctxval.systems.simulated import Simulated
 
-__all__ = ["Simulated", "System", "rk4"]
+__all__ = ["MuJoCo", "Simulated", "System", "rk4"]

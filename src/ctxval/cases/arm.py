@@ -1,0 +1,208 @@
+"""The paper's robotic arm (Sec. VI-B): two joints on a table in MuJoCo, and three models learned from the same data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval import (
+    Experiment,
+    Parameters,
+    Task,
+    TaskSpace,
+    Transitions,
+    Validation,
+    controllers,
+    distances,
+    grid_truth,
+    models,
+    systems,
+)
+from ctxval.arrays import Array
+from ctxval.errors import UnknownNameError
+
+MODELS = ("fnn", "gp", "linear")
+"""The paper's three: a feedforward network of 2 x 8 ReLU units, a Gaussian process, a linear model."""
+
+# Reacher's, as in Gymnasium: lengths, thickness and density of the links (0.1 m and 0.1 m, the fingertip 0.01 m beyond),
+# armature and damping of the joints, the elbow's range, the motors' gear and range, gravity, integrator and timestep.
+# Its walls and its target are left out, as nothing ever touches them; the site marks its fingertip.
+MJCF = """
+<mujoco model="arm">
+  <compiler angle="radian"/>
+  <option timestep="0.01" integrator="RK4" gravity="0 0 -9.81"/>
+  <default>
+    <joint type="hinge" axis="0 0 1" armature="1" damping="1"/>
+    <geom type="capsule" size="0.01" density="1000" contype="0" conaffinity="0"/>
+    <motor gear="200" ctrllimited="true" ctrlrange="-1 1"/>
+  </default>
+  <worldbody>
+    <body name="upper" pos="0 0 0.01">
+      <joint name="shoulder" limited="false"/>
+      <geom fromto="0 0 0 0.1 0 0"/>
+      <body name="lower" pos="0.1 0 0">
+        <joint name="elbow" limited="true" range="-3 3"/>
+        <geom fromto="0 0 0 0.1 0 0"/>
+        <geom type="sphere" pos="0.11 0 0"/>
+        <site name="fingertip" pos="0.11 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="shoulder"/><motor joint="elbow"/></actuator>
+</mujoco>
+"""
+
+END_EFFECTOR = (4, 5)
+"""Where (y, z), the paper's names for the coordinates on the table, stand in the state."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Every free parameter of the case, with the reason for its value; the paper gives none of them.
+
+    Attributes:
+        substeps: MuJoCo steps in one control step, Reacher's: dt is 20 ms.
+        horizon: steps; in 2 s a controller on the true dynamics reaches nearly every target, at joint rates below
+            5 rad/s and a fifth of the motors' torque.
+        reach: m; the targets are |y|, |z| <= 0.14, a square that lies whole within the arm's 0.21 m and, at its corners
+            0.198 m from the shoulder, clear of full extension, so that whoever misses a target is to blame.
+        position_weight: of the end effector's deviation, 1/m^2; what the task is about.
+        rate_weight: s^2/rad^2; small, yet without it the cost rewards whirling through the target.
+        torque_weight: of the torque in units of the motors' 200 N m; keeps the rates within those recorded.
+        final_position_weight, final_rate_weight: of the last state, ten times those of the others.
+        iterations: of iLQR; nearly all tasks have converged on the smooth models, and the network's kinks stop it.
+        rollouts, steps: recorded for learning: 400 x 10 transitions, 0.2 s each, from rest.
+        torque: recorded torques are uniform within +-0.15 of the motors' range, about those of the closed loop.
+        elbow: rad; recordings start anywhere around the shoulder and at elbow angles within +-2, so that they stay
+            clear of the elbow's stops, 3 rad.
+        points: of the data that the Gaussian process is conditioned on; more are slower and hardly more precise.
+        restarts: trainings of the network, of which the best on its data is kept.
+        training: iterations of one training at most.
+    """
+
+    substeps: int = 2
+    horizon: int = 100
+    reach: float = 0.14
+    position_weight: float = 1.0
+    rate_weight: float = 1e-3
+    torque_weight: float = 3.0
+    final_position_weight: float = 10.0
+    final_rate_weight: float = 1e-2
+    iterations: int = 25
+    rollouts: int = 400
+    steps: int = 10
+    torque: float = 0.15
+    elbow: float = 2.0
+    points: int = 400
+    restarts: int = 4
+    training: int = 1000
+
+
+def arm(settings: Settings) -> systems.MuJoCo:
+    """Return the system, with the states (th1, th2, th1', th2', y, z) in rad, rad/s and m."""
+    return systems.MuJoCo(MJCF, substeps=settings.substeps, sites=("fingertip",))
+
+
+def record(system: systems.MuJoCo, settings: Settings, seed: int) -> Transitions:
+    """Return transitions of the arm under seeded random torques, from rest in random configurations."""
+    rng = np.random.default_rng(seed)
+    bounds = np.array([np.pi, settings.elbow])
+    start = system.state(rng.uniform(-bounds, bounds, (settings.rollouts, 2)))
+    torques = rng.uniform(-settings.torque, settings.torque, (settings.steps, settings.rollouts, 2))
+    return system.execute(lambda t, x: torques[t], Task(start, horizon=settings.steps, dt=system.dt)).transitions()
+
+
+def learn(model: str, data: Transitions, settings: Settings, seed: int) -> models.Model:
+    """Return one of the three models, learned from recorded transitions.
+
+    Raises:
+        UnknownNameError: there is no such model.
+    """
+    if model == "fnn":
+        return models.FeedforwardReLU.fit(
+            data, (8, 8), seed=seed, restarts=settings.restarts, iterations=settings.training
+        )
+    if model == "gp":
+        return models.GaussianProcessModel.fit(data, settings.points, seed=seed)
+    if model == "linear":
+        return models.Linear.fit(data)
+    raise UnknownNameError.among("model", model, MODELS)
+
+
+def experiment(seed: int = 0, model: str = "fnn", settings: Settings | None = None) -> Experiment:
+    """Return the case with one of the three models; the seed draws the data, the same for all of them.
+
+    Raises:
+        UnknownNameError: there is no such model.
+    """
+    settings = Settings() if settings is None else settings
+    system = arm(settings)
+    rest = system.state([0.0, 0.0])  # extended along y
+    rates, positions = settings.rate_weight, settings.position_weight
+    final_rates, final_positions = settings.final_rate_weight, settings.final_position_weight
+
+    def reach(p: Parameters) -> Task:
+        return Task(rest, goal=[0.0, 0.0, 0.0, 0.0, p.y, p.z], horizon=settings.horizon, dt=system.dt)
+
+    validation = Validation(
+        space=TaskSpace(y=(-settings.reach, settings.reach, "m"), z=(-settings.reach, settings.reach, "m")),
+        task=reach,
+        system=system,
+        model=learn(model, record(system, settings, seed), settings, seed),
+        # The angles themselves cost nothing: the task says where the end effector is to be, not how.
+        synthesizer=controllers.ILQR(
+            [0.0, 0.0, rates, rates, positions, positions],
+            [settings.torque_weight, settings.torque_weight],
+            [0.0, 0.0, final_rates, final_rates, final_positions, final_positions],
+            iterations=settings.iterations,
+        ),
+        distance=distances.FinalState(norm=2, components=END_EFFECTOR),
+    )
+    return Experiment(
+        f"arm-{model}",
+        validation,
+        budget=50,
+        threshold=0.05,
+        truth=lambda: grid_truth(validation, per_axis=31, refinements=3),
+        units="m",
+        states=("shoulder [rad]", "elbow [rad]", "shoulder rate [rad/s]", "elbow rate [rad/s]", "y [m]", "z [m]"),
+        inputs=("shoulder torque [200 N m]", "elbow torque [200 N m]"),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Aspects:
+    """How far from their targets the closed loops end, the two aspects of Remark 1.
+
+    Attributes:
+        targets: shape ``(N, 2)``, m.
+        model_error: Aspect-1, how far the model's end effector ends from its target, shape ``(N,)``, m.
+        system_error: the same of the arm under the same controllers, NaN where the execution failed.
+    """
+
+    targets: Array
+    model_error: Array
+    system_error: Array
+
+    def __str__(self) -> str:
+        return "; ".join(
+            f"{name} {np.nanmedian(error):.4f} m (median), {np.nanmax(error):.4f} m (largest)"
+            for name, error in (("model", self.model_error), ("system", self.system_error))
+        )
+
+
+def aspects(seed: int = 0, model: str = "fnn", settings: Settings | None = None, *, per_axis: int = 21) -> Aspects:
+    """Return how well model and arm do the tasks on a grid of targets. Executes S for each.
+
+    Raises:
+        UnknownNameError: there is no such model.
+    """
+    validation = experiment(seed, model, settings).validation
+    targets = validation.space.grid(per_axis)
+    task = validation.task(validation.space.parameters(targets))
+    controller = validation.synthesizer.design(task, validation.model)
+    miss = distances.GoalError(norm=2, components=END_EFFECTOR)
+    promised = systems.Simulated(validation.model).execute(controller, task)
+    executed = validation.system.execute(controller, task)
+    return Aspects(targets, miss(promised, promised, task), miss(promised, executed, task))

@@ -1,0 +1,197 @@
+"""Gaussian-process regression of the dynamics (Rasmussen and Williams 2006, chapters 2, 4 and 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+
+from ctxval.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval.errors import InputError, ShapeError
+from ctxval.models.scaling import IncrementScaling
+from ctxval.trajectory import Transitions
+
+_BLOCK = 2048
+"""Points in one matrix of covariances: enough to be fast, few enough for the cache."""
+
+# Where the hyperparameters are searched, for standardised inputs and increments.
+_VARIANCE, _NOISE, _LENGTH_SCALE = (1e-2, 1e4), (1e-6, 1.0), (0.1, 100.0)
+
+
+@dataclass(frozen=True, eq=False)
+class SquaredExponential:
+    """``k(z, z') = v exp(-1/2 sum_j ((z_j - z'_j) / l_j)^2)``: rigid-body dynamics are smooth.
+
+    Attributes:
+        variance: v.
+        length_scales: l, shape ``(k,)``.
+    """
+
+    variance: float
+    length_scales: Array
+
+    def __call__(self, z: Array, centres: Array) -> Array:
+        """Return the covariances ``(N, M)`` of points ``(N, k)`` and ``(M, k)``."""
+        a, b = z / self.length_scales, centres / self.length_scales
+        exponent = a @ b.T
+        exponent -= 0.5 * (a**2).sum(axis=1)[:, None]
+        exponent -= 0.5 * (b**2).sum(axis=1)
+        np.minimum(exponent, 0.0, out=exponent)  # rounding may leave a point at a distance from itself
+        return np.asarray(self.variance * np.exp(exponent, out=exponent))
+
+
+class GaussianProcessModel:
+    """The posterior mean of Gaussian processes, one for each state's increment, that share a covariance.
+
+    Sharing it lets one Cholesky factor and one matrix of covariances serve all states.
+
+    Args:
+        covariance: of standardised state-input pairs.
+        centres: the standardised pairs that it was conditioned on, shape ``(M, n + m)``.
+        weights: ``(K + noise I)^-1 Y``, shape ``(M, n)``.
+        scaling: of the state-input pair and of the increment.
+        data: the transitions that it was learned from, if any.
+
+    Raises:
+        ShapeError: the shapes do not fit together.
+        InputError: a value is not finite.
+    """
+
+    def __init__(
+        self,
+        covariance: SquaredExponential,
+        centres: ArrayLike,
+        weights: ArrayLike,
+        scaling: IncrementScaling,
+        data: Transitions | None = None,
+    ) -> None:
+        self.covariance = covariance
+        self.centres: Array = as_finite("centres", centres)
+        self.weights: Array = as_finite("weights", weights)
+        self.scaling = scaling
+        self.data = data
+        pair, states = len(scaling.shift_in), len(scaling.shift_out)
+        fits = self.centres.ndim == 2 and self.weights.shape == (len(self.centres), states)
+        if not fits or self.centres.shape[1] != pair or covariance.length_scales.shape != (pair,):
+            raise ShapeError(
+                f"a model of {states} states needs centres (M, {pair}), weights (M, {states}) and length-scales "
+                f"({pair},), got {self.centres.shape}, {self.weights.shape} and {covariance.length_scales.shape}."
+            )
+        moments = (self.weights[:, :, None] * self.centres[:, None, :]).reshape(len(self.centres), -1)
+        self._moments = np.concatenate([self.weights, moments], axis=1)
+
+    @classmethod
+    def fit(cls, data: Transitions, points: int = 400, *, seed: int = 0, iterations: int = 100) -> GaussianProcessModel:
+        """Condition on recorded transitions, with the most likely hyperparameters (eq. 5.8, summed over the states).
+
+        Args:
+            data: the transitions.
+            points: how many of them, drawn at random, it is conditioned on; the effort grows with their cube.
+            seed: of the draw.
+            iterations: of the search for the hyperparameters, at most.
+
+        Raises:
+            InputError: the data are not finite, or points is not positive.
+        """
+        if points < 1:
+            raise InputError(f"a Gaussian process needs at least one point, got {points!r}.")
+        scaling = IncrementScaling.of(data)
+        rows = np.random.default_rng(seed).permutation(len(data))[:points]
+        Z, Y = scaling.inputs(data.x, data.u)[rows], scaling.targets(data)[rows]
+        with single_threaded():
+            covariance, noise = _most_likely(Z, Y, iterations)
+            return cls.conditioned(covariance, noise, Z, Y, scaling, data)
+
+    @classmethod
+    def conditioned(
+        cls,
+        covariance: SquaredExponential,
+        noise: float,
+        Z: Array,
+        Y: Array,
+        scaling: IncrementScaling,
+        data: Transitions | None = None,
+    ) -> GaussianProcessModel:
+        """Return the model with these hyperparameters, given standardised pairs ``(M, n + m)``, increments ``(M, n)``.
+
+        Raises:
+            InputError: the covariance matrix is not positive definite.
+        """
+        try:
+            factor = cho_factor(covariance(Z, Z) + noise * np.eye(len(Z)), lower=True)
+        except np.linalg.LinAlgError:
+            raise InputError(f"the covariance of {len(Z)} points is not positive definite; raise the noise.") from None
+        return cls(covariance, Z, cho_solve(factor, Y), scaling, data)
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
+        z = self.scaling.inputs(x, u)
+        output = self._contracted(z.reshape(-1, z.shape[-1]), self.weights)
+        return self.scaling.step(x, output.reshape(*z.shape[:-1], -1))
+
+    def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """Return A ``(..., n, n)`` and B ``(..., n, m)``."""
+        z = self.scaling.inputs(x, u)
+        rows = z.reshape(-1, z.shape[-1])
+        n, k = self.weights.shape[1], rows.shape[1]
+        # dk(z, c)/dz = k(z, c) (c - z) / l^2: sums of k w and of k w c over the centres are all that it takes.
+        sums = self._contracted(rows, self._moments)
+        gradient = sums[:, n:].reshape(-1, n, k) - sums[:, :n, None] * rows[:, None, :]
+        gradient /= self.covariance.length_scales**2
+        return self.scaling.jacobian(gradient.reshape(*z.shape[:-1], n, k))
+
+    def _contracted(self, rows: Array, columns: Array) -> Array:
+        """Return ``k(rows, centres) @ columns``."""
+        blocks = [rows[i : i + _BLOCK] for i in range(0, max(1, len(rows)), _BLOCK)]
+        return np.concatenate([self.covariance(block, self.centres) @ columns for block in blocks])
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this model in a store."""
+        return {
+            "points": len(self.centres),
+            "variance": self.covariance.variance,
+            "length_scales": self.covariance.length_scales,
+            "step_at_mean": self.step(*self.scaling.mean_pair),
+        }
+
+
+def _most_likely(Z: Array, Y: Array, iterations: int) -> tuple[SquaredExponential, float]:
+    """Return the covariance and the noise that make standardised outputs ``(M, n)`` most likely."""
+    boxes = [_VARIANCE, _NOISE, *[_LENGTH_SCALE] * Z.shape[1]]
+    bounds = [(float(np.log(low)), float(np.log(high))) for low, high in boxes]
+    start = np.log([1.0, 1e-3, *[3.0] * Z.shape[1]])
+
+    def negative(theta: Array) -> tuple[float, Array]:
+        try:
+            value, gradient = log_likelihood(theta, Z, Y)
+        except np.linalg.LinAlgError:
+            return 1e25, np.zeros_like(theta)
+        return -value, -gradient
+
+    found = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations})
+    variance, noise, *length_scales = np.exp(found.x).tolist()
+    return SquaredExponential(variance, np.array(length_scales)), noise
+
+
+def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
+    """Return ``sum_o log p(Y[:, o] | Z, theta)``, but for a constant, and its gradient (eqs. 5.8 and 5.9).
+
+    Args:
+        theta: logarithms of (variance, noise, length-scales).
+        Z: pairs ``(M, k)``.
+        Y: outputs ``(M, n)`` that share the covariance.
+    """
+    variance, noise, *length_scales = np.exp(theta)
+    covariance = SquaredExponential(float(variance), np.array(length_scales))
+    K = covariance(Z, Z)
+    factor = cho_factor(K + noise * np.eye(len(Z)), lower=True)
+    alpha = cho_solve(factor, Y)
+    value = -0.5 * (Y * alpha).sum() - Y.shape[1] * np.log(np.diag(factor[0])).sum()
+    W = 0.5 * (alpha @ alpha.T - Y.shape[1] * cho_solve(factor, np.eye(len(Z))))
+    G = W * K
+    S = Z / covariance.length_scales
+    by_scales = 2 * ((G.sum(axis=1)[:, None] * S**2).sum(axis=0) - (S * (G @ S)).sum(axis=0))
+    return float(value), np.concatenate([[G.sum(), noise * np.trace(W)], by_scales])

@@ -1,0 +1,141 @@
+"""A feedforward neural network learned from data."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ctxval.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval.errors import InputError, ShapeError
+from ctxval.models.scaling import IncrementScaling
+from ctxval.trajectory import Transitions
+
+
+class FeedforwardReLU:
+    """A network of ReLU layers and a linear last layer that predicts the increment of the state.
+
+    Layer i maps z to ``z @ weights[i] + biases[i]``, in the standardised units of the scaling.
+
+    Args:
+        weights: one matrix a layer, shapes ``(n + m, h), (h, h'), ..., (h'', n)``.
+        biases: one vector a layer.
+        scaling: of the state-input pair and of the increment.
+        data: the transitions that it was learned from, if any.
+
+    Raises:
+        ShapeError: the layers do not fit together or the scaling.
+        InputError: a value is not finite.
+    """
+
+    def __init__(
+        self,
+        weights: Sequence[ArrayLike],
+        biases: Sequence[ArrayLike],
+        scaling: IncrementScaling,
+        data: Transitions | None = None,
+    ) -> None:
+        self.weights = [as_finite(f"weights[{i}]", value) for i, value in enumerate(weights)]
+        self.biases = [as_finite(f"biases[{i}]", value) for i, value in enumerate(biases)]
+        self.scaling = scaling
+        self.data = data
+        pair, states = len(scaling.shift_in), len(scaling.shift_out)
+        widths = [pair, *[bias.size for bias in self.biases]]
+        shapes = [weight.shape for weight in self.weights]
+        if len(widths) < 2 or widths[-1] != states or shapes != list(itertools.pairwise(widths)):
+            raise ShapeError(
+                f"a network from {pair} standardised states and inputs to {states} increments must have layers that "
+                f"fit together, got weights {shapes} and biases {widths[1:]}."
+            )
+
+    @classmethod
+    def from_sklearn(
+        cls, regressor: Any, scaling: IncrementScaling, data: Transitions | None = None
+    ) -> FeedforwardReLU:
+        """Return a fitted ``sklearn.neural_network.MLPRegressor`` of ReLU units as a model, without sklearn in it.
+
+        Raises:
+            InputError: its units are of another kind.
+        """
+        if regressor.activation != "relu" or regressor.out_activation_ != "identity":
+            raise InputError(f"the network must have ReLU units, got {regressor.activation!r}.")
+        return cls(regressor.coefs_, regressor.intercepts_, scaling, data)
+
+    @classmethod
+    def fit(
+        cls,
+        data: Transitions,
+        hidden: Sequence[int] = (8, 8),
+        *,
+        seed: int = 0,
+        restarts: int = 4,
+        iterations: int = 1000,
+    ) -> FeedforwardReLU:
+        """Train networks on recorded transitions with scikit-learn's MLPRegressor and L-BFGS; keep the best.
+
+        Args:
+            data: the transitions.
+            hidden: units in each hidden layer.
+            seed: of the first weights.
+            restarts: how many networks are trained; the one with the smallest loss on the data is kept.
+            iterations: of one training, at most.
+
+        Raises:
+            InputError: scikit-learn is not installed, the data are not finite, or a number is not positive.
+        """
+        if restarts < 1 or iterations < 1:
+            raise InputError(f"restarts and iterations must be positive, got {restarts!r} and {iterations!r}.")
+        scaling = IncrementScaling.of(data)
+        seeds = np.random.SeedSequence(seed).generate_state(restarts)
+        trained = [_trained(data, scaling, tuple(hidden), int(start), iterations) for start in seeds]
+        return cls.from_sklearn(min(trained, key=lambda regressor: regressor.loss_), scaling, data)
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
+        z = self.scaling.inputs(x, u)
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            z = np.maximum(z @ weight + bias, 0.0)
+        return self.scaling.step(x, z @ self.weights[-1] + self.biases[-1])
+
+    def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """Return A ``(..., n, n)`` and B ``(..., n, m)``; at a kink, that of the inactive side."""
+        z = self.scaling.inputs(x, u)
+        gradient = np.eye(z.shape[-1])
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            before = z @ weight + bias
+            gradient = (gradient @ weight) * (before > 0)[..., None, :]
+            z = np.maximum(before, 0.0)
+        return self.scaling.jacobian(np.swapaxes(gradient @ self.weights[-1], -1, -2))
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this model in a store."""
+        return {
+            "layers": [len(bias) for bias in self.biases],
+            "norms": [np.linalg.norm(weight) for weight in self.weights],
+            "step_at_mean": self.step(*self.scaling.mean_pair),
+        }
+
+
+def _trained(
+    data: Transitions, scaling: IncrementScaling, hidden: tuple[int, ...], seed: int, iterations: int
+) -> Any:
+    """Return a fitted MLPRegressor."""
+    try:
+        from sklearn.exceptions import ConvergenceWarning
+        from sklearn.neural_network import MLPRegressor
+    except ImportError as error:
+        raise InputError('scikit-learn is not installed: pip install "ctxval[cases]".') from error
+    regressor = MLPRegressor(
+        hidden_layer_sizes=hidden,
+        solver="lbfgs",
+        alpha=1e-6,  # next to no penalty: so few weights do not overfit thousands of transitions
+        max_iter=iterations,
+        max_fun=2 * iterations,
+        random_state=seed,
+    )
+    with single_threaded(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # the limit of iterations is meant
+        return regressor.fit(scaling.inputs(data.x, data.u), scaling.targets(data))

@@ -1,0 +1,73 @@
+"""Standardised inputs and increments: what a learned regressor of the dynamics sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.errors import InputError
+from ctxval.trajectory import Transitions
+
+
+@dataclass(frozen=True, eq=False)
+class IncrementScaling:
+    """The model ``x_next = x + shift_out + scale_out * f(((x, u) - shift_in) / scale_in)`` around a regressor f.
+
+    Attributes:
+        shift_in, scale_in: of the state-input pair, shapes ``(n + m,)``.
+        shift_out, scale_out: of the increment, shapes ``(n,)``.
+    """
+
+    shift_in: Array
+    scale_in: Array
+    shift_out: Array
+    scale_out: Array
+
+    @classmethod
+    def of(cls, data: Transitions) -> IncrementScaling:
+        """Return the scaling that gives recorded transitions zero mean and unit variance.
+
+        Raises:
+            InputError: the data are not finite, or none.
+        """
+        if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
+            raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
+        pairs, increments = np.concatenate([data.x, data.u], axis=1), data.x_next - data.x
+        return cls(pairs.mean(axis=0), _spread(pairs), increments.mean(axis=0), _spread(increments))
+
+    @property
+    def mean_pair(self) -> tuple[Array, Array]:
+        """The state ``(n,)`` and the input ``(m,)`` in the middle of the data."""
+        n = len(self.shift_out)
+        return self.shift_in[:n], self.shift_in[n:]
+
+    def inputs(self, x: Array, u: Array) -> Array:
+        """Return what f takes, shape ``(..., n + m)``, of states ``(..., n)`` and inputs ``(..., m)``."""
+        batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+        n = x.shape[-1]
+        z = np.empty((*batch, n + u.shape[-1]))
+        z[..., :n], z[..., n:] = x, u
+        return (z - self.shift_in) / self.scale_in
+
+    def targets(self, data: Transitions) -> Array:
+        """Return what f is to return for recorded transitions, shape ``(N, n)``."""
+        return (data.x_next - data.x - self.shift_out) / self.scale_out
+
+    def step(self, x: Array, output: Array) -> Array:
+        """Return the next states ``(..., n)`` of what f returned, ``(..., n)``."""
+        return x + self.shift_out + self.scale_out * output
+
+    def jacobian(self, gradient: Array) -> tuple[Array, Array]:
+        """Return A ``(..., n, n)`` and B ``(..., n, m)`` of the gradient of f, ``(..., n, n + m)``."""
+        n = len(self.shift_out)
+        whole = self.scale_out[:, None] * gradient / self.scale_in
+        whole[..., :n] += np.eye(n)
+        return whole[..., :n], whole[..., n:]
+
+
+def _spread(columns: Array) -> Array:
+    """Return the standard deviations, and 1 for a column that does not vary."""
+    spread = columns.std(axis=0)
+    return np.where(spread > 1e-12 * np.maximum(1.0, np.abs(columns).max(axis=0)), spread, 1.0)

@@ -1,0 +1,74 @@
+"""Simulated annealing (Kirkpatrick, Gelatt and Vecchi 1983), a baseline for many executions."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.errors import InputError
+from ctxval.searches.base import SequentialSearch
+
+_SMALLEST_MOVE = 0.1
+"""Moves shrink with the temperature, down to this share of the first ones."""
+
+
+class Annealing(SequentialSearch):
+    """A Metropolis walk through the unit cube, at a temperature that falls geometrically.
+
+    Each point is a Gaussian move from the walk's place, reflected at the faces of the cube, or now and then a uniform
+    draw. The walk goes there if the value is larger, or else with probability ``exp(-loss / T_k)``, where T_k at
+    trial k is ``temperature * cooling ** k`` times the range of the values before it. It never goes to a failed point.
+
+    Args:
+        temperature: at the start, as a share of the range of the values.
+        cooling: factor of the temperature from one trial to the next.
+        move: standard deviation of the first moves on each axis, in widths of the cube; it shrinks with the square
+            root of the temperature.
+        restart: probability of a uniform draw in place of a move.
+
+    Raises:
+        InputError: temperature or move is not positive, cooling not in (0, 1], or restart not in [0, 1].
+    """
+
+    def __init__(
+        self, temperature: float = 0.1, cooling: float = 0.98, move: float = 0.2, restart: float = 0.05
+    ) -> None:
+        if not (0 < temperature < np.inf and 0 < move < np.inf):
+            raise InputError(f"temperature and move must be positive numbers, got {temperature!r} and {move!r}.")
+        if not (0 < cooling <= 1 and 0 <= restart <= 1):
+            raise InputError(f"cooling must be in (0, 1] and restart in [0, 1], got {cooling!r} and {restart!r}.")
+        self.temperature = temperature
+        self.cooling = cooling
+        self.move = move
+        self.restart = restart
+
+    def propose(self, rng: np.random.Generator) -> Array:
+        """Return a uniform draw, or a move from where the walk is."""
+        points, values = self.points, self.values
+        uniform = rng.random() < self.restart
+        if uniform or not np.isfinite(values).any():
+            return rng.random(self.dimension)
+        shrunk = max(self.cooling ** (0.5 * len(values)), _SMALLEST_MOVE)
+        place = points[self._walk(values)]
+        return reflected(place + self.move * shrunk * rng.normal(size=self.dimension))
+
+    def _walk(self, values: Array) -> int:
+        """Return the number of the trial at which the walk is, after all of them."""
+        known = np.flatnonzero(np.isfinite(values))
+        heights = values[known]
+        ranges = np.maximum.accumulate(heights) - np.minimum.accumulate(heights)
+        # One stream for all decisions: a longer history has the same first draws. The third word keeps it apart from
+        # the stream [seed, k] of trial k. A loss below T times an exponential variate has the Metropolis probability.
+        stream = np.random.default_rng(np.random.SeedSequence([self._seed, 0, 1]))
+        tolerated = self.temperature * self.cooling**known * stream.standard_exponential(len(values))[known]
+        place = 0
+        for i in range(1, len(known)):
+            if heights[place] - heights[i] <= tolerated[i] * ranges[i - 1]:
+                place = i
+        return int(known[place])
+
+
+def reflected(points: Array) -> Array:
+    """Return points folded back into the unit cube at its faces."""
+    remainder = np.mod(points, 2.0)
+    return np.minimum(remainder, 2.0 - remainder)

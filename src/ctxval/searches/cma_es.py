@@ -1,0 +1,95 @@
+"""CMA-ES (Hansen and Ostermeier 2001) with restarts, a baseline for many executions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ctxval.arrays import Array, single_threaded
+from ctxval.errors import InputError
+from ctxval.searches.base import SequentialSearch
+
+if TYPE_CHECKING:
+    from cmaes import CMA
+
+_SMALLEST_POPULATION = 4
+_POINT = 1e-4
+"""A generation that spans less than this of the cube on every axis has nothing left to find."""
+
+
+class CMAES(SequentialSearch):
+    """Covariance matrix adaptation inside the unit cube, one point of a generation after the other.
+
+    It starts at the centre of the cube. A run that has converged is followed by one from a random place with twice
+    the population (IPOP; Auger and Hansen 2005). Every point told counts in its generation, also one chosen by hand.
+
+    Args:
+        sigma: standard deviation of the first generation on each axis, in widths of the cube.
+        population: points in a generation; ``4 + floor(3 ln d)`` by default.
+
+    Raises:
+        InputError: sigma is not positive, the population is below 4, or ``cmaes`` is not installed.
+    """
+
+    def __init__(self, sigma: float = 0.3, population: int | None = None) -> None:
+        if not 0 < sigma < np.inf:
+            raise InputError(f"sigma must be a positive number, got {sigma!r}.")
+        if population is not None and population < _SMALLEST_POPULATION:
+            raise InputError(f"CMA-ES needs a population of at least {_SMALLEST_POPULATION}, got {population!r}.")
+        _cma_class()
+        self.sigma = sigma
+        self.population = population
+
+    def reset(self, dimension: int, seed: int) -> None:
+        """Forget everything and start on the unit cube of this dimension."""
+        super().reset(dimension, seed)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._distribution = self._started(np.full(self.dimension, 0.5), self.population)
+        self._learned = np.empty(0)
+
+    def propose(self, rng: np.random.Generator) -> Array:
+        """Return a draw from the distribution that the whole generations so far have shaped."""
+        with single_threaded():
+            self._learn_generations(self.points, self.values)
+            self._distribution.reseed_rng(int(rng.integers(2**32)))
+            return np.asarray(self._distribution.ask(), dtype=np.float64)
+
+    def _learn_generations(self, points: Array, values: Array) -> None:
+        if not np.array_equal(values[: len(self._learned)], self._learned, equal_nan=True):
+            self._begin()  # a value has come in late, for a generation that was learned without it
+        while (last := (first := len(self._learned)) + self._distribution.population_size) <= len(points):
+            _learn(self._distribution, points[first:last], values[first:last])
+            if self._distribution.should_stop() or (np.ptp(points[first:last], axis=0) < _POINT).all():
+                self._distribution = self._restarted(2 * self._distribution.population_size, last)
+            self._learned = values[:last]
+
+    def _started(self, mean: Array, population: int | None) -> CMA:
+        bounds = np.tile([0.0, 1.0], (self.dimension, 1))
+        return _cma_class()(mean=mean, sigma=self.sigma, bounds=bounds, population_size=population)
+
+    def _restarted(self, population: int, number: int) -> CMA:
+        # Trial k draws from [seed, k]; the third word keeps the restart's place apart from it.
+        rng = np.random.default_rng(np.random.SeedSequence([self._seed, number, 1]))
+        return self._started(rng.random(self.dimension), population)
+
+
+def _learn(distribution: CMA, points: Array, values: Array) -> None:
+    """Tell one generation; its failures rank behind its worst value, and a generation of failures teaches nothing."""
+    known = np.isfinite(values)
+    if not known.any():
+        return
+    losses = np.where(known, -values, -values[known].min())
+    order = np.argsort(-values, kind="stable")  # NaN last
+    distribution.tell([(points[i], float(losses[i])) for i in order])
+
+
+def _cma_class() -> type[CMA]:
+    try:
+        import cmaes  # here, and not above: it is an extra
+    except ImportError as error:
+        raise InputError('cmaes is not installed: pip install "ctxval[searches]".') from error
+    found: type[CMA] = cmaes.CMA
+    return found

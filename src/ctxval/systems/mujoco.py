@@ -1,0 +1,311 @@
+"""A MuJoCo model as the true system."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from ctxval.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
+from ctxval.controller import Controller
+from ctxval.errors import InputError, ShapeError, UnknownNameError
+from ctxval.rollout import rollout
+from ctxval.task import Task
+from ctxval.trajectory import Trajectory
+
+_SAME_POSITION = 1e-6
+"""Metres by which the given position of a site may miss the actual one in an initial state."""
+
+
+class MuJoCo:
+    """An MJCF model as the true system, with feedback, whole batches of closed loops at once.
+
+    The state is ``(qpos, qvel)``, then the chosen coordinates of each chosen site. An execution starts from the
+    model's defaults (activations, mocap bodies, ...) at the task's qpos and qvel. Inputs are MuJoCo's ``ctrl``, held
+    over a step; MuJoCo clamps them to a ``ctrlrange``, while the trajectory keeps what the controller asked for.
+
+    A simulation that MuJoCo warns of (unstable state or acceleration, full contact buffer) has failed, although MuJoCo
+    resets it silently and goes on: its states are NaN from there on, and the trajectory's ``ended`` names the warning.
+
+    Args:
+        mjcf: the model as XML text, or the path of its file.
+        substeps: MuJoCo steps in one control step; a task's dt is the model's timestep times this.
+        sites: names of sites whose positions belong to the state, such as an end effector.
+        axes: which world coordinates of the sites, letters of ``"xyz"``.
+        threads: what a batch is spread over (MuJoCo 4 or later); the results do not depend on it.
+
+    Raises:
+        InputError: MuJoCo is not installed, the model cannot be read or compiled, or a value cannot be used.
+    """
+
+    batched = True
+
+    def __init__(
+        self,
+        mjcf: str | Path,
+        *,
+        substeps: int = 1,
+        sites: str | Sequence[str] = (),
+        axes: str = "xy",
+        threads: int = 1,
+    ) -> None:
+        self._mjcf, self._model = _compiled(mjcf)
+        self.substeps = _positive("substeps", substeps)
+        self.threads = _positive("threads", threads)
+        self.sites = (sites,) if isinstance(sites, str) else tuple(sites)
+        self.axes = axes
+        self._coordinates = _coordinates(self._model, self.sites, axes)
+
+    @property
+    def dt(self) -> float:
+        """Seconds in one control step."""
+        return float(self._model.opt.timestep) * self.substeps
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this system in a store."""
+        digest = hashlib.sha256(self._mjcf.encode()).hexdigest()[:16]
+        masses = self._model.body_mass.tolist()  # those of meshes are not in the text
+        return {
+            "mjcf": digest,
+            "mass": masses,
+            "substeps": self.substeps,
+            "sites": self.sites,
+            "axes": self.axes,
+        }
+
+    def state(self, qpos: ArrayLike, qvel: ArrayLike | None = None) -> Array:
+        """Return the whole state at rest, or at ``qvel (..., nv)``, in configurations ``qpos (..., nq)``.
+
+        Raises:
+            InputError: a value is not a finite number, or has the wrong shape.
+        """
+        positions = require_shape("qpos", as_finite("qpos", qpos), (self._model.nq,))
+        velocities = np.zeros(self._model.nv) if qvel is None else as_finite("qvel", qvel)
+        require_shape("qvel", velocities, (self._model.nv,))
+        batch = np.broadcast_shapes(positions.shape[:-1], velocities.shape[:-1])
+        simulations = _simulations(self._model, int(np.prod(batch)), 1)
+        simulations.qpos[:] = np.broadcast_to(positions, (*batch, self._model.nq)).reshape(-1, self._model.nq)
+        simulations.qvel[:] = np.broadcast_to(velocities, (*batch, self._model.nv)).reshape(-1, self._model.nv)
+        simulations.locate()
+        return self._observed(simulations).reshape(*batch, -1)
+
+    def execute(self, controller: Controller, task: Task) -> Trajectory:
+        """Run the closed loop from the task's initial state over its horizon.
+
+        Raises:
+            InputError: the task's dt is not that of a control step, or its initial state has a site elsewhere.
+            ShapeError: states or inputs are not as many as the model's.
+        """
+        if not np.isclose(task.dt, self.dt, rtol=1e-9, atol=0):
+            raise InputError(
+                f"the task's dt must be the model's timestep times substeps, "
+                f"{self._model.opt.timestep:g} s x {self.substeps} = {self.dt:g} s, got {task.dt:g} s."
+            )
+        execution = _Execution(self, self._started(task))
+        trajectory = rollout(execution.step, controller, task)
+        ended = execution.failure or trajectory.ended
+        return Trajectory(trajectory.times, trajectory.states, trajectory.inputs, ended)
+
+    def _started(self, task: Task) -> _Simulations:
+        """Return one simulation for each task, in its initial state."""
+        nq, nv, sites = self._model.nq, self._model.nv, self._coordinates[0].size * self._coordinates[1].size
+        states = task.initial_state.reshape(-1, task.initial_state.shape[-1])
+        if states.shape[1] != nq + nv + sites:
+            raise ShapeError(
+                f"the task must have {nq + nv + sites} states, {nq} qpos, {nv} qvel and {sites} coordinates of sites, "
+                f"got {states.shape[1]}."
+            )
+        simulations = _simulations(self._model, len(states), self.threads)
+        simulations.qpos[:], simulations.qvel[:] = states[:, :nq], states[:, nq : nq + nv]
+        if sites:
+            self._require_located(states, simulations)
+        return simulations
+
+    def _require_located(self, states: Array, simulations: _Simulations) -> None:
+        simulations.locate()
+        given, actual = (array[:, self._model.nq + self._model.nv :] for array in (states, self._observed(simulations)))
+        misses = np.abs(given - actual).max(axis=1)
+        if misses.max() > _SAME_POSITION:
+            worst = int(misses.argmax())
+            raise InputError(
+                f"the initial state must end with the sites' positions at its qpos, {actual[worst].tolist()}, "
+                f"got {given[worst].tolist()}; state(qpos, qvel) returns the whole state."
+            )
+
+    def _observed(self, simulations: _Simulations) -> Array:
+        sites, axes = self._coordinates
+        positions = simulations.site_positions[:, sites, axes]
+        return np.concatenate([simulations.qpos, simulations.qvel, positions.reshape(len(positions), -1)], axis=1)
+
+
+class _Execution:
+    """The simulations of a batch of tasks, as a step function with a memory."""
+
+    def __init__(self, system: MuJoCo, simulations: _Simulations) -> None:
+        self.system, self.simulations = system, simulations
+        self.healthy: Mask = np.ones(len(simulations.qpos), dtype=bool)
+        self.steps = 0
+        self.failure = ""
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Apply inputs ``(..., m)`` for one control step; return the states ``(..., n)``, NaN where one failed."""
+        ctrl = self.simulations.ctrl
+        if u.shape[-1] != ctrl.shape[1]:
+            raise ShapeError(f"the controller must return the model's {ctrl.shape[1]} inputs, got {u.shape[-1]}.")
+        inputs = u.reshape(ctrl.shape)
+        self.steps += 1
+        self._mark(np.asarray(~np.isfinite(inputs).all(axis=1)), "an input is not finite")
+        ctrl[self.healthy] = inputs[self.healthy]
+        self.simulations.advance(self.system.substeps, self.healthy, locate=bool(self.system.sites))
+        warned: Mask = np.asarray(self.simulations.warnings > 0)
+        if warned.any():
+            self._mark(np.asarray(warned.any(axis=1)), f"MuJoCo warned of {_warning_name(warned)}")
+        states = self.system._observed(self.simulations)
+        states[~self.healthy] = np.nan
+        return states.reshape(x.shape)
+
+    def _mark(self, failed: Mask, reason: str) -> None:
+        if (failed & self.healthy).any():
+            self.failure = self.failure or f"{reason} at step {self.steps}"
+            self.healthy &= ~failed
+
+
+class _Simulations(Protocol):
+    """Simulations of one model, one a row: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``."""
+
+    qpos: Array
+    qvel: Array
+    ctrl: Array
+    site_positions: Array  # (N, nsite, 3)
+
+    @property
+    def warnings(self) -> Rows:
+        """How often MuJoCo warned, by simulation and kind of warning."""
+
+    def locate(self) -> None:
+        """Compute the sites' positions."""
+
+    def advance(self, substeps: int, rows: Mask, *, locate: bool) -> None:
+        """Step the simulations in these rows, and compute their sites' positions if wanted."""
+
+
+def _simulations(model: Any, count: int, threads: int) -> _Simulations:
+    try:
+        return _Batch(model, count, threads)
+    except ImportError:
+        return _Loop(model, count)
+
+
+class _Batch:
+    """MuJoCo's own batch, since its version 4."""
+
+    def __init__(self, model: Any, count: int, threads: int) -> None:
+        from mujoco import mjtStage
+        from mujoco.batch import Batch
+
+        self.batch = Batch(model, count, threads)
+        self.located, self.moved = int(mjtStage.mjSTAGE_POS), int(mjtStage.mjSTAGE_NONE)
+        self.qpos, self.qvel, self.ctrl = (self.batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+        self.site_positions: Array = self.batch.bind("site_xpos")
+
+    @property
+    def warnings(self) -> Rows:
+        counts: Rows = self.batch.warning[:, :, 1]
+        return counts
+
+    def locate(self) -> None:
+        self.batch.forward(stage=self.located)
+
+    def advance(self, substeps: int, rows: Mask, *, locate: bool) -> None:
+        ids = None if rows.all() else np.flatnonzero(rows)
+        self.batch.step(ids, substeps, self.located if locate else self.moved)
+
+
+class _Loop:
+    """One MjData that serves all simulations in turn, for older versions: the same numbers, more slowly."""
+
+    def __init__(self, model: Any, count: int) -> None:
+        import mujoco
+
+        self.model, self.data = model, mujoco.MjData(model)
+        # Everything that the next step depends on, the constraint solver's warm start too.
+        self.kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        row = np.empty(mujoco.mj_stateSize(model, self.kind))
+        mujoco.mj_getState(model, self.data, row, self.kind)
+        self.rows = np.tile(row, (count, 1))
+        kinds = mujoco.mjtState
+        self.qpos, self.qvel = self._columns(kinds.mjSTATE_QPOS), self._columns(kinds.mjSTATE_QVEL)
+        self.ctrl = self._columns(kinds.mjSTATE_CTRL)
+        self.site_positions = np.zeros((count, model.nsite, 3))
+        self.warnings: Rows = np.zeros((count, len(self.data.warning)), dtype=np.intp)
+
+    def _columns(self, component: Any) -> Array:
+        """Return a view of one component of the rows; they stand in the order of their bits."""
+        from mujoco import mj_stateSize
+
+        start = mj_stateSize(self.model, self.kind & (int(component) - 1))
+        return self.rows[:, start : start + mj_stateSize(self.model, int(component))]
+
+    def locate(self) -> None:
+        self.advance(0, np.ones(len(self.rows), dtype=bool), locate=True)
+
+    def advance(self, substeps: int, rows: Mask, *, locate: bool) -> None:
+        import mujoco
+
+        model, data = self.model, self.data
+        for i in np.flatnonzero(rows).tolist():
+            mujoco.mj_setState(model, data, self.rows[i], self.kind)
+            if substeps:
+                mujoco.mj_step(model, data, substeps)
+                mujoco.mj_getState(model, data, self.rows[i], self.kind)
+            if locate:
+                mujoco.mj_kinematics(model, data)
+                self.site_positions[i] = data.site_xpos
+            if data.warning.number.any():
+                self.warnings[i] = data.warning.number
+                mujoco.mj_resetData(model, data)  # the others have not been warned of
+
+
+def _compiled(mjcf: str | Path) -> tuple[str, Any]:
+    """Return the text and the compiled model."""
+    try:
+        import mujoco
+    except ImportError as error:
+        raise InputError('MuJoCo is not installed: pip install "ctxval[mujoco]".') from error
+    is_text = isinstance(mjcf, str) and "<" in mjcf
+    try:
+        text = str(mjcf) if is_text else Path(mjcf).read_text(encoding="utf-8")
+        model = mujoco.MjModel.from_xml_string(text) if is_text else mujoco.MjModel.from_xml_path(str(mjcf))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"the MuJoCo model {str(mjcf)!r} cannot be read: {error}.") from error
+    except ValueError as error:
+        raise InputError(f"MuJoCo cannot compile the model: {error}") from error
+    return text, model
+
+
+def _positive(name: str, value: int) -> int:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+        raise InputError(f"{name} must be a positive integer, got {value!r}.")
+    return int(value)
+
+
+def _coordinates(model: Any, sites: Sequence[str], axes: str) -> tuple[Rows, ...]:
+    """Return the indices of these sites' coordinates in positions ``(nsite, 3)``."""
+    if not axes or not set(axes) <= set("xyz"):
+        raise InputError(f"axes must be letters of 'xyz', got {axes!r}.")
+    known = [model.site(i).name for i in range(model.nsite)]
+    for site in sites:
+        if site not in known:
+            raise UnknownNameError.among("site", site, known)
+    rows = np.array([known.index(site) for site in sites], dtype=np.intp)
+    return np.ix_(rows, np.array(["xyz".index(axis) for axis in axes], dtype=np.intp))
+
+
+def _warning_name(warned: Mask) -> str:
+    """Return the first kind of warning in ``(N, kinds)``."""
+    from mujoco import mjtWarning
+
+    return str(mjtWarning(int(warned.any(axis=0).argmax())).name).removeprefix("mjWARN_")
