@@ -116,9 +116,7 @@ def test_one_closed_loop_is_what_a_plain_loop_of_mj_step_does(arm: systems.MuJoC
         task = arm_task(arm)[index]
         trajectory = arm.execute(feedback, task)
         assert trajectory.ended == "complete"
-        np.testing.assert_allclose(
-            trajectory.states, bare_loop(ARM, 2, feedback, task, ("tip",)), rtol=0, atol=1e-12
-        )
+        np.testing.assert_allclose(trajectory.states, bare_loop(ARM, 2, feedback, task, ("tip",)), rtol=0, atol=1e-12)
 
 
 @pytest.mark.usefixtures("engine")
@@ -140,9 +138,7 @@ def test_a_batch_does_what_its_tasks_do_alone(arm: systems.MuJoCo) -> None:
         np.testing.assert_array_equal(batch[index].states, arm.execute(feedback, task[index]).states)
 
 
-def test_the_loop_for_older_versions_gives_the_same_bits(
-    arm: systems.MuJoCo, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_loop_for_older_versions_gives_the_same_bits(arm: systems.MuJoCo, monkeypatch: pytest.MonkeyPatch) -> None:
     ball = systems.MuJoCo(BALL, substeps=4)
     ball_task = Task(ball.state([0, 0, 0.12, 1, 0, 0, 0, 0]), horizon=40, dt=0.02)
     runs = [(arm, feedback, arm_task(arm)), (ball, push, ball_task)]

@@ -25,8 +25,8 @@ from ctxval.errors import UnknownNameError
 MODELS = ("fnn", "gp", "linear")
 """The paper's three: a feedforward network of 2 x 8 ReLU units, a Gaussian process, a linear model."""
 
-# Reacher's, as in Gymnasium: lengths, thickness and density of the links (0.1 m and 0.1 m, the fingertip 0.01 m beyond),
-# armature and damping of the joints, the elbow's range, the motors' gear and range, gravity, integrator and timestep.
+# Reacher's, as in Gymnasium: the links' lengths, thickness and density (0.1 m each, the fingertip 0.01 m beyond), the
+# joints' armature and damping, the elbow's range, the motors' gear and range, gravity, integrator and timestep.
 # Its walls and its target are left out, as nothing ever touches them; the site marks its fingertip.
 MJCF = """
 <mujoco model="arm">
@@ -63,38 +63,38 @@ class Settings:
 
     Attributes:
         substeps: MuJoCo steps in one control step, Reacher's: dt is 20 ms.
-        horizon: steps; in 2 s a controller on the true dynamics reaches nearly every target, at joint rates below
-            5 rad/s and a fifth of the motors' torque.
-        reach: m; the targets are |y|, |z| <= 0.14, a square that lies whole within the arm's 0.21 m and, at its corners
-            0.198 m from the shoulder, clear of full extension, so that whoever misses a target is to blame.
+        horizon: steps, Reacher's: 1 s; on the true dynamics iLQR then ends within 2 cm of every target.
+        y, z: m; the table in front of the arm. All of it is within the arm's reach of 0.21 m, the far corners are
+            0.206 m away, and 4 cm and more from the shoulder, where the elbow's stops let no fingertip, so that
+            whoever misses a target is to blame. Behind its shoulder the arm has no way that is better than all others.
         position_weight: of the end effector's deviation, 1/m^2; what the task is about.
-        rate_weight: s^2/rad^2; small, yet without it the cost rewards whirling through the target.
-        torque_weight: of the torque in units of the motors' 200 N m; keeps the rates within those recorded.
-        final_position_weight, final_rate_weight: of the last state, ten times those of the others.
-        iterations: of iLQR; nearly all tasks have converged on the smooth models, and the network's kinks stop it.
-        rollouts, steps: recorded for learning: 400 x 10 transitions, 0.2 s each, from rest.
-        torque: recorded torques are uniform within +-0.15 of the motors' range, about those of the closed loop.
-        elbow: rad; recordings start anywhere around the shoulder and at elbow angles within +-2, so that they stay
-            clear of the elbow's stops, 3 rad.
-        points: of the data that the Gaussian process is conditioned on; more are slower and hardly more precise.
-        restarts: trainings of the network, of which the best on its data is kept.
-        training: iterations of one training at most.
+        rate_weight: s^2/rad^2; small, yet without it whirling through the target is as good as stopping there.
+        torque_weight: of the torque in units of the motors' 200 N m; small, so that half of it is ever used.
+        final_position_weight, final_rate_weight: of the last state, ten times and more those of the others.
+        iterations: of iLQR; smooth models have converged after them, and the network's kinks stop it sooner or later.
+        rollouts, steps: recorded for learning: 400 x 10 transitions, from rest.
+        torque: recorded torques are uniform within +-0.2 of the motors' range, as the typical ones of the closed loop.
+        elbow: rad; recordings start at any angle of the shoulder and at elbow angles within +-2.5, so that they stay
+            clear of the elbow's stops at 3 rad.
+        points: of the data that the Gaussian process is conditioned on; with more it is slower and errs by less still.
+        restarts, training: how often the network is trained, and iterations of one training at most; the best is kept.
     """
 
     substeps: int = 2
-    horizon: int = 100
-    reach: float = 0.14
+    horizon: int = 50
+    y: tuple[float, float] = (0.04, 0.18)
+    z: tuple[float, float] = (-0.1, 0.1)
     position_weight: float = 1.0
-    rate_weight: float = 1e-3
-    torque_weight: float = 3.0
+    rate_weight: float = 3e-4
+    torque_weight: float = 0.1
     final_position_weight: float = 10.0
     final_rate_weight: float = 1e-2
     iterations: int = 25
     rollouts: int = 400
     steps: int = 10
-    torque: float = 0.15
-    elbow: float = 2.0
-    points: int = 400
+    torque: float = 0.2
+    elbow: float = 2.5
+    points: int = 200
     restarts: int = 4
     training: int = 1000
 
@@ -146,7 +146,7 @@ def experiment(seed: int = 0, model: str = "fnn", settings: Settings | None = No
         return Task(rest, goal=[0.0, 0.0, 0.0, 0.0, p.y, p.z], horizon=settings.horizon, dt=system.dt)
 
     validation = Validation(
-        space=TaskSpace(y=(-settings.reach, settings.reach, "m"), z=(-settings.reach, settings.reach, "m")),
+        space=TaskSpace(y=(*settings.y, "m"), z=(*settings.z, "m")),
         task=reach,
         system=system,
         model=learn(model, record(system, settings, seed), settings, seed),

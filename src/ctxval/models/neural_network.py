@@ -119,9 +119,7 @@ class FeedforwardReLU:
         }
 
 
-def _trained(
-    data: Transitions, scaling: IncrementScaling, hidden: tuple[int, ...], seed: int, iterations: int
-) -> Any:
+def _trained(data: Transitions, scaling: IncrementScaling, hidden: tuple[int, ...], seed: int, iterations: int) -> Any:
     """Return a fitted MLPRegressor."""
     try:
         from sklearn.exceptions import ConvergenceWarning

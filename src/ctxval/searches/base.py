@@ -10,6 +10,7 @@ import numpy as np
 from ctxval.arrays import Array, ArrayLike, as_floats
 from ctxval.errors import InputError, ShapeError
 
+
 @runtime_checkable
 class Search(Protocol):
     """Chooses the next points of the unit cube to evaluate, seeking the largest value.
