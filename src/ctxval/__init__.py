@@ -11,7 +11,7 @@ from ctxval.store import Store
 from ctxval.task import Task
 from ctxval.trajectory import Trajectory, Transitions
 from ctxval.trial import Trial
-from ctxval.truth import Truth, grid_truth
+from ctxval.truth import Truth, cached_truth, grid_truth, search_truth
 from ctxval.validation import Outcome, Plan, Validation
 from ctxval.verdict import Verdict
 
@@ -33,5 +33,7 @@ __all__ = [
     "Truth",
     "Validation",
     "Verdict",
+    "cached_truth",
     "grid_truth",
+    "search_truth",
 ]

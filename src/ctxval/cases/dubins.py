@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-import ctxval.truth
 from ctxval import (
     Experiment,
     Parameters,
@@ -15,9 +14,11 @@ from ctxval import (
     Trajectory,
     Transitions,
     Validation,
+    cached_truth,
     controllers,
     distances,
     models,
+    search_truth,
     systems,
 )
 from ctxval.arrays import Array
@@ -161,7 +162,7 @@ def experiment(
         validation,
         budget=100,
         threshold=settings.threshold if name == settings.distance else None,
-        truth=lambda: ctxval.truth.cached_truth(validation, ctxval.truth.search_truth),
+        truth=lambda: cached_truth(validation, search_truth),
         units="m",
     )
 

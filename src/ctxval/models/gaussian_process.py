@@ -130,7 +130,7 @@ class GaussianProcessModel:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         z = self.scaling.inputs(x, u)
         output = self._contracted(z.reshape(-1, z.shape[-1]), self.weights)
-        return self.scaling.step(x, output.reshape(*z.shape[:-1], -1))
+        return self.scaling.step(x, output.reshape(*z.shape[:-1], self.weights.shape[1]))
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A ``(..., n, n)`` and B ``(..., n, m)``."""
@@ -139,7 +139,7 @@ class GaussianProcessModel:
         n, k = self.weights.shape[1], rows.shape[1]
         # dk(z, c)/dz = k(z, c) (c - z) / l^2: sums of k w and of k w c over the centres are all that it takes.
         sums = self._contracted(rows, self._moments)
-        gradient = sums[:, n:].reshape(-1, n, k) - sums[:, :n, None] * rows[:, None, :]
+        gradient = sums[:, n:].reshape(len(rows), n, k) - sums[:, :n, None] * rows[:, None, :]
         gradient /= self.covariance.length_scales**2
         return self.scaling.jacobian(gradient.reshape(*z.shape[:-1], n, k))
 

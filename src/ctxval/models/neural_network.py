@@ -103,7 +103,7 @@ class FeedforwardReLU:
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A ``(..., n, n)`` and B ``(..., n, m)``; at a kink, that of the inactive side."""
         z = self.scaling.inputs(x, u)
-        gradient = np.eye(z.shape[-1])
+        gradient = np.broadcast_to(np.eye(z.shape[-1]), (*z.shape, z.shape[-1]))
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             before = z @ weight + bias
             gradient = (gradient @ weight) * (before > 0)[..., None, :]
