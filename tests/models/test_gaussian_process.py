@@ -65,11 +65,8 @@ def test_the_likelihood_is_scikit_learns_and_its_gradient_is_right() -> None:
     constant = -0.5 * Y.size * np.log(2 * np.pi)
     assert value + constant == pytest.approx(oracle.log_marginal_likelihood_value_, abs=1e-8)
     h = 1e-6
-    numeric = [
-        (gaussian_process.log_likelihood(theta + h * e, Z, Y)[0] - gaussian_process.log_likelihood(theta - h * e, Z, Y)[0])
-        / (2 * h)
-        for e in np.eye(len(theta))
-    ]
+    likelihood = lambda moved: gaussian_process.log_likelihood(moved, Z, Y)[0]  # noqa: E731
+    numeric = [(likelihood(theta + h * e) - likelihood(theta - h * e)) / (2 * h) for e in np.eye(len(theta))]
     np.testing.assert_allclose(gradient, numeric, rtol=1e-5, atol=1e-5)
 
 
@@ -158,8 +155,8 @@ def test_what_cannot_be_used_is_refused() -> None:
         models.GaussianProcessModel.fit(Transitions(data.x, data.u, data.x_next * np.inf))
     with pytest.raises(InputError, match="at least one point, got 0"):
         models.GaussianProcessModel.fit(data, 0)
+    Z = np.zeros((3, 3))
     with pytest.raises(InputError, match="not positive definite; raise the noise"):
-        Z = np.zeros((3, 3))
         models.GaussianProcessModel.conditioned(own.covariance, 0.0, Z, np.zeros((3, 2)), own.scaling)
     with pytest.raises(ShapeError, match=r"2 states needs centres \(M, 3\), weights \(M, 2\)"):
         models.GaussianProcessModel(own.covariance, own.centres[:, :2], own.weights, own.scaling)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import itertools
 import json
 from typing import Any
 
@@ -31,7 +32,7 @@ def network() -> models.FeedforwardReLU:
 def random_network(rng: np.random.Generator, hidden: tuple[int, ...]) -> models.FeedforwardReLU:
     """Return a network of three states and two inputs with random weights and a random scaling."""
     widths = [5, *hidden, 3]
-    weights = [rng.normal(size=shape) for shape in zip(widths[:-1], widths[1:], strict=True)]
+    weights = [rng.normal(size=shape) for shape in itertools.pairwise(widths)]
     biases = [rng.normal(size=width) for width in widths[1:]]
     scaling = models.IncrementScaling(
         rng.normal(size=5), rng.uniform(0.5, 2, 5), rng.normal(size=3), rng.uniform(0.5, 2, 3)
