@@ -7,7 +7,16 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, TaskSpace, Validation, searches
-from ctxval.errors import DistanceError, ExecutionError, InputError, ModelError, StoreMismatchError, UnknownNameError
+from ctxval.errors import (
+    CtxvalError,
+    DistanceError,
+    ExecutionError,
+    InputError,
+    ModelError,
+    StoreAccessError,
+    StoreMismatchError,
+    UnknownNameError,
+)
 from ctxval.testing import FaultyRig
 from ctxval.trial import Trial
 
@@ -257,3 +266,72 @@ def test_the_sketch_of_the_readme_runs() -> None:
         distance=validation.distance,
     )
     assert Campaign(again, search=searches.GPUCB(beta=2.0), seed=7).run(budget=6).executions == 6
+
+
+# What an attack on the campaign found, and must not find again
+
+
+def test_an_interrupt_while_planning_leaves_no_ghost_in_the_search(validation: Validation) -> None:
+    class Impatient:
+        batched = True
+        designs = 0
+
+        def design(self, task, model):  # type: ignore[no-untyped-def]
+            self.designs += 1
+            if self.designs == 7:
+                raise KeyboardInterrupt
+            return validation.synthesizer.design(task, model)
+
+        def describe(self) -> dict[str, object]:
+            return {}
+
+    hasty = make_validation()
+    hasty.synthesizer = Impatient()
+    campaign = Campaign(hasty, seed=2)
+    with pytest.raises(KeyboardInterrupt):
+        campaign.run(10)
+    assert facts(campaign.run(10).trials) == facts(Campaign(validation, seed=2).run(10).trials)
+
+
+def test_an_interrupted_trial_that_cannot_be_planned_any_more_is_passed_over(tmp_path: Path) -> None:
+    class Stopped(FaultyRig):
+        def execute(self, controller, task):  # type: ignore[no-untyped-def]
+            raise KeyboardInterrupt
+
+    plain = make_validation()
+    with pytest.raises(KeyboardInterrupt):
+        Campaign(make_validation(system=Stopped(plain.system)), store=tmp_path / "a.sqlite").run(3)
+    again = make_validation(system=Stopped(plain.system))
+    campaign = Campaign(again, store=tmp_path / "a.sqlite")
+    whole, again.synthesizer.design = again.synthesizer.design, None  # type: ignore[attr-defined, method-assign]
+    with pytest.raises(CtxvalError):
+        campaign.run(3)
+    again.synthesizer.design = whole  # type: ignore[method-assign]
+    again.system = plain.system
+    assert campaign.run(3).executions == 3
+    assert (campaign.trials[0].state, campaign.trials[0].executed) == ("failed", False)
+
+
+def test_a_failure_with_undecodable_text_is_stored(validation: Validation) -> None:
+    class Serial(FaultyRig):
+        def execute(self, controller, task):  # type: ignore[no-untyped-def]
+            raise RuntimeError("serial said \udcff")
+
+    campaign = Campaign(make_validation(system=Serial(validation.system))).run(1)
+    assert campaign.executions == 1
+    assert "serial said" in (campaign.trials[0].failure or "")
+
+
+def test_two_processes_do_not_run_one_store(validation: Validation, tmp_path: Path) -> None:
+    first, second = (Campaign(validation, store=tmp_path / "a.sqlite") for _ in range(2))
+    with first.store.sole_writer(), pytest.raises(StoreAccessError, match="run by another process"):
+        second.run(1)
+    assert second.run(1).executions == 1
+
+
+def test_an_open_trial_of_another_campaign_is_refused(validation: Validation) -> None:
+    here, there = Campaign(validation, seed=1), Campaign(validation, seed=2)
+    here.ask()
+    opened = there.ask()
+    with pytest.raises(InputError, match="another campaign"):
+        here.tell(opened, validation.execute(opened.plan))

@@ -11,6 +11,7 @@ from typer.testing import CliRunner, Result
 from ctxval.cli import app
 
 EXPERIMENT = """
+import sys
 from conftest import make_validation
 from ctxval import Experiment, truth
 
@@ -23,6 +24,10 @@ def experiment(seed=0, horizon=25):
 def slow(seed):
     raise KeyboardInterrupt
 
+def crashing(seed):
+    return {}["nothing"]
+
+leaving = lambda seed: sys.exit(0)
 broken = make_validation(model=lambda x, u: x * float("nan"))
 number = 3
 """
@@ -109,6 +114,7 @@ def test_an_experiment_file_runs_and_the_command_line_wins(invoke) -> None:  # t
         (["run", "rig:number"], "must be an Experiment or a Validation"),
         (["run", "rig:experiment", "--dim", "3"], "callable with a seed and its options"),
         (["run", "pendulum", "--dim", "3"], "no option of the case 'pendulum' is called 'dim'"),
+        (["run", "rig:crashing"], "rig:crashing failed: KeyError"),
         (["run", "none.toml"], "cannot be read"),
         (["run", "rig:validation", "--truth"], "truth of 'validation' is not known"),
         (["run", "rig:experiment", "--store", "/proc/none/x.sqlite"], "cannot be used as a store"),
@@ -187,3 +193,16 @@ def test_the_installed_command_runs_without_a_traceback(tmp_path: Path) -> None:
     )
     assert result.returncode == 2
     assert "Traceback" not in result.stderr
+
+
+def test_user_code_that_leaves_python_is_not_taken_for_done(invoke) -> None:  # type: ignore[no-untyped-def]
+    assert invoke("run", "rig:leaving").exit_code == 3
+
+
+def test_a_picture_that_cannot_be_written_does_not_hide_the_verdict(invoke) -> None:  # type: ignore[no-untyped-def]
+    Path("a.worst.png").mkdir()
+    result = invoke("run", "rig:experiment", "--store", "a.sqlite", "--threshold", "0.001", "--json")
+    assert result.exit_code == 1
+    report = json.loads(result.stdout)
+    assert (report["verdict"], report["pictures"]) == ("falsified", [])
+    assert "no pictures" in result.stderr

@@ -64,7 +64,6 @@ def test_a_description_is_json_and_does_not_differ_from_itself(value: object) ->
         (Slotted(), {"type": "Slotted"}),
         (Own(), {"type": "Own", "identity": 7}),
         (int, "builtins.int"),
-        (policy, f"{__name__}.policy"),
         (np.linalg.norm, "numpy.linalg.norm"),
     ],
 )
@@ -73,7 +72,7 @@ def test_values_are_described_by_what_identifies_them(value: object, expected: o
 
 
 def test_a_partial_is_described_by_its_function_and_what_it_binds() -> None:
-    expected = {"partial": f"{__name__}.policy", "args": [1], "keywords": {"x": 2.0}}
+    expected = {"partial": stored(policy), "args": [1], "keywords": {"x": 2.0}}
     assert stored(functools.partial(policy, 1, x=2.0)) == expected
 
 
@@ -154,3 +153,25 @@ def test_long_values_are_shortened_in_a_difference() -> None:
     found = first_difference({"a": "x" * 500}, {"a": "y" * 500})
     assert found is not None
     assert len(found) < 160
+
+
+def test_functions_that_differ_in_a_constant_a_default_or_a_name_are_told_apart() -> None:
+    pairs = (
+        (lambda x: 0.5 * x, lambda x: 0.3 * x),
+        (lambda x, k=1.0: k * x, lambda x, k=2.0: k * x),
+        (lambda x, *, k=1.0: k * x, lambda x, *, k=2.0: k * x),
+        (lambda x: np.sin(x), lambda x: np.tanh(x)),
+    )
+    for one, other in pairs:
+        assert first_difference(stored(one), stored(other)) is not None
+        assert first_difference(stored(one), stored(one)) is None
+
+
+def test_large_arrays_in_another_order_are_told_apart() -> None:
+    matrix = np.random.default_rng(0).normal(size=(11, 11))
+    assert first_difference(stored(matrix), stored(matrix.T)) is not None
+    assert first_difference(stored(matrix), stored(matrix * (1 + 1e-9))) is None
+
+
+def test_small_weights_are_told_apart() -> None:
+    assert first_difference(1e-10, 9e-10, "R") is not None

@@ -169,20 +169,31 @@ class Campaign:
         """
         if not isinstance(budget, int | np.integer) or isinstance(budget, bool) or budget < 1:
             raise InputError(f"budget must be a positive integer, got {budget!r}.")
-        for trial in [trial for trial in self._trials if trial.state == "open" and trial.attempts]:
-            if self.executions < budget:
-                self.store.begin_attempt(trial.number)
-                self._execute(OpenTrial(replace(trial, attempts=trial.attempts + 1), self._plan(trial)), on_trial)
-        while self.executions < budget:
-            self._execute(self._open(None, attempts=1), on_trial)
+        with self.store.sole_writer():
+            for trial in [trial for trial in self._trials if trial.state == "open" and trial.attempts]:
+                if self.executions < budget:
+                    self._execute(self._reopen(trial), on_trial)
+            while self.executions < budget:
+                self._execute(self._open(None, attempts=1), on_trial)
         return self
+
+    def _reopen(self, trial: Trial) -> OpenTrial:
+        """Plan an interrupted trial again and count one more attempt."""
+        try:
+            plan = self._plan(trial)
+        except CtxvalError as error:
+            self._close(trial, failure=_text(error), executed=False)
+            raise
+        self.store.begin_attempt(trial.number)
+        self._trials[trial.number] = replace(trial, attempts=trial.attempts + 1)
+        return OpenTrial(self._trials[trial.number], plan)
 
     def _execute(self, opened: OpenTrial, on_trial: Callable[[Trial], None] | None) -> None:
         started = time.perf_counter()
         try:
             trajectory = self.validation.execute(opened.plan)
         except ExecutionError as error:
-            ended = self._close(opened.trial, failure=str(error), seconds=time.perf_counter() - started)
+            ended = self._close(opened.trial, failure=_text(error), seconds=time.perf_counter() - started)
         else:
             ended = self._measure(opened, trajectory, time.perf_counter() - started)
         if on_trial is not None:
@@ -202,6 +213,14 @@ class Campaign:
 
     def _open(self, parameters: Mapping[str, Any] | None, attempts: int) -> OpenTrial:
         """Store a new trial ahead of its execution; one that is about to be executed counts as its first attempt."""
+        try:
+            return self._store_next(parameters, attempts)
+        except BaseException:
+            # Whatever stopped it, the search must know the stored trials and no other.
+            self._replay()
+            raise
+
+    def _store_next(self, parameters: Mapping[str, Any] | None, attempts: int) -> OpenTrial:
         origin = self._origin() if parameters is None else "manual"
         if parameters is None:
             unit_point = self._suggestion()
@@ -213,8 +232,7 @@ class Campaign:
         try:
             plan = self._plan(trial)
         except CtxvalError as error:
-            self._trials.append(replace(trial, state="failed", failure=str(error), attempts=0))
-            self.store.record_failed_plan(self._trials[-1])
+            self.store.record_failed_plan(replace(trial, state="failed", failure=_text(error), attempts=0))
             raise
         self.store.open_trial(trial, plan.model_trajectory)
         self._trials.append(trial)
@@ -229,11 +247,13 @@ class Campaign:
             InputError: neither or both are given, or the trial is not open.
             ExecutionError: the trajectory is not a whole execution of the trial's task; the trial stays open.
         """
-        trial = self._open_trial(opened if isinstance(opened, int) else opened.number)
+        trial = self._open_trial(opened.number if isinstance(opened, OpenTrial) else int(opened))
+        if isinstance(opened, OpenTrial) and not np.array_equal(opened.trial.unit_point, trial.unit_point):
+            raise InputError(f"this open trial {opened.number} is of another campaign.")
         if (trajectory is None) == (failed is None):
             raise InputError("tell needs either a trajectory or the reason of a failure.")
         if trajectory is None:
-            return self._close(trial, failure=failed)
+            return self._close(trial, failure=_text(failed))
         plan = opened.plan if isinstance(opened, OpenTrial) else self._plan(trial)
         require_execution(plan, trajectory)
         return self._measure(OpenTrial(trial, plan), trajectory, None)
@@ -268,7 +288,7 @@ class Campaign:
         try:
             distance = self.validation.measure(opened.plan, trajectory)
         except DistanceError as error:
-            self._close(opened.trial, trajectory, failure=str(error), seconds=seconds)
+            self._close(opened.trial, trajectory, failure=_text(error), seconds=seconds)
             raise
         return self._close(opened.trial, trajectory, distance=distance, seconds=seconds)
 
@@ -280,11 +300,12 @@ class Campaign:
         distance: float | None = None,
         failure: str | None = None,
         seconds: float | None = None,
+        executed: bool = True,
     ) -> Trial:
         ended = replace(
             trial,
             state="completed" if failure is None else "failed",
-            executed=True,
+            executed=executed,
             distance=distance,
             failure=failure,
             seconds=seconds,
@@ -299,3 +320,8 @@ class Campaign:
 def _distance(trial: Trial) -> float:
     assert trial.distance is not None  # completed trials have one
     return trial.distance
+
+
+def _text(reason: object) -> str:
+    """Return a reason as text that every file can hold; a serial line may have put anything into it."""
+    return str(reason).encode("utf-8", "backslashreplace").decode()

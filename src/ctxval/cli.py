@@ -17,6 +17,7 @@ from ctxval import cases as known_cases
 from ctxval import plot
 from ctxval.campaign import Campaign
 from ctxval.config import Settings, read_settings
+from ctxval.describe import describe
 from ctxval.errors import CtxvalError, InputError, StoreError
 from ctxval.experiment import Experiment
 from ctxval.store import Store
@@ -53,9 +54,15 @@ def _command(function: Callable[..., Any]) -> Callable[..., Any]:
         except CtxvalError as error:
             _err.print(f"[bold red]error:[/] {_escaped(str(error))}", highlight=False, soft_wrap=True)
             raise typer.Exit(BAD_INPUT if isinstance(error, InputError | StoreError) else CANNOT_GO_ON) from None
+        except (typer.Exit, typer.Abort):
+            raise
         except KeyboardInterrupt:
             _err.print("stopped; what was executed is stored, run the same command to go on.")
             raise typer.Exit(INTERRUPTED) from None
+        except (Exception, SystemExit) as error:
+            # Python's own exit status here would be 1, which says that a model is falsified.
+            _err.print(f"[bold red]error:[/] {_escaped(f'{type(error).__name__}: {error}')}", highlight=False)
+            raise typer.Exit(CANNOT_GO_ON) from None
 
     return wrapped
 
@@ -82,7 +89,8 @@ def run(
         {"budget": budget, "search": search, "threshold": threshold, "seed": seed, "store": store, "options": options},
     )
     experiment = settings.load()
-    limit = experiment.threshold if settings.threshold is None else require_threshold(settings.threshold)
+    chosen = experiment.threshold if settings.threshold is None else settings.threshold
+    limit = None if chosen is None else require_threshold(chosen)
     path = settings.store_path(experiment.name)
     campaign = Campaign(
         experiment.validation, search=settings.search.build(), store=path, seed=settings.seed, name=experiment.name
@@ -94,7 +102,7 @@ def run(
     report = _report(campaign, experiment, settings, total, path, verdict, known)
     report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path)]
     if as_json:
-        print(json.dumps(report))
+        print(json.dumps(describe(report), allow_nan=False))
     else:
         _print_report(report, verdict)
     if verdict is not None and verdict.answer == "falsified":
@@ -230,6 +238,15 @@ def _worst(trial: Trial | None) -> dict[str, Any] | None:
 
 
 def _save_pictures(campaign: Campaign, experiment: Experiment, path: Path) -> list[Path]:
+    try:
+        return _draw_pictures(campaign, experiment, path)
+    except Exception as error:
+        # A picture must not hide the verdict that was paid for.
+        _err.print(f"no pictures: {_escaped(f'{type(error).__name__}: {error}')}", highlight=False)
+        return []
+
+
+def _draw_pictures(campaign: Campaign, experiment: Experiment, path: Path) -> list[Path]:
     if campaign.worst is None:
         return []
     drawn = [

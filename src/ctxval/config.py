@@ -63,6 +63,8 @@ class Settings(BaseModel):
         Raises:
             InputError: it cannot be found or made.
         """
+        if "seed" in self.options:
+            raise InputError("the seed stands beside [options], not in it.")
         if ":" in self.experiment:
             return _from_reference(self.experiment, self.seed, self.options)
         return cases.by_name(self.experiment, self.seed, **self.options)
@@ -139,6 +141,10 @@ def _from_reference(reference: str, seed: int, options: dict[str, Any]) -> Exper
             found = found(seed, **options)
         except TypeError as error:
             raise InputError(f"{reference} must be callable with a seed and its options: {error}.") from error
+        except CtxvalError:
+            raise
+        except Exception as error:
+            raise InputError(f"{reference} failed: {type(error).__name__}: {error}.") from error
     if isinstance(found, Validation):
         return Experiment(attribute, found)
     if not isinstance(found, Experiment):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 import inspect
 import math
+import types
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -42,9 +44,14 @@ def describe(value: Any, depth: int = _DEPTH) -> Any:
 
 
 def _describe_array(array: np.ndarray[Any, Any]) -> Any:
+    if array.dtype.kind not in "biuf":
+        return [item if isinstance(item, str) else repr(item) for item in array.ravel().tolist()]
     if array.size <= _LISTED:
         return array.tolist()
-    return {"shape": list(array.shape), "mean": float(array.mean()), "std": float(array.std())}
+    # The projection tells apart arrays of the same values in another order.
+    projection = float(array.ravel() @ np.cos(np.arange(array.size)))
+    summary = {"mean": float(array.mean()), "std": float(array.std()), "projection": projection}
+    return {"shape": list(array.shape), **summary}
 
 
 def _describe_callable(value: Any, depth: int) -> Any:
@@ -59,10 +66,26 @@ def _describe_callable(value: Any, depth: int) -> Any:
     bound = {"of": describe(owner, depth - 1)} if owner is not None and not inspect.ismodule(owner) else {}
     closed_over = inspect.getclosurevars(value).nonlocals if inspect.isfunction(value) else {}
     enclosed = {key: describe(item, depth - 1) for key, item in closed_over.items()}
-    defaults = getattr(value, "__defaults__", None)
-    if defaults:
+    defaults = (getattr(value, "__defaults__", None) or (), getattr(value, "__kwdefaults__", None) or {})
+    if any(defaults):
         enclosed["defaults"] = describe(defaults, depth - 1)
+    if inspect.isfunction(value):
+        enclosed["constants"] = _constants(value.__code__)
     return {"function": name, **bound, **enclosed} if bound or enclosed else name
+
+
+def _constants(code: types.CodeType) -> str:
+    """Return a digest of a function's names and constants: what an edit of its formula mostly changes.
+
+    The bytecode itself is left out, as it differs between versions of Python.
+    """
+    constants = [
+        _constants(item)
+        if isinstance(item, types.CodeType)
+        else repr(sorted(map(repr, item)) if isinstance(item, frozenset) else item)
+        for item in code.co_consts
+    ]
+    return hashlib.sha256(repr((code.co_names, constants)).encode()).hexdigest()[:16]
 
 
 def _describe_object(value: Any, depth: int) -> Any:
@@ -105,7 +128,7 @@ def first_difference(stored: Any, present: Any, path: str = "") -> str | None:
 def _same(stored: Any, present: Any) -> bool:
     if isinstance(stored, int | float) and isinstance(present, int | float):
         both_nan = math.isnan(stored) and math.isnan(present)
-        return both_nan or math.isclose(stored, present, rel_tol=_TOLERANCE, abs_tol=1e-9)
+        return both_nan or math.isclose(stored, present, rel_tol=_TOLERANCE, abs_tol=1e-13)
     return bool(stored == present)
 
 

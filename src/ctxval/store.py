@@ -89,6 +89,26 @@ class Store:
         """Close the file."""
         self._connection.close()
 
+    @contextmanager
+    def sole_writer(self) -> Iterator[None]:
+        """Keep other processes from running this store; the lock goes with the process, however it ends.
+
+        Raises:
+            StoreAccessError: another process is running it.
+        """
+        if self.path is None:
+            yield
+            return
+        lock = sqlite3.connect(f"{self.path}.lock", isolation_level=None, timeout=0)
+        try:
+            try:
+                lock.execute("BEGIN EXCLUSIVE")
+            except sqlite3.OperationalError as error:
+                raise StoreAccessError(f"{self._name} is being run by another process.") from error
+            yield
+        finally:
+            lock.close()
+
     # The experiment
 
     def identify(self, description: dict[str, Any]) -> None:
@@ -252,8 +272,10 @@ class Store:
             raise StoreAccessError(f"{self._name} cannot be used as a store: {error}.") from error
         except sqlite3.DatabaseError as error:
             raise ForeignStoreError(f"{self._name} cannot be read as a store: {error}.") from error
-        except OSError as error:
-            raise StoreAccessError(f"{self._name} cannot be used as a store: {error.strerror}.") from error
+        except (OSError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise StoreAccessError(f"{self._name} cannot be used as a store: {error}.") from error
 
 
 def _now() -> str:

@@ -37,7 +37,7 @@ def require_threshold(threshold: float) -> float:
     Raises:
         InputError: it is not a positive number.
     """
-    if not threshold > 0 or threshold == float("inf"):
+    if not isinstance(threshold, int | float) or not threshold > 0 or threshold == float("inf"):
         raise InputError(f"the threshold must be a positive number, got {threshold!r}.")
     return float(threshold)
 

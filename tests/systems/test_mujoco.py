@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from ctxval import Task, Validation, systems, testing
+from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, searches, systems, testing
 from ctxval.arrays import Array
 from ctxval.describe import describe, first_difference
 from ctxval.errors import InputError, ShapeError, UnknownNameError
@@ -22,13 +22,13 @@ ARM = """
   <option timestep="0.01" integrator="RK4"/>
   <default><joint type="hinge" axis="0 0 1" damping="0.01"/><geom type="capsule" size="0.01" contype="0"/></default>
   <worldbody>
-    <body><joint/><geom fromto="0 0 0 0.3 0 0"/><site name="elbow" pos="0.3 0 0"/>
-      <body pos="0.3 0 0"><joint limited="true" range="-60 60"/><geom fromto="0 0 0 0.2 0 0"/>
+    <body><joint name="joint0"/><geom fromto="0 0 0 0.3 0 0"/><site name="elbow" pos="0.3 0 0"/>
+      <body pos="0.3 0 0"><joint name="joint1" limited="true" range="-60 60"/><geom fromto="0 0 0 0.2 0 0"/>
         <site name="tip" pos="0.2 0 0"/></body></body>
   </worldbody>
   <actuator><motor joint="joint0" gear="0.2"/><motor joint="joint1" gear="0.2"/></actuator>
 </mujoco>
-""".replace("<joint/>", '<joint name="joint0"/>').replace("<joint limited", '<joint name="joint1" limited')
+"""
 
 # A ball above a table and a pusher: contacts, a free joint, an actuator with a state of its own.
 BALL = """
@@ -230,11 +230,7 @@ def test_an_input_that_is_not_finite_never_becomes_zero(arm: systems.MuJoCo) -> 
     np.testing.assert_array_equal(trajectory.states[[0, 1, 3, 4]], whole.states[[0, 1, 3, 4]])
 
 
-def test_a_diverged_execution_is_a_failed_trial(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, validation: Validation
-) -> None:
-    from ctxval import TaskSpace, controllers, distances, models
-
+def test_a_diverged_execution_is_a_failed_trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     system = systems.MuJoCo(UNSTABLE)
     broken = Validation(
@@ -246,6 +242,8 @@ def test_a_diverged_execution_is_a_failed_trial(
         distance=distances.FinalState(),
     )
     assert np.isnan(broken.distances([[0.0], [0.1]])).tolist() == [False, True]
+    campaign = Campaign(broken, search=searches.Random()).run(3)
+    assert [trial.failure for trial in campaign.failed] == ["MuJoCo warned of BADQACC at step 2"] * 3
 
 
 # What the user may get wrong

@@ -20,7 +20,7 @@ NAMES: dict[str, str] = {
 __all__ = ["NAMES", "by_name"]
 
 
-def by_name(name: str, seed: int = 0, **options: Any) -> Experiment:
+def by_name(name: str, /, seed: int = 0, **options: Any) -> Experiment:
     """Return a case; its seed draws the data and so the model.
 
     Raises:
