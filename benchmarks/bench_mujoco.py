@@ -72,7 +72,8 @@ def main() -> None:
     for count in (100, 4000):
         reacher = arm.arm(arm.Settings())
         starts = reacher.state(rng.uniform(-1, 1, (count, 2)))
-        report("arm, Runge-Kutta, 2 substeps, a site", arm.MJCF, reacher, starts, -0.05 * np.eye(2, 6))
+        name = f"arm, Runge-Kutta, {reacher.substeps} substeps, a site"
+        report(name, arm.MJCF, reacher, starts, -0.05 * np.eye(2, 6))
         for substeps in (1, 5):
             cart = systems.MuJoCo(CART, substeps=substeps)
             starts = cart.state(rng.uniform(-0.5, 0.5, (count, 2)))

@@ -78,7 +78,8 @@ def test_it_says_that_it_is_a_best_known_value_and_how_it_was_found() -> None:
     assert method.startswith("best known value of ")
     assert "2 repeats, of which the two best differ by 0.00%" in method
     evaluations = int(method.removeprefix("best known value of ").split()[0].replace(",", ""))
-    assert 1000 < evaluations < 2 * 61 * 60 + 1000
+    # Two repeats of 61 generations of 60 points and 61 climbs, each from the best of 16 points in steps of 7.
+    assert 1000 < evaluations < 2 * (61 * 60 + 61 * (16 + 30 * 7))
 
 
 def test_repeats_that_never_agree_end_at_the_limit_and_leave_a_doubt() -> None:
@@ -99,13 +100,25 @@ def test_the_seed_decides_and_the_space_is_searched_in_batches() -> None:
         return Validation.distances(validation, points)
 
     validation.distances = counted  # type: ignore[method-assign, assignment]
-    settings = {"agreement": 1.0, "population": 8, "generations": 3}
+    settings = {"agreement": 1.0, "population": 8, "generations": 3, "climbs": 2}
     first, again, other = (search_truth(validation, seed=seed, **settings) for seed in (1, 1, 2))  # type: ignore[arg-type]
     np.testing.assert_array_equal(first.parameters.points, again.parameters.points)
     assert not np.array_equal(first.parameters.points, other.parameters.points)
-    # Generations of 8 d points, gradients of 2 d + 1, and each repeat's best task once more alone.
-    assert set(calls) == {24, 7, 1}
-    assert calls.count(1) == 3 * 2
+    # Generations of 8 d points, starts of 16, gradients of 2 d + 1, and each climb's end once more alone.
+    assert set(calls) == {24, 16, 7, 1}
+    assert calls.count(1) == 3 * 2 * 3
+
+
+def test_climbs_find_a_narrow_peak_that_evolution_passes_by() -> None:
+    def surface(x: np.ndarray) -> np.ndarray:
+        """A wide hill of 1 in the middle, and in a corner a slope of small basin that leads to 1.5."""
+        wide = np.exp(-4 * ((x - 0.5) ** 2).sum(axis=-1))
+        corner = np.abs(x - 1).max(axis=-1)
+        return np.where(corner < 0.12, 0.9 + 5 * (0.12 - corner), wide)
+
+    found = [search_truth(of_surface(surface), climbs=climbs, agreement=1.0).distance for climbs in (0, 200)]
+    assert found[1] == pytest.approx(1.5, abs=1e-6)
+    assert found[0] <= found[1]
 
 
 def test_failed_executions_are_searched_around() -> None:
