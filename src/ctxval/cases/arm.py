@@ -78,8 +78,8 @@ class Settings:
         rollouts, steps: recorded for learning: 500 x 4 transitions from rest, 200 s in all.
         torque: recorded torques are uniform within +-0.12 of the motors' range, which leads to the joint rates of the
             closed loop, 5 rad/s.
-        elbow: rad; recordings start at any angle of the shoulder and at elbow angles within +-2, so that they stay
-            clear of the elbow's stops at 3 rad.
+        elbow: rad; recordings start at any angle of the shoulder and at elbow angles within +-2.2, so that they
+            cover the bent arm, and fewer than one in a hundred meets the elbow's stops at 3 rad.
         points: of the data that the Gaussian process is conditioned on; with more it is slower and errs by less still.
         restarts, training: how often the network is trained, and iterations of one training at most; the best is kept.
     """
@@ -97,7 +97,7 @@ class Settings:
     rollouts: int = 500
     steps: int = 4
     torque: float = 0.12
-    elbow: float = 2.0
+    elbow: float = 2.2
     points: int = 200
     restarts: int = 4
     training: int = 1000
