@@ -112,7 +112,9 @@ class ArmSamples:
                 "CuSTOM is within 2 % of d* in under 50 executions, far ahead of the baselines",
                 f"median {counted(ucb[0], _ACTIVE)} (from {counted(ucb[1], _ACTIVE)} to {counted(ucb[2], _ACTIVE)}); "
                 f"SC {counted(sc[0], _RANDOM)}",
-                "yes" if ucb[0] < 50 and sc[0] > ucb[0] else "no",
+                "yes" if ucb[0] < 50 and sc[0] > ucb[0] else "partly" if sc[0] > ucb[0] else "no",
+                "the distance of the network, piecewise linear inside, has many kinks and narrow peaks; with the other "
+                "two models it takes fewer",
             )
         ]
 
@@ -192,7 +194,7 @@ class ArmModels:
                 "CuSTOM finds d* within a few samples for every model",
                 "within 2 % after "
                 + ", ".join(f"{counted(spread(within[m])[0], _ACTIVE)} ({MODELS[m][0]})" for m in MODELS),
-                "yes" if max(spread(within[m])[0] for m in MODELS) <= _ACTIVE else "partly",
+                "yes" if max(spread(within[m])[0] for m in MODELS) < 50 else "partly",
             ),
             _order("by d*, the distance between M and S", "the GP is the best model, the linear one the worst", worst),
             _order(
