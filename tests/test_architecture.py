@@ -12,7 +12,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "ctxval"
 ARCHITECTURE = Path(__file__).parents[1] / "docs" / "architecture.md"
 
-NUMBERS_ONLY = ("kernels", "gp", "surrogate", "acquisition", "searches", "certificates")
+NUMBERS_ONLY = ("kernels", "gp", "hyperposterior", "paths", "surrogate", "acquisition", "searches", "certificates")
 CONTROL = ("task", "trajectory", "model", "controller", "system", "rollout", "distance", "validation", "campaign")
 READ_ONLY = ("plot", "report")
 EXECUTING = {"execute", "run", "ask", "tell", "outcome", "distances", "plan"}

@@ -14,8 +14,9 @@ from ctxval.trial import Trial
 from ctxval.truth import Truth, cached_truth, grid_truth, search_truth
 from ctxval.validation import Outcome, Plan, Validation
 from ctxval.verdict import Verdict
+from ctxval.version import VERSION
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 __all__ = [
     "Campaign",

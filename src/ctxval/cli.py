@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,14 +18,15 @@ from rich.table import Table
 from ctxval import cases as known_cases
 from ctxval import plot
 from ctxval.campaign import Campaign
-from ctxval.config import Settings, read_settings
+from ctxval.certificates import KINDS, Certificate, Options, Sample, TheoremConstants, certify
+from ctxval.config import Settings, read_settings, stored_settings
 from ctxval.describe import describe
 from ctxval.errors import CtxvalError, InputError, StoreError
 from ctxval.experiment import Experiment
 from ctxval.store import Store
 from ctxval.trial import Trial
 from ctxval.truth import Truth
-from ctxval.verdict import Verdict, require_threshold
+from ctxval.verdict import CONFIDENCE, Verdict, is_decided, judge, judge_by, require_threshold
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED = 1, 2, 3, 130
 
@@ -74,6 +77,10 @@ def run(
     budget: Annotated[int | None, typer.Option(help="Executions of the system in all, earlier ones counted.")] = None,
     search: Annotated[str | None, typer.Option(help="How tasks are chosen: gp-ucb, random, ...")] = None,
     threshold: Annotated[float | None, typer.Option(help="Largest distance that you can accept.")] = None,
+    confidence: Annotated[float | None, typer.Option(help="Of a validation; 0.95 if not given.")] = None,
+    until_decided: Annotated[
+        bool, typer.Option("--until-decided", help="Stop as soon as the verdict is reached; the budget is the most.")
+    ] = False,
     seed: Annotated[int | None, typer.Option(help="Of the data, the model and the search.")] = None,
     store: Annotated[Path | None, typer.Option(help="File of the trials; it is resumed if it exists.")] = None,
     truth: Annotated[bool, typer.Option("--truth", help="Find the true maximum too, of a simulated system.")] = False,
@@ -84,10 +91,8 @@ def run(
 ) -> None:
     """Search for the task at which the system differs most from its model."""
     options = {k: v for k, v in {"variant": variant, "model": model, "dim": dim}.items() if v is not None}
-    settings = read_settings(
-        target,
-        {"budget": budget, "search": search, "threshold": threshold, "seed": seed, "store": store, "options": options},
-    )
+    given = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence, "seed": seed}
+    settings = read_settings(target, {**given, "store": store, "options": options})
     experiment = settings.load()
     chosen = experiment.threshold if settings.threshold is None else settings.threshold
     limit = None if chosen is None else require_threshold(chosen)
@@ -95,10 +100,12 @@ def run(
     campaign = Campaign(
         experiment.validation, search=settings.search.build(), store=path, seed=settings.seed, name=experiment.name
     )
+    campaign.store.keep_settings(settings.model_dump(mode="json", exclude={"store"}))
     total = experiment.budget if settings.budget is None else settings.budget
-    _run_with_progress(campaign, total, show=not as_json)
+    until = _decided(limit, settings.confidence) if until_decided else None
+    _run_with_progress(campaign, total, until, show=not as_json)
     known = _truth(experiment) if truth else None
-    verdict = None if limit is None else campaign.verdict(limit)
+    verdict = None if limit is None else campaign.verdict(limit, settings.confidence)
     report = _report(campaign, experiment, settings, total, path, verdict, known)
     report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path)]
     if as_json:
@@ -107,6 +114,83 @@ def run(
         _print_report(report, verdict)
     if verdict is not None and verdict.answer == "falsified":
         raise typer.Exit(FALSIFIED)
+
+
+@app.command("certify")
+@_command
+def certify_store(
+    store: Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials.")],
+    threshold: Annotated[float | None, typer.Option(help="Largest distance that you can accept.")] = None,
+    confidence: Annotated[float, typer.Option(help="Of the certificate.")] = CONFIDENCE,
+    kind: Annotated[str | None, typer.Option(help=f"One of {', '.join(KINDS)}.")] = None,
+    audit: Annotated[
+        int | None, typer.Option(help="Execute independent draws of tasks first, until there are so many in all.")
+    ] = None,
+    volume: Annotated[float, typer.Option(help="Share of the task space that may exceed the threshold.")] = 0.0,
+    discard: Annotated[int | None, typer.Option(help="sampling-discarding: how many; chosen beforehand.")] = None,
+    constant: Annotated[float | None, typer.Option(help="convergence: C, in the distance's units.")] = None,
+    theorem: Annotated[
+        str | None, typer.Option(help="convergence: SCALE,NOISE,A,B,GAIN that C is computed from (see the manual).")
+    ] = None,
+    stochastic: Annotated[
+        bool, typer.Option("--stochastic", help="posterior: executions of one task may differ.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Say what the trials of a store prove, and with what confidence; nothing is executed but for an audit."""
+    opened = Store.existing(store)
+    limit = None if threshold is None else require_threshold(threshold)
+    if audit is not None:
+        _run_audit(opened, audit, show=not as_json)
+    chosen = kind or ("posterior" if audit is None else "audit")
+    options = Options(stochastic, discard, constant, _theorem(theorem))
+    trials = opened.trials()
+    certificate = certify(Sample.of(trials), chosen, confidence, options)
+    verdict = None if limit is None else judge_by(certificate, trials, limit, volume=volume)
+    if verdict is not None and verdict.answer == "undecided" and chosen == "posterior":
+        verdict = judge(trials, verdict.threshold, confidence, stochastic=stochastic)
+    answer = {} if verdict is None else {"verdict": verdict.answer, "reason": verdict.reason, "threshold": limit}
+    report = {**answer, **certificate.to_json(), "expected": _certificate_of(verdict)["expected"], "store": str(store)}
+    if as_json:
+        print(json.dumps(describe(report), allow_nan=False))
+    else:
+        _print_certificate(certificate, verdict)
+    if verdict is not None and verdict.answer == "falsified":
+        raise typer.Exit(FALSIFIED)
+
+
+def _run_audit(store: Store, draws: int, *, show: bool) -> None:
+    settings = stored_settings(store)
+    experiment = settings.load()
+    campaign = Campaign(
+        experiment.validation, search=settings.search.build(), store=store, seed=settings.seed, name=experiment.name
+    )
+    drawn = sum(trial.origin == "iid" for trial in campaign.trials)
+    with _progress(campaign, campaign.executions + max(0, draws - drawn), show=show) as on_trial:
+        campaign.audit(draws, on_trial)
+
+
+def _theorem(text: str | None) -> TheoremConstants | None:
+    if text is None:
+        return None
+    try:
+        return TheoremConstants(*(float(part) for part in text.split(",")))
+    except (ValueError, TypeError) as error:
+        raise InputError(f"--theorem must be five numbers SCALE,NOISE,A,B,GAIN, got {text!r}.") from error
+
+
+def _print_certificate(certificate: Certificate, verdict: Verdict | None) -> None:
+    if verdict is not None:
+        _out.print(
+            f"[bold]{verdict.answer}[/] against {verdict.threshold:g}: {_escaped(verdict.reason)}", highlight=False
+        )
+    _out.print(f"{certificate.kind}: {_escaped(certificate.statement)}", highlight=False)
+    if certificate.doubt is not None:
+        _out.print(f"[bold red]withdrawn[/]: {_escaped(certificate.doubt)}.", highlight=False)
+    _out.print("It assumes that", highlight=False)
+    for assumption in certificate.assumptions:
+        _out.print(f"- {_escaped(assumption)};", highlight=False)
+    _print_table({**certificate.details, "trials": certificate.trials, "version": certificate.version})
 
 
 @app.command()
@@ -172,7 +256,21 @@ def reproduce(
     _out.print(f"table: {table}\nfigures and data: {out}", highlight=False)
 
 
-def _run_with_progress(campaign: Campaign, budget: int, *, show: bool) -> None:
+def _decided(threshold: float | None, confidence: float) -> Callable[[Campaign], bool]:
+    if threshold is None:
+        raise InputError("--until-decided needs a threshold to decide about; say --threshold.")
+    return lambda campaign: is_decided(campaign.trials, threshold, confidence)
+
+
+def _run_with_progress(
+    campaign: Campaign, budget: int, until: Callable[[Campaign], bool] | None, *, show: bool
+) -> None:
+    with _progress(campaign, budget, show=show) as on_trial:
+        campaign.run(budget, on_trial, until=until)
+
+
+@contextmanager
+def _progress(campaign: Campaign, total: int, *, show: bool) -> Iterator[Callable[[Trial], None]]:
     columns = (
         TextColumn("executions"),
         BarColumn(bar_width=30),
@@ -181,13 +279,13 @@ def _run_with_progress(campaign: Campaign, budget: int, *, show: bool) -> None:
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=_err, disable=not show) as progress:
-        line = progress.add_task("", total=budget, completed=campaign.executions, best="-", pace="")
+        line = progress.add_task("", total=total, completed=campaign.executions, best="-", pace="")
 
         def on_trial(trial: Trial) -> None:
             best = "-" if campaign.worst is None else f"{campaign.worst.distance:.4g}"
             progress.update(line, completed=campaign.executions, best=best, pace=_pace(trial))
 
-        campaign.run(budget, on_trial)
+        yield on_trial
 
 
 def _pace(trial: Trial) -> str:
@@ -223,6 +321,7 @@ def _report(
         "verdict": None if verdict is None else verdict.answer,
         "reason": None if verdict is None else verdict.reason,
         "threshold": None if verdict is None else verdict.threshold,
+        **_certificate_of(verdict),
         "store": str(path),
     }
     if truth is not None:
@@ -231,6 +330,16 @@ def _report(
         estimate = campaign.estimate
         report["error_percent"] = None if estimate is None else 100 * (truth.distance - estimate) / truth.distance
     return report
+
+
+def _certificate_of(verdict: Verdict | None) -> dict[str, Any]:
+    """Return what stands behind a verdict, and what is expected of further executions."""
+    if verdict is None:
+        return {"certificate": None, "expected": None}
+    return {
+        "certificate": None if verdict.certificate is None else verdict.certificate.to_json(),
+        "expected": None if verdict.expected is None else asdict(verdict.expected),
+    }
 
 
 def _worst(trial: Trial | None) -> dict[str, Any] | None:
@@ -271,7 +380,8 @@ def _true_curve(experiment: Experiment) -> plot.Curve | None:
 
 
 def _print_report(report: dict[str, Any], verdict: Verdict | None) -> None:
-    shown = {key: value for key, value in report.items() if key not in ("verdict", "reason", "threshold", "units")}
+    apart = ("verdict", "reason", "threshold", "units", "certificate", "expected")
+    shown = {key: value for key, value in report.items() if key not in apart}
     _print_table(shown, units=report["units"])
     if verdict is not None:
         _out.print(

@@ -15,7 +15,9 @@ from ctxval import cases
 from ctxval.errors import CtxvalError, InputError
 from ctxval.experiment import Experiment
 from ctxval.searches import Search, by_name
+from ctxval.store import Store
 from ctxval.validation import Validation
+from ctxval.verdict import CONFIDENCE
 
 DEFAULT_SEARCH = "gp-ucb"
 
@@ -44,6 +46,7 @@ class Settings(BaseModel):
         experiment: a case, or ``module:attr`` of an experiment or of a function of a seed that makes one.
         options: passed on to the case or function.
         budget, threshold, seed, store: None where the experiment decides.
+        confidence: of a validation.
         search: which search, and its options.
     """
 
@@ -53,6 +56,7 @@ class Settings(BaseModel):
     options: dict[str, Any] = Field(default_factory=dict)
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    confidence: float = Field(default=CONFIDENCE, gt=0, lt=1)
     seed: int = Field(default=0, ge=0)
     store: Path | None = None
     search: SearchTable = Field(default_factory=SearchTable)
@@ -98,6 +102,21 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
         return Settings.model_validate({**content, **given, "options": options, "search": search})
     except ValidationError as error:
         raise InputError(_sentence(target, error)) from error
+
+
+def stored_settings(store: Store) -> Settings:
+    """Return what was run into a store.
+
+    Raises:
+        InputError: the store does not say it, or what it says is not allowed.
+    """
+    kept = store.settings()
+    if not kept:
+        raise InputError("the store does not say what was run into it; only one made by `ctxval run` can be audited.")
+    try:
+        return Settings.model_validate(kept)
+    except ValidationError as error:
+        raise InputError(_sentence("the store's settings", error)) from error
 
 
 def _table(content: dict[str, Any], key: str) -> dict[str, Any]:

@@ -102,6 +102,12 @@ class Matern:
         slope = np.exp(theta[0]) * self._slope(cdist(Y, V))
         return np.asarray(-slope[:, :, None] * (Y[:, None, :] - V[None, :, :]) / scales)
 
+    def weighted_input_gradient(self, theta: Array, X: Array, Z: Array, weights: Array) -> Array:
+        """Return ``sum_j weights_ij dk(x_i, z_j)/dx_i``, shape ``(n, d)``, without the ``(n, m, d)`` of its terms."""
+        scales = np.exp(theta[1:])
+        pulls = np.exp(theta[0]) * weights * self._slope(cdist(X / scales, Z / scales))
+        return np.asarray((pulls @ Z - pulls.sum(axis=1)[:, None] * X) / scales**2)
+
     def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
         """Return zero: the kernel is stationary."""
         return np.zeros_like(X)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from ctxval.errors import InputError
+from ctxval.certificates import Certificate, Forecast, Maxima, Sample, certify_posterior, draw_maxima, forecast
+from ctxval.errors import CertificateError, InputError
 from ctxval.trial import Trial
 
 Answer = Literal["validated", "falsified", "undecided"]
+
+CONFIDENCE = 0.95
+"""Of a validation, unless said otherwise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,12 +25,16 @@ class Verdict:
         threshold: tau.
         reason: one sentence.
         witness: the executed trial with d(p) > tau, if falsified.
+        certificate: what validates, or failed to.
+        expected: what is expected of further executions, if undecided and it can be told.
     """
 
     answer: Answer
     threshold: float
     reason: str
     witness: Trial | None = None
+    certificate: Certificate | None = None
+    expected: Forecast | None = None
 
     def __str__(self) -> str:
         return f"{self.answer}: {self.reason}"
@@ -42,16 +51,109 @@ def require_threshold(threshold: float) -> float:
     return float(threshold)
 
 
-def judge(worst: Trial | None, executions: int, failed: int, threshold: float) -> Verdict:
-    """Return the verdict from the worst completed trial.
+def counterexample(trials: Sequence[Trial], threshold: float) -> Verdict | None:
+    """Return the verdict that an executed distance above the threshold makes, None where there is none.
 
     Raises:
         InputError: the threshold is not a positive number.
     """
     tau = require_threshold(threshold)
-    if worst is not None and worst.distance is not None and worst.distance > tau:
-        reason = f"trial {worst.number} was executed and its distance {worst.distance:.4g} exceeds {tau:g}."
-        return Verdict("falsified", tau, reason, worst)
-    unknown = f", and {failed} failed, of whose distance nothing is known" if failed else ""
-    reason = f"no distance above {tau:g} in {executions} executions{unknown}; that alone bounds nothing."
-    return Verdict("undecided", tau, reason)
+    above = [trial for trial in trials if trial.distance is not None and trial.distance > tau]
+    if not above:
+        return None
+    worst = max(above, key=lambda trial: trial.distance or 0.0)
+    reason = f"trial {worst.number} was executed and its distance {worst.distance:.4g} exceeds {tau:g}."
+    return Verdict("falsified", tau, reason, worst)
+
+
+def judge_by(certificate: Certificate, trials: Sequence[Trial], threshold: float, *, volume: float = 0.0) -> Verdict:
+    """Return the verdict of the trials and a certificate.
+
+    Args:
+        certificate: of any kind.
+        trials: all of them.
+        threshold: tau.
+        volume: the share of the task space that may exceed the threshold; 0 accepts bounds on d* alone.
+
+    Raises:
+        InputError: the threshold is not a positive number.
+    """
+    tau = require_threshold(threshold)
+    found = counterexample(trials, tau)
+    if found is not None:
+        return Verdict("falsified", tau, found.reason, found.witness, certificate)
+    if certificate.covers(tau, volume):
+        but = f", but for {100 * certificate.volume:.3g} % of the task space" if certificate.volume else ""
+        reason = (
+            f"the {certificate.kind} bound of {certificate.trials} trials is {certificate.upper_bound:.4g}, at most "
+            f"{tau:g}, with confidence {certificate.confidence:g}{but}."
+        )
+        return Verdict("validated", tau, reason, certificate=certificate)
+    return Verdict("undecided", tau, _why_not(certificate, tau, volume), certificate=certificate)
+
+
+def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
+    if certificate.doubt is not None:
+        return f"{certificate.doubt}."
+    if certificate.upper_bound > tau:
+        return f"no distance above {tau:g} was executed, but d* may be up to {certificate.upper_bound:.4g}."
+    return (
+        f"the {certificate.kind} bound leaves out {100 * certificate.volume:.3g} % of the task space, "
+        f"more than the {100 * volume:.3g} % that are acceptable; it is no bound on d*."
+    )
+
+
+def judge(
+    trials: Sequence[Trial], threshold: float, confidence: float = CONFIDENCE, *, stochastic: bool = False
+) -> Verdict:
+    """Return the verdict by an executed counterexample or the posterior bound; undecided says what more would take.
+
+    Args:
+        trials: all of them.
+        threshold: tau, in the distance's units.
+        confidence: of a validation.
+        stochastic: whether two executions of one task may differ.
+
+    Raises:
+        InputError: the threshold is not a positive number.
+        CertificateError: the confidence is not a probability, or a trial is open.
+    """
+    found = counterexample(trials, threshold)
+    if found is not None:
+        return found
+    try:
+        sample = Sample.of(trials)
+        drawn = draw_maxima(sample, stochastic=stochastic)
+    except CertificateError as error:
+        return Verdict("undecided", threshold, str(error))
+    verdict = judge_by(certify_posterior(sample, confidence, stochastic=stochastic, found=drawn), trials, threshold)
+    return verdict if verdict.answer == "validated" else _with_forecast(verdict, sample, drawn, confidence)
+
+
+def _with_forecast(verdict: Verdict, sample: Sample, drawn: Maxima, confidence: float) -> Verdict:
+    if verdict.certificate is not None and verdict.certificate.doubt is not None:
+        return verdict  # futures of a process that the trials speak against say nothing
+    expected = forecast(sample, drawn, verdict.threshold, confidence)
+    reason = f"{verdict.reason.removesuffix('.')}; {expected}."
+    return Verdict("undecided", verdict.threshold, reason, certificate=verdict.certificate, expected=expected)
+
+
+def is_decided(
+    trials: Sequence[Trial], threshold: float, confidence: float = CONFIDENCE, *, stochastic: bool = False
+) -> bool:
+    """Return whether the verdict is reached, for less than it costs where it is far away.
+
+    Raises:
+        InputError: the threshold is not a positive number.
+    """
+    if counterexample(trials, threshold) is not None:
+        return True
+    try:
+        sample = Sample.of(trials)
+        # A quarter of the draws already tell most of the times that the bound is too high.
+        coarse = draw_maxima(sample, draws=32, stochastic=stochastic)
+        if coarse.probability(threshold) < confidence - 0.05:
+            return False
+        return certify_posterior(sample, confidence, stochastic=stochastic).covers(threshold)
+    except CertificateError:
+        return False

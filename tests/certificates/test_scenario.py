@@ -78,8 +78,9 @@ def test_a_certificate_says_everything() -> None:
     assert certificate.volume == pytest.approx(1 - 0.05 ** (1 / 3))
     assert "no bound on d*" in " ".join(certificate.assumptions)
     assert certificate.to_json()["kind"] == "scenario"
-    assert certificate.covers(0.4)
-    assert not certificate.covers(0.39)
+    assert certificate.covers(0.4, volume=0.5)
+    assert not certificate.covers(0.39, volume=0.5)
+    assert not certificate.covers(0.4)
 
 
 def test_a_failed_execution_counts_as_a_violation() -> None:

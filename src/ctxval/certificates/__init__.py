@@ -1,14 +1,30 @@
 """Certificates: statements on d*, each with its assumptions."""
 
 from ctxval.certificates.base import Certificate, Sample
-from ctxval.certificates.convergence import certify_convergence, rate
-from ctxval.certificates.scenario import certify_scenario, samples_needed, tail, volume_bound
+from ctxval.certificates.convergence import TheoremConstants, certify_convergence, rate
+from ctxval.certificates.diagnostics import Diagnosis, diagnose
+from ctxval.certificates.forecast import Forecast, forecast
+from ctxval.certificates.named import KINDS, Options, certify
+from ctxval.certificates.posterior import Maxima, certify_posterior, draw_maxima
+from ctxval.certificates.scenario import certify_audit, certify_scenario, samples_needed, tail, volume_bound
 
 __all__ = [
+    "KINDS",
     "Certificate",
+    "Diagnosis",
+    "Forecast",
+    "Maxima",
+    "Options",
     "Sample",
+    "TheoremConstants",
+    "certify",
+    "certify_audit",
     "certify_convergence",
+    "certify_posterior",
     "certify_scenario",
+    "diagnose",
+    "draw_maxima",
+    "forecast",
     "rate",
     "samples_needed",
     "tail",

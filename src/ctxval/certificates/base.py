@@ -10,7 +10,8 @@ import numpy as np
 
 from ctxval.arrays import Array
 from ctxval.errors import CertificateError
-from ctxval.trial import Origin, State
+from ctxval.trial import Origin, State, Trial
+from ctxval.version import VERSION
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,32 @@ class Sample:
     def __len__(self) -> int:
         return len(self.distances)
 
+    @classmethod
+    def of(cls, trials: Sequence[Trial]) -> Sample:
+        """Return what a certificate may know of trials; a task that failed before its execution has failed as well.
+
+        Raises:
+            CertificateError: there is none, or one is still open.
+        """
+        if not trials:
+            raise CertificateError("nothing was executed yet, so nothing can be certified.")
+        return cls(
+            np.array([trial.unit_point for trial in trials]),
+            np.array([np.nan if trial.distance is None else trial.distance for trial in trials]),
+            [trial.origin for trial in trials],
+            [trial.state for trial in trials],
+        )
+
+    def only(self, origin: Origin) -> Sample:
+        """Return the trials of one origin."""
+        rows = [row for row, own in enumerate(self.origins) if own == origin]
+        return Sample(self.points[rows], self.distances[rows], [origin] * len(rows), [self.states[row] for row in rows])
+
+    @property
+    def best(self) -> float:
+        """The largest distance; minus infinity where none is known."""
+        return float(np.nanmax(self.distances, initial=-np.inf))
+
     @property
     def failed(self) -> int:
         """How many executions failed."""
@@ -65,6 +92,7 @@ class Certificate:
         trials: n.
         assumptions: what must hold, in plain words.
         details: the numbers behind it.
+        doubt: why it is withdrawn, where the trials speak against what it assumes; a user must not believe it then.
         version: of ctxval.
     """
 
@@ -76,11 +104,12 @@ class Certificate:
     trials: int
     assumptions: tuple[str, ...]
     details: dict[str, Any] = field(default_factory=dict)
-    version: str = ""
+    doubt: str | None = None
+    version: str = VERSION
 
-    def covers(self, threshold: float) -> bool:
-        """Return whether the bound is at most the threshold."""
-        return self.upper_bound <= threshold
+    def covers(self, threshold: float, volume: float = 0.0) -> bool:
+        """Return whether it bounds the distance by the threshold, but for a volume that is acceptable."""
+        return self.doubt is None and self.volume <= volume and self.upper_bound <= threshold
 
     def to_json(self) -> dict[str, Any]:
         """Return everything, ready for JSON."""

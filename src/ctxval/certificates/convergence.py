@@ -11,6 +11,7 @@ gamma_n = O((log n)^(|P|+1)).
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
@@ -39,6 +40,43 @@ def rate(n: int, dimension: int, kernel: KernelName = "matern-3/2") -> float:
     return float(np.sqrt(dimension / n ** (double / (double + dimension * (dimension + 1)))))
 
 
+@dataclass(frozen=True)
+class TheoremConstants:
+    """What the theorem behind Proposition 1 needs to be known, for a task space scaled to the unit cube.
+
+    Attributes:
+        scale: standard deviation of the distance under the prior, in its units.
+        noise: variance of the observations relative to the square of the scale; the theorem needs some.
+        a, b: of the paths' slopes, ``Pr(sup |df/dx_j| > scale L) <= a exp(-(L / b)^2)`` for each j and L > 0.
+        gain: the information gain is at most this times its rate, ``gamma_n <= gain n^e``.
+    """
+
+    scale: float
+    noise: float
+    a: float
+    b: float
+    gain: float
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not (value > 0 and np.isfinite(value)):
+                raise CertificateError(f"{name} of the theorem must be a positive number, got {value!r}.")
+
+    def constant(self, n: int, dimension: int, confidence: float, kernel: KernelName = "matern-3/2") -> float:
+        """Return the C with which ``r_n`` is the theorem's bound ``sqrt(C_1 beta_n gamma_n / n) + 2 / n`` on the gap.
+
+        From Srinivas, Krause, Kakade and Seeger 2012, Theorem 2, with their C_1 and beta_n; the least gap of n
+        executions is at most the mean one. It grows with the logarithm of n, which the paper hides in its constant.
+        """
+        eps = 1 - require_probability("confidence", confidence)
+        first = 8 / np.log1p(1 / self.noise)
+        slopes = dimension * self.b * np.sqrt(np.log(max(4 * dimension * self.a / eps, np.e)))
+        beta = 2 * np.log(n**2 * 2 * np.pi**2 / (3 * eps)) + 2 * dimension * np.log(max(n**2 * slopes, 1.0))
+        gain = self.gain * n * rate(n, dimension, kernel) ** 2 / dimension
+        gap = np.sqrt(first * beta * gain / n) + 2 / n
+        return float(self.scale * gap / rate(n, dimension, kernel))
+
+
 def certify_convergence(
     sample: Sample, constant: float, confidence: float = 0.95, kernel: KernelName = "matern-3/2"
 ) -> Certificate:
@@ -47,6 +85,7 @@ def certify_convergence(
     Args:
         sample: the trials of a GP-UCB campaign.
         constant: C, in the distance's units; the paper does not give it, and nothing can compute it from the trials.
+            :class:`TheoremConstants` computes it from what one is ready to state.
         confidence: 1 - eps.
         kernel: of the prior.
 

@@ -77,7 +77,7 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
     if foreign:
         raise CertificateError(
             f"a {_name(discarded)} bound takes independent draws alone, but {len(foreign)} of {len(sample)} trials "
-            f"were chosen otherwise ({', '.join(sorted(set(foreign)))}); run --search random, or audit."
+            f"were chosen otherwise ({', '.join(sorted(set(foreign)))}); run --search random, or say --kind audit."
         )
     _require_counts(len(sample), discarded)
     if sample.failed > discarded:
@@ -105,6 +105,49 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
             "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
         ),
         details={"discarded": discarded, "failed": sample.failed},
+    )
+
+
+def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
+    """Bound the volume of the tasks that are worse than the worst one known, by the independent draws among the trials.
+
+    The volume above the largest of N independent draws is bounded whatever the distance is like, and that above the
+    largest of all trials, however chosen, is not larger.
+
+    Args:
+        sample: trials of any origin, some of them independent draws.
+        confidence: 1 - beta.
+
+    Raises:
+        CertificateError: there is no independent draw, or an execution of one failed.
+    """
+    beta = 1 - require_probability("confidence", confidence)
+    drawn = sample.only("iid")
+    if not len(drawn):
+        raise CertificateError("an audit needs independent draws of tasks, and there is none; run certify --audit N.")
+    if drawn.failed:
+        raise CertificateError(
+            f"{drawn.failed} of {len(drawn)} independently drawn executions failed and count as violations; "
+            f"--kind sampling-discarding --discard {drawn.failed} says what can be said."
+        )
+    volume, h = volume_bound(len(drawn), 0, beta), sample.best
+    return Certificate(
+        kind="audit",
+        statement=(
+            f"With confidence {confidence:g}, at most {100 * volume:.3g} % of the task space "
+            f"has a distance above {h:.4g}, the largest one found."
+        ),
+        upper_bound=h,
+        confidence=confidence,
+        volume=volume,
+        trials=len(drawn),
+        assumptions=(
+            "the audited tasks are independent and uniform over the task space, and their number was chosen before",
+            "each task has one distance: the system is deterministic",
+            "nothing is assumed of how the distance depends on the task",
+            "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
+        ),
+        details={"largest_drawn": drawn.best, "largest_found": h, "exceeding": int((drawn.distances >= h).sum())},
     )
 
 

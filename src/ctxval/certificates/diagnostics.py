@@ -1,0 +1,75 @@
+"""Do the trials speak against the Gaussian process? Each is predicted from those before it, and from all others.
+
+Under the process, the standardised error of each prediction from the trials before it follows a t distribution, and
+these errors are independent, whatever chose the tasks (recursive residuals; Brown, Durbin and Evans 1975).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
+from scipy.special import ndtri, stdtr
+
+from ctxval.arrays import Array
+from ctxval.hyperposterior import Conditioned
+
+LEVEL = 0.01
+"""How unlikely a surprise must be for the bound to be withdrawn."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """How well the process predicts its own data.
+
+    Attributes:
+        surprise: the probability that the largest upward surprise of so many trials is as large as the one seen.
+        trial: in which trial it was seen.
+        left_out: root mean square of the leave-one-out errors in their standard deviations; about 1 if all is well.
+        doubt: one sentence, where the bound is withdrawn.
+    """
+
+    surprise: float
+    trial: int
+    left_out: float
+    doubt: str | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the numbers."""
+        return {"surprise": self.surprise, "trial": self.trial, "left_out": self.left_out}
+
+
+def diagnose(conditioned: list[Conditioned], X: Array, y: Array, level: float = LEVEL) -> Diagnosis:
+    """Return how the values ``(n,)`` at ``(n, d)``, in the order of the trials, agree with the process."""
+    exceed = np.mean([_exceedances(one, y) for one in conditioned], axis=0)
+    worst = int(exceed.argmin())
+    surprise = float(-np.expm1(len(exceed) * np.log1p(-min(exceed[worst], 1 - 1e-16))))
+    left_out = float(np.sqrt(np.mean([_left_out(one, y) for one in conditioned])))
+    doubt = None
+    if surprise < level:
+        doubt = (
+            f"trial {worst + 2} came out {-ndtri(max(exceed[worst], 1e-300)):.1f} standard deviations above what the "
+            "trials before it predict: the distance is not what the process takes it for, and the bound is withdrawn"
+        )
+    return Diagnosis(surprise, worst + 2, left_out, doubt)
+
+
+def _exceedances(conditioned: Conditioned, y: Array) -> Array:
+    """Return Pr(a value as large) for trials 3 to n, given those before each, shape ``(n - 2,)``."""
+    whitened = solve_triangular(conditioned.L, np.stack([np.ones(len(y)), y], axis=1), lower=True, check_finite=False)
+    a, b = whitened.T
+    precision = np.cumsum(a**2)
+    means = np.cumsum(a * b) / precision
+    residuals = (b[1:] - a[1:] * means[:-1]) / np.sqrt(1 + a[1:] ** 2 / precision[:-1])
+    freedom = np.arange(1, len(residuals))
+    scales = np.sqrt(np.cumsum(residuals**2)[:-1] / freedom)
+    return np.asarray(stdtr(freedom, -residuals[1:] / np.maximum(scales, np.finfo(np.float64).tiny)))
+
+
+def _left_out(conditioned: Conditioned, y: Array) -> float:
+    """Return the mean square of the standardised leave-one-out errors (Rasmussen and Williams 2006, eq. 5.12)."""
+    inverse = cho_solve((conditioned.L, True), np.eye(len(y)), check_finite=False)
+    pull = inverse @ (y - conditioned.mean)
+    return float(np.mean(pull**2 / np.diag(inverse)) / conditioned.scale2)

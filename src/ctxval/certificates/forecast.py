@@ -1,0 +1,133 @@
+"""How many more executions would decide? Futures of the campaign are played through on what the trials leave open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve
+
+from ctxval.arrays import Array, single_threaded
+from ctxval.certificates.base import Sample
+from ctxval.certificates.posterior import Maxima
+from ctxval.hyperposterior import Conditioned
+
+HORIZON = 200
+"""Executions that are looked ahead at most."""
+
+_CANDIDATES = 400
+_BETA = 2.0
+_JITTER = 1e-9
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What is expected of the executions still to come.
+
+    Attributes:
+        executions: until half of the futures are decided; None where that takes more than ``HORIZON``.
+        validated: share of the futures that end with the threshold kept.
+        falsified: share that end with a counterexample.
+    """
+
+    executions: int | None
+    validated: float
+    falsified: float
+
+    def __str__(self) -> str:
+        many = f"about {self.executions}" if self.executions is not None else f"more than {HORIZON}"
+        return f"{many} more executions are expected to decide"
+
+
+def forecast(
+    sample: Sample, found: Maxima, threshold: float, confidence: float, *, seed: int = 0, futures: int = 32
+) -> Forecast:
+    """Return how many more executions of GP-UCB decide whether d* is at most the threshold.
+
+    Each future takes one draw of the hyperparameters, draws a true distance from the posterior on a set of candidate
+    tasks, and searches it; it is decided when a distance above the threshold is executed, or when the upper bound falls
+    to the threshold. The bound's width in standard deviations is the one that it has now.
+
+    Args:
+        sample: the trials.
+        found: draws of d* from the same trials.
+        threshold: tau.
+        confidence: of the bound.
+        seed: of the futures.
+        futures: how many.
+    """
+    rng = np.random.default_rng(seed)
+    lengths, kept = [], 0
+    with single_threaded():
+        for k in range(futures):
+            conditioned = found.conditioned[k * len(found.conditioned) // futures]
+            length, validated = _Future(sample, found, conditioned, confidence, rng).play(threshold)
+            lengths.append(length)
+            kept += validated
+    decided = np.isfinite(lengths)
+    half = float(np.quantile(lengths, 0.5, method="higher"))
+    return Forecast(int(half) if np.isfinite(half) else None, kept / futures, (int(decided.sum()) - kept) / futures)
+
+
+class _Future:
+    """A posterior on finitely many tasks, and a campaign that has not happened yet."""
+
+    def __init__(
+        self, sample: Sample, found: Maxima, conditioned: Conditioned, confidence: float, rng: np.random.Generator
+    ) -> None:
+        candidates = np.concatenate(
+            [found.points[:: max(1, len(found.points) // 100)], rng.random((_CANDIDATES, sample.points.shape[1]))]
+        )
+        self.best = sample.best
+        self.mean, self.covariance = _joint(conditioned, sample.points, sample.distances, candidates)
+        L = np.linalg.cholesky(self.covariance + _JITTER * conditioned.scale2 * np.eye(len(candidates)))
+        self.truth = self.mean + L @ rng.normal(size=len(candidates))
+        tops = (self.mean[:, None] + L @ rng.normal(size=(len(candidates), 256))).max(axis=0)
+        self.width = self._width(max(float(np.quantile(tops, confidence)), self.best))
+
+    def _width(self, bound: float) -> float:
+        """Return the z at which ``max (mean + z deviation)`` is the bound."""
+        low, high = 0.0, 20.0
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self._upper(middle) < bound else (low, middle)
+        return high
+
+    def _deviation(self) -> Array:
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    def _upper(self, width: float) -> float:
+        return float((self.mean + width * self._deviation()).max())
+
+    def play(self, threshold: float) -> tuple[float, bool]:
+        """Return after how many executions it is decided, infinity for never, and whether the threshold is kept."""
+        for executions in range(HORIZON + 1):
+            if self.best > threshold:
+                return executions, False
+            if max(self._upper(self.width), self.best) <= threshold:
+                return executions, True
+            self._execute()
+        return np.inf, False
+
+    def _execute(self) -> None:
+        deviation = self._deviation()
+        bound = self.mean + np.sqrt(_BETA) * deviation
+        row = int(bound.argmax())
+        if deviation[row] <= 1e-6 * max(deviation.max(), 1e-300):
+            row = int(deviation.argmax())
+        variance = self.covariance[row, row] + _JITTER * np.trace(self.covariance) / len(self.mean) + 1e-300
+        pull = self.covariance[:, row] / variance
+        self.mean = self.mean + pull * (self.truth[row] - self.mean[row])
+        self.covariance = self.covariance - np.outer(pull, self.covariance[row])
+        self.best = max(self.best, float(self.truth[row]))
+
+
+def _joint(conditioned: Conditioned, X: Array, y: Array, Z: Array) -> tuple[Array, Array]:
+    """Return posterior mean ``(m,)`` and covariance ``(m, m)`` at Z, with the uncertainty of the prior's mean."""
+    hyperparameters = conditioned.hyperparameters
+    k = hyperparameters.kernel(Z, X)
+    weights = cho_solve((conditioned.L, True), k.T, check_finite=False)
+    mean = conditioned.mean + weights.T @ (y - conditioned.mean)
+    missing = 1 - weights.sum(axis=0)
+    covariance = hyperparameters.kernel(Z, Z) - k @ weights + conditioned.mean_variance * np.outer(missing, missing)
+    return mean, conditioned.scale2 * covariance

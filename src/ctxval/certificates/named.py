@@ -1,0 +1,64 @@
+"""Certificates by name, for the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ctxval.certificates.base import Certificate, Sample
+from ctxval.certificates.convergence import TheoremConstants, certify_convergence
+from ctxval.certificates.posterior import certify_posterior
+from ctxval.certificates.scenario import certify_audit, certify_scenario
+from ctxval.errors import CertificateError, UnknownNameError
+
+KINDS = ("posterior", "audit", "scenario", "sampling-discarding", "convergence")
+"""What can be certified, the bound that people will use first."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What some kinds need to be told.
+
+    Attributes:
+        stochastic: posterior: whether two executions of one task may differ.
+        discard: sampling-discarding: how many of the largest distances are discarded.
+        constant: convergence: C, in the distance's units.
+        theorem: convergence: what C is computed from, in place of it.
+    """
+
+    stochastic: bool = False
+    discard: int | None = None
+    constant: float | None = None
+    theorem: TheoremConstants | None = None
+
+
+def certify(sample: Sample, kind: str, confidence: float, options: Options | None = None) -> Certificate:
+    """Return the certificate of a kind.
+
+    Raises:
+        UnknownNameError: there is no such kind.
+        CertificateError: its theory does not allow these trials, or something that it needs is not given.
+    """
+    chosen = Options() if options is None else options
+    if kind == "posterior":
+        return certify_posterior(sample, confidence, stochastic=chosen.stochastic)
+    if kind == "audit":
+        return certify_audit(sample, confidence)
+    if kind == "scenario":
+        return certify_scenario(sample, confidence)
+    if kind == "sampling-discarding":
+        if not chosen.discard:
+            raise CertificateError("sampling and discarding needs to be told how many to discard, at least 1.")
+        return certify_scenario(sample, confidence, chosen.discard)
+    if kind == "convergence":
+        return certify_convergence(sample, _constant(sample, confidence, chosen), confidence)
+    raise UnknownNameError.among("certificate", kind, KINDS)
+
+
+def _constant(sample: Sample, confidence: float, options: Options) -> float:
+    if options.constant is not None:
+        return options.constant
+    if options.theorem is not None:
+        return options.theorem.constant(len(sample), sample.points.shape[1], confidence)
+    raise CertificateError(
+        "Proposition 1 needs its constant C, which the paper does not give: state it, or what it is computed from."
+    )

@@ -1,0 +1,195 @@
+r"""The Gaussian-process bound: the posterior of ``d* = max_p d(p)`` given all trials, however they were chosen.
+
+Paths are drawn from the posterior, each is maximised over the task space, and the bound is an order statistic of the
+maxima: of S draws and the truth, all alike under the prior, the truth is at most the k-th smallest draw with
+probability ``k / (S + 1)``. Smoothness, length-scales, mean, variance and noise are drawn as well, not plugged in.
+Bayes' rule does not ask why a task was chosen, nor why the campaign stopped, so the bound holds after adaptive
+sampling; what it does rest on is the prior, and :mod:`ctxval.certificates.diagnostics` says when the trials speak
+against it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval.acquisition import UpperConfidenceBound, maximise
+from ctxval.arrays import Array, single_threaded
+from ctxval.certificates.base import Certificate, Sample, require_probability
+from ctxval.certificates.diagnostics import diagnose
+from ctxval.errors import CertificateError, InputError
+from ctxval.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
+from ctxval.paths import draw_paths, maxima
+from ctxval.surrogate import fit_surrogate
+
+FEWEST = 4
+"""Trials without which nothing is said."""
+
+STOCHASTIC = (1e-6, 1.0)
+"""Bounds of the noise variance of a stochastic system, relative to the variance of the distance."""
+
+_EXACTNESS = 3.0 * np.sqrt(EXACT)
+"""How far a path may miss exact values, in standard deviations of the distance."""
+
+
+@dataclass(frozen=True, eq=False)
+class Maxima:
+    """Draws of d* from its posterior.
+
+    Attributes:
+        draws: sorted, shape ``(S,)``.
+        points: a maximiser of each, in the unit cube, shape ``(S, d)``.
+        conditioned: the hyperparameters drawn.
+    """
+
+    draws: Array
+    points: Array
+    conditioned: list[Conditioned]
+
+    def upper(self, confidence: float) -> float:
+        """Return the bound that holds with this probability.
+
+        Raises:
+            CertificateError: so high a confidence needs more draws.
+        """
+        rank = int(np.ceil((len(self.draws) + 1) * require_probability("confidence", confidence) - 1e-9))
+        if rank > len(self.draws):
+            raise CertificateError(
+                f"a confidence of {confidence:g} needs more than the {len(self.draws)} draws of d* that there are."
+            )
+        return float(self.draws[rank - 1])
+
+    def probability(self, threshold: float) -> float:
+        """Return Pr(d* <= threshold), rounded down to what so many draws can tell."""
+        return float((self.draws <= threshold).sum() / (len(self.draws) + 1))
+
+
+def draw_maxima(
+    sample: Sample,
+    *,
+    draws: int = 128,
+    paths: int = 8,
+    seed: int = 0,
+    stochastic: bool = False,
+    prior: Prior | None = None,
+) -> Maxima:
+    """Return draws of d* given the trials.
+
+    Args:
+        sample: trials of any origin.
+        draws: of hyperparameters.
+        paths: for each of them.
+        seed: of the draws.
+        stochastic: whether two executions of one task may differ; then d* is the largest expected distance.
+        prior: of the hyperparameters.
+
+    Raises:
+        CertificateError: an execution failed, or the trials are too few or all alike.
+    """
+    X, y = _required(sample)
+    rng = np.random.default_rng(seed)
+    believed = Prior(noise=STOCHASTIC if stochastic else (EXACT, EXACT)) if prior is None else prior
+    best_first = X[np.argsort(-y, kind="stable")]
+    with single_threaded():
+        conditioned = draw_hyperparameters(X, y, draws, rng, believed)
+        found = [maxima(draw_paths(one, X, y, paths, rng), best_first, rng) for one in conditioned]
+    tops = np.concatenate(
+        [top + _EXACTNESS * np.sqrt(one.scale2) for (top, _), one in zip(found, conditioned, strict=True)]
+    )
+    if not stochastic:
+        tops = np.maximum(tops, y.max())
+    order = np.argsort(tops, kind="stable")
+    return Maxima(tops[order], np.concatenate([where for _, where in found])[order], conditioned)
+
+
+def _required(sample: Sample) -> tuple[Array, Array]:
+    if sample.failed:
+        raise CertificateError(
+            f"{sample.failed} of {len(sample)} executions failed: what the distance is there is unknown, so nothing "
+            "bounds d*; execute those tasks again, or leave them out of the task space."
+        )
+    if len(sample) < FEWEST:
+        raise CertificateError(f"a posterior bound needs at least {FEWEST} trials, got {len(sample)}.")
+    if np.ptp(sample.distances) == 0:
+        raise CertificateError(f"all {len(sample)} distances are {sample.distances[0]:g}: they say nothing of d*.")
+    return sample.points, sample.distances
+
+
+def certify_posterior(
+    sample: Sample, confidence: float = 0.95, *, stochastic: bool = False, seed: int = 0, found: Maxima | None = None
+) -> Certificate:
+    """Return the bound that d* stays below with the confidence, under the prior and given the trials.
+
+    Args:
+        sample: trials of any origin.
+        confidence: 1 - eps.
+        stochastic: whether two executions of one task may differ; then the largest expected distance is bounded.
+        seed: of the draws.
+        found: draws of d* made before, from the same trials.
+
+    Raises:
+        CertificateError: an execution failed, the trials are too few or all alike, or the confidence is too high.
+    """
+    require_probability("confidence", confidence)
+    maxima_found = draw_maxima(sample, stochastic=stochastic, seed=seed) if found is None else found
+    upper, best = maxima_found.upper(confidence), float(sample.distances.max())
+    diagnosis = diagnose(maxima_found.conditioned, sample.points, sample.distances)
+    what = "the largest expected distance" if stochastic else "d*"
+    return Certificate(
+        kind="posterior",
+        statement=f"With probability {confidence:g} under the prior, given the trials, {what} is at most {upper:.4g}.",
+        upper_bound=upper,
+        confidence=confidence,
+        volume=0.0,
+        trials=len(sample),
+        assumptions=_assumptions(stochastic),
+        details={
+            "best": best,
+            "gap": upper - best,
+            "draws": len(maxima_found.draws),
+            "instantaneous": _instantaneous(sample),
+            **_summary(maxima_found.conditioned),
+            "diagnosis": diagnosis.to_json(),
+        },
+        doubt=diagnosis.doubt,
+    )
+
+
+def _assumptions(stochastic: bool) -> tuple[str, ...]:
+    noise = (
+        "executions of one task differ by independent normal noise of one size"
+        if stochastic
+        else "each task has one distance: the system is deterministic"
+    )
+    return (
+        "the distance is a draw from a Gaussian process: a constant mean, a Matern kernel of smoothness 3/2 or 5/2, "
+        "one length-scale for each parameter, all of them unknown and integrated over",
+        "it is as rough in one part of the task space as in another: a peak narrower than the gaps between the trials, "
+        "of which no trial shows a trace, is not covered; audit for that",
+        noise,
+        "how the tasks were chosen and when the campaign stopped does not matter",
+    )
+
+
+def _summary(conditioned: list[Conditioned]) -> dict[str, object]:
+    """Return the hyperparameters in short: medians of the length-scales, and how likely the rougher kernel is."""
+    scales = np.exp([one.hyperparameters.log_scales for one in conditioned])
+    rough = float(np.mean([one.hyperparameters.nu == 1.5 for one in conditioned]))
+    return {
+        "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
+        "length_scales": np.median(scales, axis=0).tolist(),
+    }
+
+
+def _instantaneous(sample: Sample, beta: float = 2.0) -> dict[str, float] | None:
+    """Return the largest UCB of the paper's GP, hyperparameters plugged in, and its gap to the best distance found."""
+    try:
+        surrogate = fit_surrogate(sample.points, sample.distances)
+    except InputError:
+        return None
+    bound = UpperConfidenceBound(surrogate.process, beta)
+    best_first = sample.points[np.argsort(-sample.distances, kind="stable")]
+    point = maximise(bound, sample.points.shape[1], best_first, np.random.default_rng(0))
+    largest = surrogate.shift + surrogate.scale * float(bound(point[None])[0])
+    return {"max_ucb": largest, "gap": largest - float(sample.distances.max()), "beta": beta}
