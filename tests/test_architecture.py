@@ -97,6 +97,7 @@ def test_cases_use_the_public_interface_alone(module: str) -> None:
 
 def test_importing_ctxval_loads_nothing_heavy() -> None:
     heavy = ["matplotlib", "plotly", "scipy.stats", "gymnasium", "mujoco", "sklearn", "torch", "cmaes", "rich", "typer"]
+    heavy += ["fmpy", "onnxruntime", "onnx", "casadi", "control"]
     code = (
         "import sys, ctxval; from ctxval import cases, controllers, distances, models, searches, systems; "
         f"print([m for m in {heavy} if m in sys.modules])"

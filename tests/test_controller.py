@@ -1,10 +1,15 @@
 from __future__ import annotations
 
+import pickle
+from typing import Any
+
 import numpy as np
 import pytest
 
 from ctxval import Task, controllers
-from ctxval.controller import AffineFeedback, Policy, Synthesizer
+from ctxval.controller import AffineFeedback, Limits, Policy, Synthesizer
+from ctxval.describe import describe
+from ctxval.errors import InputError, ShapeError
 from ctxval.models import Linear
 
 
@@ -55,3 +60,56 @@ def test_the_ready_made_synthesizers_are_synthesizers_that_take_batches(synthesi
 
 def test_what_has_no_design_is_no_synthesizer() -> None:
     assert not isinstance(feedback(), Synthesizer)
+
+
+# Limits
+
+
+def test_affine_feedback_stays_within_its_limits_and_is_itself_inside() -> None:
+    free, limits = feedback((5,)), Limits.of(([-0.5, -np.inf], 0.7), 2)
+    limited = AffineFeedback(free.gains, free.inputs, free.states, limits)
+    x = 3 * np.random.default_rng(1).normal(size=(5, 3))
+    np.testing.assert_array_equal(limited(2, x), np.clip(free(2, x), [-0.5, -np.inf], 0.7))
+    assert (limited(2, x) < -0.5).any()  # the second input, which has no lower limit
+    np.testing.assert_array_equal(limited[3](2, x[3]), limited(2, x)[3])
+
+
+@pytest.mark.parametrize(
+    ("given", "low", "high"),
+    [(2.0, [-2, -2], [2, 2]), ([1, 3], [-1, -3], [1, 3]), ((0, 5), [0, 0], [5, 5]), (([0, -1], 5), [0, -1], [5, 5])],
+)
+def test_limits_are_given_as_numbers_or_for_each_input(given: Any, low: list[float], high: list[float]) -> None:
+    limits = Limits.of(given, 2)
+    assert limits.low.tolist() == low
+    assert limits.high.tolist() == high
+    assert Limits.of(limits, 2).high.tolist() == high
+
+
+def test_limits_that_make_no_sense_are_refused() -> None:
+    for wrong in (0.0, -1.0, (2.0, 1.0), float("nan")):
+        with pytest.raises(InputError, match="low < high for every input"):
+            Limits.of(wrong, 2)
+    with pytest.raises(ShapeError, match=r"must be numbers or have shape \(2,\), got \(3,\)"):
+        Limits.of([1, 2, 3], 2)
+
+
+def test_a_policy_can_be_limited() -> None:
+    task, model = Task([1.0, 2.0], horizon=3, dt=0.1), Linear(np.eye(2), np.eye(2))
+    pi = Policy(lambda t, x, task: 10 * x, limits=(-1.0, [5.0, 30.0])).design(task, model)
+    np.testing.assert_array_equal(pi(0, task.initial_state), [5, 20])
+    np.testing.assert_array_equal(pi(0, -task.initial_state), [-1, -1])
+    assert "limits" in describe(Policy(np.sum, limits=1.0))
+    assert "limits" not in describe(Policy(np.sum))
+
+
+def test_a_policy_that_takes_one_state_says_so() -> None:
+    assert not Policy(lambda t, x, task: x, vectorized=False).batched
+
+
+def double(t: int, x: np.ndarray, task: Task) -> np.ndarray:
+    return 2 * x
+
+
+def test_a_bound_policy_can_go_to_another_process() -> None:
+    pi = Policy(double, limits=3.0).design(Task([1.0], horizon=3, dt=0.1), Linear([[1.0]], [[1.0]]))
+    assert pickle.loads(pickle.dumps(pi))(0, np.array([1.0])).tolist() == [2.0]

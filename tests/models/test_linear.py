@@ -117,3 +117,20 @@ def test_the_description_is_json_with_all_that_a_step_depends_on() -> None:
     again = Linear(**json.loads(json.dumps(model.describe())))
     x, u = np.ones((3, 2)), np.ones((3, 1))
     np.testing.assert_array_equal(again.step(x, u), model.step(x, u))
+
+
+def test_inputs_that_hardly_move_by_themselves_are_refused_by_name() -> None:
+    data = record(draw_model(3, 2, 0), 60, 0)
+    rng = np.random.default_rng(1)
+    # Feedback: the second input is a combination of states, up to the rounding of a sensor.
+    u = np.stack([data.u[:, 0], 2 * data.x[:, 0] - data.x[:, 2] + 1e-11 * rng.normal(size=60)], axis=1)
+    with pytest.raises(InputError, match=r"x0 and x2 and u1 depend on each other in all transitions \(condition"):
+        Linear.fit(Transitions(data.x, u, data.x_next))
+
+
+def test_units_do_not_decide_whether_data_are_enough() -> None:
+    truth = draw_model(2, 1, 0)
+    data = record(truth, 40, 0)
+    units = np.array([1e-5, 1e5])
+    fitted = Linear.fit(Transitions(data.x * units, data.u, data.x_next * units))
+    np.testing.assert_allclose(fitted.A, truth.A * units[:, None] / units, rtol=1e-8)

@@ -1,4 +1,7 @@
-"""Iterative LQR (Li and Todorov 2004; regularisation and line search after Tassa, Erez and Todorov 2012)."""
+"""Iterative LQR (Li and Todorov 2004; regularisation and line search after Tassa, Erez and Todorov 2012).
+
+Input limits after control-limited differential dynamic programming (Tassa, Mansard and Todorov 2014).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval.arrays import Array, ArrayLike, Mask, Rows
-from ctxval.controller import AffineFeedback
+from ctxval.controller import AffineFeedback, Limits, LimitsLike
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.errors import DesignError, InputError
 from ctxval.model import Model, linearize
@@ -17,6 +20,7 @@ from ctxval.task import Task
 _STEP_LENGTHS = 0.5 ** np.arange(12)
 _SUFFICIENT_DECREASE = 1e-4
 _DAMPING_MIN, _DAMPING_MAX = 1e-6, 1e10
+_NEWTON_STEPS, _NEWTON_DECREASE, _NEWTON_SETTLED = 50, 0.1, 1e-26
 _ROUNDING = 1e12  # a cost that falls by less leaves the states with a relative error below 1e-10
 
 
@@ -40,8 +44,11 @@ class ILQRSolution:
 class ILQR:
     """Finite-horizon iterative LQR on any model, a whole batch of tasks at once.
 
-    Minimises a quadratic cost on the deviation from the task's reference. On a linear model it converges in one
-    iteration, to the Riccati solution.
+    Minimises a quadratic cost on the deviation from the task's reference. On a linear model without limits it
+    converges in one iteration, to the Riccati solution.
+
+    It plans with input limits: every backward step minimises over the inputs within them, inputs at a limit get no
+    feedback, and roll-outs are clipped. The controller clips too, on the model and on the system alike.
 
     Args:
         Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
@@ -49,9 +56,11 @@ class ILQR:
         Q_final: weight of the last state; Q by default.
         iterations: the most steps for one task.
         tolerance: stop where the next step would lower the cost by less than this share of it.
+        limits: of the inputs, ``(low, high)`` or ``high`` for ``(-high, high)``: numbers, or one each input.
 
     Raises:
-        InputError: the weights are not positive semidefinite, R not positive definite, or a limit not positive.
+        InputError: the weights are not positive semidefinite, R not positive definite, iterations or tolerance not
+            positive, or limits not low < high.
     """
 
     batched = True
@@ -64,12 +73,19 @@ class ILQR:
         *,
         iterations: int = 100,
         tolerance: float = 1e-8,
+        limits: LimitsLike | None = None,
     ) -> None:
         self.cost = QuadraticCost(Q, R, Q_final)
         self.iterations = iterations
         self.tolerance = tolerance
         if iterations < 1 or not tolerance > 0:
             raise InputError(f"iterations and tolerance must be positive, got {iterations!r} and {tolerance!r}.")
+        self.limits = None if limits is None else Limits.of(limits, len(self.cost.R))
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this synthesizer in a store."""
+        fields = {"cost": self.cost, "iterations": self.iterations, "tolerance": self.tolerance}
+        return {**fields, **({} if self.limits is None else {"limits": self.limits})}
 
     def design(self, task: Task, model: Model) -> AffineFeedback:
         """Return the feedback around the optimised trajectory of the model."""
@@ -94,10 +110,10 @@ class _Descent:
 
     def __init__(self, settings: ILQR, task: Task, model: Model) -> None:
         n, m = task.initial_state.shape[-1], len(settings.cost.R)
-        self.settings, self.cost, self.model = settings, settings.cost, model
+        self.settings, self.cost, self.model, self.limits = settings, settings.cost, model, settings.limits
         self.reference = np.moveaxis(task.reference.reshape(-1, task.horizon + 1, n), 1, 0)
         batch = self.reference.shape[1]
-        self.U = np.zeros((task.horizon, batch, m))
+        self.U = self._clipped(np.zeros((task.horizon, batch, m)))
         self.X = np.empty((task.horizon + 1, batch, n))
         self.X[0] = task.initial_state.reshape(-1, n)
         self.K = np.zeros((task.horizon, batch, m, n))
@@ -127,7 +143,7 @@ class _Descent:
         self.damping[rows[arrived]] = np.where(self.refused[rows[arrived]], np.inf, 0.0)
         before = self.J[rows]
         moved = self._line_search(rows, policy, change, ~arrived)
-        if A.ndim == 2 and B.ndim == 2:
+        if A.ndim == 2 and B.ndim == 2 and self.limits is None:
             # The model is linear: the step was the exact minimiser, and its gains hold everywhere. Only where the cost
             # fell from very far, as on an unstable model, rounding calls for another look.
             self.converged[rows[moved]] = (before <= _ROUNDING * self.J[rows])[moved]
@@ -146,8 +162,12 @@ class _Descent:
             VA, VB = V @ A_t, V @ B_t
             Q_x, Q_u = deviations[t] @ self.cost.Q + _times(v, A_t), inputs[t] @ self.cost.R + _times(v, B_t)
             Q_ux, Q_uu = _T(B_t) @ VA, self.cost.R + _T(B_t) @ VB
-            inverse = np.linalg.inv(Q_uu + ridge)
-            K, k = -inverse @ Q_ux, -_times(Q_u, inverse)
+            if self.limits is None:
+                inverse = np.linalg.inv(Q_uu + ridge)
+                K, k = -inverse @ Q_ux, -_times(Q_u, inverse)
+            else:
+                box = self.limits.low - inputs[t], self.limits.high - inputs[t]
+                K, k = _within(box, Q_uu + ridge, Q_u, Q_ux)
             Q_uu_k = _times(k, Q_uu)
             slope += (k * Q_u).sum(axis=-1)
             curvature += (k * Q_uu_k).sum(axis=-1)
@@ -192,9 +212,13 @@ class _Descent:
             U[t] = U_old[t] + lengths[:, None] * policy.k[t]
             if lengths.any():
                 U[t] += _times(X[t] - X_old[t], _T(policy.K[t]))
+            U[t] = self._clipped(U[t])
             X[t + 1] = self.model.step(X[t], U[t])
         J = self.cost.value(X - self.reference[:, rows], U)
         return X, U, np.where(np.isfinite(J), J, np.inf)
+
+    def _clipped(self, inputs: Array) -> Array:
+        return inputs if self.limits is None else self.limits.clip(inputs)
 
     def solution(self, batch_shape: tuple[int, ...]) -> ILQRSolution:
         """Return the iterates as a solution, batch first."""
@@ -202,7 +226,8 @@ class _Descent:
         def batch_first(array: Array) -> Array:
             return np.moveaxis(array, 0, 1).reshape(*batch_shape, len(array), *array.shape[2:])
 
-        controller = AffineFeedback(batch_first(self.K), batch_first(self.U), batch_first(self.X[:-1]))
+        parts = batch_first(self.K), batch_first(self.U), batch_first(self.X[:-1])
+        controller = AffineFeedback(*parts, self.limits)
         return ILQRSolution(
             controller,
             self.J.reshape(batch_shape),
@@ -231,6 +256,38 @@ class _Change:
 
     def at(self, length: float | Array) -> Array:
         return length * self.slope + 0.5 * length**2 * self.curvature
+
+
+def _within(box: tuple[Array, Array], Q_uu: Array, Q_u: Array, Q_ux: Array) -> tuple[Array, Array]:
+    """Minimise ``Q_u'k + 1/2 k'Q_uu k`` over ``low <= k <= high``; return the gains K ``(N, m, n)`` and k ``(N, m)``.
+
+    Projected Newton steps (Bertsekas 1982; Tassa, Mansard and Todorov 2014, Sec. III). Inputs at a limit have no gain.
+    """
+    (low, high), (N, m) = box, Q_u.shape
+    Q_uu, Q_ux = np.broadcast_to(Q_uu, (N, m, m)), np.broadcast_to(Q_ux, (N, *Q_ux.shape[-2:]))
+    k = np.zeros((N, m))  # within the box, as the inputs are
+    largest = 0.0
+    for _ in range(_NEWTON_STEPS):
+        slope = Q_u + _times(k, Q_uu)
+        free = ~(((k <= low) & (slope > 0)) | ((k >= high) & (slope < 0)))
+        inverse = np.linalg.inv(np.where(free[:, :, None] & free[:, None, :], Q_uu, np.eye(m)))
+        direction = -_times(np.where(free, slope, 0.0), inverse)
+        decrease = float(-np.where(free, slope * direction, 0.0).sum(axis=-1).min(initial=0.0))
+        largest = max(largest, decrease)
+        if decrease <= _NEWTON_SETTLED * largest:
+            break
+        k = _projected(k, direction, slope, Q_uu, box)
+    return -inverse @ np.where(free[:, :, None], Q_ux, 0.0), k
+
+
+def _projected(k: Array, direction: Array, slope: Array, Q_uu: Array, box: tuple[Array, Array]) -> Array:
+    """Return for each row the longest of several steps, projected onto the box, that lowers its value enough."""
+    moves = np.clip(k + _STEP_LENGTHS[:, None, None] * direction, *box) - k
+    linear = (moves * slope).sum(axis=-1)
+    change = linear + 0.5 * (moves * (moves[..., None, :] @ Q_uu)[..., 0, :]).sum(axis=-1)
+    enough = change <= _NEWTON_DECREASE * linear
+    chosen = moves[enough.argmax(axis=0), np.arange(len(k))]
+    return k + np.where(enough.any(axis=0)[:, None], chosen, 0.0)
 
 
 def _times(rows: Array, matrix: np.ndarray[Any, np.dtype[np.floating[Any]]]) -> Array:

@@ -1,12 +1,15 @@
-"""Finite-horizon linear-quadratic tracking by the Riccati recursion."""
+"""Linear-quadratic tracking: over the task's horizon by the Riccati recursion, and stationary."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from ctxval.arrays import Array, ArrayLike
-from ctxval.controller import AffineFeedback
+from ctxval.controller import AffineFeedback, Limits, LimitsLike
 from ctxval.controllers.cost import QuadraticCost
+from ctxval.errors import DesignError
 from ctxval.model import Model, linearize
 from ctxval.task import Task
 
@@ -16,19 +19,26 @@ class LQR:
 
     A nonlinear model is linearised once, at the task's initial state and zero input.
 
+    Limits only clip the inputs, on the model and on the system alike: the gains are those of the problem without
+    limits, and optimal as long as none is reached. iLQR and MPC plan with them.
+
     Args:
         Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
         R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``.
         Q_final: weight of the last state; Q by default.
+        limits: of the inputs, ``(low, high)`` or ``high`` for ``(-high, high)``: numbers, or one each input.
 
     Raises:
-        InputError: the weights are not positive semidefinite, or R not positive definite.
+        InputError: the weights are not positive semidefinite, R not positive definite, or limits not low < high.
     """
 
     batched = True
 
-    def __init__(self, Q: ArrayLike, R: ArrayLike, Q_final: ArrayLike | None = None) -> None:
+    def __init__(
+        self, Q: ArrayLike, R: ArrayLike, Q_final: ArrayLike | None = None, *, limits: LimitsLike | None = None
+    ) -> None:
         self.cost = QuadraticCost(Q, R, Q_final)
+        self.limits = None if limits is None else Limits.of(limits, len(self.cost.R))
 
     def design(self, task: Task, model: Model) -> AffineFeedback:
         """Return the feedback ``u = K_t x + k_t`` that minimises the cost on the (linearised) model."""
@@ -38,7 +48,79 @@ class LQR:
         A, B = linearize(model, x0, u0)
         offset = model.step(x0, u0) - (A @ x0[..., None])[..., 0]
         gains, feedforward = _riccati(self.cost, A, B, offset, task.reference)
-        return AffineFeedback(gains, feedforward, np.zeros_like(task.reference[..., :-1, :]))
+        return AffineFeedback(gains, feedforward, np.zeros_like(task.reference[..., :-1, :]), self.limits)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this synthesizer in a store."""
+        return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
+
+
+class StationaryLQR:
+    """The infinite-horizon linear-quadratic regulator: one gain, from the algebraic Riccati equation.
+
+    ``u = u_g + K (x - r_t)`` follows the task's reference, with the input u_g that holds the task's goal best in the
+    sense of least squares. The model is linearised there. A goal that no input holds leaves an offset.
+
+    Limits only clip the inputs, as for :class:`LQR`.
+
+    Args:
+        Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
+        R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``.
+        limits: of the inputs, ``(low, high)`` or ``high`` for ``(-high, high)``: numbers, or one each input.
+
+    Raises:
+        InputError: the weights are not positive semidefinite, R not positive definite, or limits not low < high.
+    """
+
+    batched = True
+
+    def __init__(self, Q: ArrayLike, R: ArrayLike, *, limits: LimitsLike | None = None) -> None:
+        self.cost = QuadraticCost(Q, R)
+        self.limits = None if limits is None else Limits.of(limits, len(self.cost.R))
+
+    def design(self, task: Task, model: Model) -> AffineFeedback:
+        """Return the stationary feedback around the reference.
+
+        Raises:
+            DesignError: no feedback stabilises the model at the goal.
+        """
+        self.cost.require_task(task)
+        holding = np.zeros((*task.batch_shape, len(self.cost.R)))
+        _, B = linearize(model, task.goal, holding)
+        # One step of Gauss and Newton: exact for models that are affine in the input.
+        missing = task.goal - model.step(task.goal, holding)
+        holding = holding + (np.linalg.pinv(B) @ missing[..., None])[..., 0]
+        K = _stationary_gain(self.cost, *linearize(model, task.goal, holding))
+        gains = np.repeat(K[..., None, :, :], task.horizon, axis=-3)
+        inputs = np.repeat(holding[..., None, :], task.horizon, axis=-2)
+        return AffineFeedback(gains, inputs, task.reference[..., :-1, :], self.limits)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this synthesizer in a store."""
+        return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
+
+
+def _stationary_gain(cost: QuadraticCost, A: Array, B: Array) -> Array:
+    """Return K ``(..., m, n)`` of ``u = K x``."""
+    if A.ndim > 2 or B.ndim > 2:
+        batch = np.broadcast_shapes(A.shape[:-2], B.shape[:-2])
+        many = (np.broadcast_to(part, (*batch, *part.shape[-2:])).reshape(-1, *part.shape[-2:]) for part in (A, B))
+        gains = [_stationary_gain(cost, A_i, B_i) for A_i, B_i in zip(*many, strict=True)]
+        return np.stack(gains).reshape(*batch, *gains[0].shape)
+    from scipy.linalg import solve_discrete_are
+
+    try:
+        P = solve_discrete_are(A, B, cost.Q, cost.R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise DesignError(f"no stationary feedback stabilises the model at the goal: {error}") from error
+    K = -np.linalg.solve(cost.R + B.T @ P @ B, B.T @ P @ A)
+    radius = float(np.abs(np.linalg.eigvals(A + B @ K)).max())
+    if not radius < 1:
+        raise DesignError(
+            "no stationary feedback stabilises the model at the goal: the largest eigenvalue of its closed loop has "
+            f"modulus {radius:.6g}, which must be below 1."
+        )
+    return np.asarray(K)
 
 
 def _riccati(cost: QuadraticCost, A: Array, B: Array, offset: Array, reference: Array) -> tuple[Array, Array]:

@@ -10,6 +10,9 @@ from ctxval.arrays import Array, ArrayLike, as_finite, single_threaded
 from ctxval.errors import InputError, ShapeError
 from ctxval.trajectory import Transitions
 
+_LARGEST_CONDITION = 1e8
+"""Half of the digits of a double: beyond it the weights are those of rounding and of noise."""
+
 
 class Linear:
     """The model ``x_next = A x + B u + c``.
@@ -41,7 +44,7 @@ class Linear:
         """Fit A, B and, with an intercept, c by least squares on recorded transitions.
 
         Raises:
-            InputError: the data do not determine the model, or are not finite.
+            InputError: the data do not determine the model, or so badly that rounding decides, or are not finite.
         """
         n, m = data.x.shape[1], data.u.shape[1]
         if not all(np.isfinite(array).all() for array in (data.x, data.u, data.x_next)):
@@ -55,6 +58,7 @@ class Linear:
                 f"the data do not determine a linear model: {len(data)} transitions of {n} states and {m} inputs "
                 f"have rank {rank} where {regressors.shape[1]} is needed; excite every state and input."
             )
+        _require_identifiable(regressors, n, m)
         return cls(weights[:n].T, weights[n : n + m].T, weights[n + m] if intercept else None, data)
 
     def step(self, x: Array, u: Array) -> Array:
@@ -68,3 +72,19 @@ class Linear:
     def describe(self) -> dict[str, Any]:
         """Return what identifies this model in a store."""
         return {"A": self.A.tolist(), "B": self.B.tolist(), "c": self.c.tolist()}
+
+
+def _require_identifiable(regressors: Array, n: int, m: int) -> None:
+    """Check that no regressor is nearly a combination of the others, whatever units they are in."""
+    scaled = regressors / np.linalg.norm(regressors, axis=0)
+    with single_threaded():
+        _, sizes, directions = np.linalg.svd(scaled, full_matrices=False)
+    if sizes[0] <= _LARGEST_CONDITION * sizes[-1]:
+        return
+    names = [*(f"x{i}" for i in range(n)), *(f"u{i}" for i in range(m)), "the constant"]
+    together = [names[i] for i in np.flatnonzero(np.abs(directions[-1]) > 0.1)]
+    raise InputError(
+        f"the data hardly determine a linear model: {' and '.join(together)} depend on each other in all transitions "
+        f"(condition {sizes[0] / sizes[-1]:.1e}, at most {_LARGEST_CONDITION:.0e}); excite them independently, "
+        "for example without feedback."
+    )

@@ -2,7 +2,12 @@
 
 from ctxval.integrate import rk4
 from ctxval.system import System
+from ctxval.systems.fmu import FMU
+from ctxval.systems.function import Function
+from ctxval.systems.gymnasium import Gymnasium
+from ctxval.systems.manual import Manual
 from ctxval.systems.mujoco import MuJoCo
 from ctxval.systems.simulated import Simulated
+from ctxval.systems.subprocess import Subprocess
 
-__all__ = ["MuJoCo", "Simulated", "System", "rk4"]
+__all__ = ["FMU", "Function", "Gymnasium", "Manual", "MuJoCo", "Simulated", "Subprocess", "System", "rk4"]

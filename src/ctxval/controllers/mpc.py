@@ -1,0 +1,259 @@
+"""Model predictive control with limits on inputs and states, on any model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ctxval.arrays import Array, ArrayLike, Mask, as_floats
+from ctxval.controller import Limits, LimitsLike
+from ctxval.controllers.cost import QuadraticCost
+from ctxval.errors import DesignError, InputError, ShapeError
+from ctxval.model import Model, linearize
+from ctxval.task import Task
+
+_SETTLED = 1e-9  # relative change of the cost at which the iteration stops
+_STEP_LENGTHS = 0.5 ** np.arange(10)
+_EXACT = 2.0  # the merit's weight of violations, in multiplicities of the largest multiplier
+_STRICT = 1e-6  # quadratic share of the cost of a violation, which keeps the problem strictly convex
+
+
+class MPC:
+    """Receding-horizon control that plans with limits, by sequential quadratic programming in CasADi.
+
+    At every step it minimises the quadratic cost of the model's prediction over the next steps, follows the task's
+    reference (held beyond its end), and applies the first input. On a linear model one quadratic program is the exact
+    solution; on others the model is linearised along the prediction, up to ``iterations`` times, with a line search.
+    The input depends on the step and the state alone: nothing is remembered from one call to the next.
+
+    Input limits are never exceeded. State limits hold for the model's predictions; on a system that differs from the
+    model a state may leave them, and where no inputs lead back at once there is no solution, which is an error, unless
+    a ``violation_cost`` makes them soft.
+
+    Args:
+        Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
+        R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``.
+        Q_final: weight of the last predicted state; Q by default.
+        steps: how many steps it looks ahead.
+        limits: of the inputs, ``(low, high)`` or ``high`` for ``(-high, high)``: numbers, or one each input.
+        state_limits: likewise; infinite where there are none.
+        violation_cost: cost of exceeding the state limits by 1, for each predicted step; None where they are hard.
+        iterations: quadratic programs for one input, at most.
+
+    Raises:
+        InputError: CasADi is not installed, or a weight, limit or number cannot be used.
+    """
+
+    batched = False
+
+    def __init__(
+        self,
+        Q: ArrayLike,
+        R: ArrayLike,
+        Q_final: ArrayLike | None = None,
+        *,
+        steps: int,
+        limits: LimitsLike | None = None,
+        state_limits: LimitsLike | None = None,
+        violation_cost: float | None = None,
+        iterations: int = 20,
+    ) -> None:
+        self.cost = QuadraticCost(Q, R, Q_final)
+        n, m = len(self.cost.Q), len(self.cost.R)
+        self.steps, self.iterations = steps, iterations
+        if any(not isinstance(k, int | np.integer) or isinstance(k, bool) or k < 1 for k in (steps, iterations)):
+            raise InputError(f"steps and iterations must be positive integers, got {steps!r} and {iterations!r}.")
+        self.limits = Limits.of(np.inf if limits is None else limits, m)
+        self.state_limits = Limits.of(np.inf if state_limits is None else state_limits, n)
+        self.violation_cost = violation_cost
+        if violation_cost is not None and not (np.isfinite(violation_cost) and violation_cost > 0):
+            raise InputError(f"violation_cost must be a positive number or None, got {violation_cost!r}.")
+        _casadi()
+
+    def design(self, task: Task, model: Model) -> RecedingHorizon:
+        """Return the controller, which solves its problem again at every step.
+
+        Raises:
+            ShapeError: the task is a batch, or has other states than the weights.
+        """
+        self.cost.require_task(task)
+        if task.batch_shape:
+            raise ShapeError(f"MPC designs for one task at a time, got a batch of shape {task.batch_shape}.")
+        return RecedingHorizon(self, task, model)
+
+
+@dataclass(frozen=True, eq=False)
+class RecedingHorizon:
+    """The controller of :class:`MPC` for one task."""
+
+    settings: MPC
+    task: Task
+    model: Model
+
+    def __call__(self, t: int, x: Array) -> Array:
+        """Return the input ``(m,)`` at step t.
+
+        Raises:
+            DesignError: no inputs keep the prediction within the state limits, or it is not finite.
+        """
+        first: Array = self.plan(t, x)[1][0]
+        return first
+
+    def plan(self, t: int, x: Array) -> tuple[Array, Array]:
+        """Return the predicted states ``(steps + 1, n)`` and the planned inputs ``(steps, m)``.
+
+        Raises:
+            DesignError: as when it is called.
+        """
+        steps = self.settings.steps
+        rows = np.minimum(t + 1 + np.arange(steps), self.task.horizon)
+        problem = _Problem(self.settings, self.model, as_floats("the state", x), self.task.reference[rows])
+        with np.errstate(all="ignore"):
+            return problem.solve(t)
+
+
+class _Problem:
+    """The optimal control problem at one step: deviations from a guess of the inputs, improved again and again."""
+
+    def __init__(self, settings: MPC, model: Model, x: Array, reference: Array) -> None:
+        self.settings, self.model, self.x, self.reference = settings, model, x, reference
+        steps, cost = settings.steps, settings.cost
+        self.Q = np.stack([*[cost.Q] * (steps - 1), cost.Q_final])
+        limits = settings.state_limits
+        self.limited: Mask = np.isfinite(limits.low) | np.isfinite(limits.high)
+        self.weight = 0.0
+
+    def solve(self, t: int) -> tuple[Array, Array]:
+        m = len(self.settings.cost.R)
+        U = self.settings.limits.clip(np.zeros((self.settings.steps, m)))
+        X = self._predicted(U)
+        if not np.isfinite(X).all():
+            raise DesignError(f"MPC cannot start at step {t}: the prediction from {self.x.tolist()} is not finite.")
+        for _ in range(self.settings.iterations):
+            A, B = linearize(self.model, X[:-1], U)
+            change = self._improved(X, U, A, B)
+            if change is None:
+                raise DesignError(
+                    f"MPC finds no inputs at step {t} that keep the prediction from {self.x.tolist()} within the "
+                    "state limits; a violation_cost makes them soft."
+                )
+            if A.ndim == 2 and B.ndim == 2:
+                U = self.settings.limits.clip(U + change)
+                return self._predicted(U), U
+            X, U, settled = self._line_search(X, U, change)
+            if settled:
+                break
+        return X, U
+
+    def _predicted(self, U: Array) -> Array:
+        X = np.empty((len(U) + 1, len(self.x)))
+        X[0] = self.x
+        for k, u in enumerate(U):
+            X[k + 1] = self.model.step(X[k], u)
+        return X
+
+    def _improved(self, X: Array, U: Array, A: Array, B: Array) -> Array | None:
+        """Return the change of the inputs ``(steps, m)`` that is best for the linearised prediction, if any."""
+        steps, m = U.shape
+        G = _sensitivities(A, B, steps)  # (steps, n, steps * m)
+        QG = self.Q @ G
+        hessian = np.tensordot(G, QG, axes=([0, 1], [0, 1])) + np.kron(np.eye(steps), self.settings.cost.R)
+        slope = np.tensordot(X[1:] - self.reference, QG, axes=([0, 1], [0, 1])) + (U @ self.settings.cost.R).ravel()
+        low, high = (bound - U for bound in (self.settings.limits.low, self.settings.limits.high))
+        rows = G[:, self.limited].reshape(-1, steps * m)
+        gap_low = (self.settings.state_limits.low - X[1:])[:, self.limited].ravel()
+        gap_high = (self.settings.state_limits.high - X[1:])[:, self.limited].ravel()
+        soft = self.settings.violation_cost
+        if soft is None or not len(rows):
+            found = _quadratic_program(hessian, slope, rows, (low.ravel(), high.ravel()), (gap_low, gap_high))
+        else:
+            found = _softened(hessian, slope, rows, (low.ravel(), high.ravel()), (gap_low, gap_high), soft, steps)
+        if found is None:
+            return None
+        change, largest = found
+        self.weight = max(self.weight, _EXACT * largest) if soft is None else soft
+        return change[: steps * m].reshape(steps, m)
+
+    def _line_search(self, X: Array, U: Array, change: Array) -> tuple[Array, Array, bool]:
+        """Return states and inputs with a lower merit, and whether they have settled."""
+        before = self._merit(X, U)
+        for length in _STEP_LENGTHS:
+            U_new = self.settings.limits.clip(U + length * change)
+            X_new = self._predicted(U_new)
+            after = self._merit(X_new, U_new)
+            if after < before:
+                return X_new, U_new, before - after <= _SETTLED * (1 + abs(before))
+        return X, U, True
+
+    def _merit(self, X: Array, U: Array) -> float:
+        """Return the cost and what exceeds the state limits, weighted so that it pays to keep them."""
+        deviations = X[1:] - self.reference
+        cost = 0.5 * (
+            ((self.Q @ deviations[..., None])[..., 0] * deviations).sum() + ((U @ self.settings.cost.R) * U).sum()
+        )
+        limits = self.settings.state_limits
+        excess = np.maximum(np.maximum(limits.low - X[1:], X[1:] - limits.high), 0.0)
+        violation = excess.sum() if self.settings.violation_cost is None else excess.max(axis=-1).sum()
+        merit = float(cost + self.weight * violation)
+        return merit if np.isfinite(merit) else np.inf
+
+
+def _sensitivities(A: Array, B: Array, steps: int) -> Array:
+    """Return the derivatives of the states 1 to ``steps`` by all inputs, ``(steps, n, steps * m)``."""
+    n, m = B.shape[-2:]
+    G = np.zeros((steps, n, steps * m))
+    for k in range(steps):
+        A_k, B_k = A if A.ndim == 2 else A[k], B if B.ndim == 2 else B[k]
+        if k:
+            G[k] = A_k @ G[k - 1]
+        G[k, :, k * m : (k + 1) * m] = B_k
+    return G
+
+
+def _softened(
+    hessian: Array, slope: Array, rows: Array, box: Sequence[Array], gaps: Sequence[Array], cost: float, steps: int
+) -> tuple[Array, float] | None:
+    """Solve with one more variable a step, by which the state limits may be exceeded."""
+    size, count = len(slope), len(rows)
+    whole = np.zeros((size + steps, size + steps))
+    whole[:size, :size] = hessian
+    whole[size:, size:] = _STRICT * cost * np.eye(steps)
+    own = np.kron(np.eye(steps), np.ones((count // steps, 1)))
+    unlimited = np.full(count, np.inf)
+    return _quadratic_program(
+        whole,
+        np.concatenate([slope, np.full(steps, cost)]),
+        np.block([[rows, own], [rows, -own]]),
+        (np.append(box[0], np.zeros(steps)), np.append(box[1], np.full(steps, np.inf))),
+        (np.append(gaps[0], -unlimited), np.append(unlimited, gaps[1])),
+    )
+
+
+def _quadratic_program(
+    hessian: Array, slope: Array, rows: Array, box: Sequence[Array], gaps: Sequence[Array]
+) -> tuple[Array, float] | None:
+    """Minimise ``1/2 z'Hz + g'z`` within a box and within gaps of ``rows z``.
+
+    Return z and the largest multiplier of a row; None where there is no solution.
+    """
+    casadi = _casadi()
+    dense = casadi.Sparsity.dense
+    sizes = {"h": dense(*hessian.shape), "a": dense(len(rows), len(slope))}
+    # DAQP is an active-set method, exact to rounding and quiet.
+    solver = casadi.conic("mpc", "daqp", sizes, {"error_on_fail": False})
+    solution = solver(h=hessian, g=slope, a=rows, lbx=box[0], ubx=box[1], lba=gaps[0], uba=gaps[1])
+    if not solver.stats()["success"]:
+        return None
+    multipliers = np.abs(np.array(solution["lam_a"]).ravel())
+    return np.array(solution["x"], dtype=np.float64).ravel(), float(multipliers.max(initial=0.0))
+
+
+def _casadi() -> Any:
+    try:
+        import casadi
+    except ImportError as error:
+        raise InputError('CasADi is not installed: pip install "ctxval[mpc]".') from error
+    return casadi

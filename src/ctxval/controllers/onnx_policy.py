@@ -1,0 +1,80 @@
+"""A trained policy from an ONNX file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.controller import Limits, LimitsLike
+from ctxval.errors import InputError
+from ctxval.model import Model
+from ctxval.onnx_network import OnnxNetwork
+from ctxval.task import Task
+
+Observe = Callable[[int, Array, Task], Array]
+
+
+class OnnxPolicy:
+    """The same trained network for every task, as a synthesizer; the model is not asked.
+
+    The network takes one row of observations for each task and returns the inputs as its first output, such as the
+    means of a stochastic policy. Nothing in the file is executed as code.
+
+    Args:
+        source: the file, or its bytes.
+        observe: ``(t, x, task) -> observations (..., k)`` from the step's index, states ``(..., n)`` and the task;
+            the states by default.
+        scale: what the network's outputs are multiplied by, a number or ``(m,)``: a policy in ``[-1, 1]`` drives a
+            motor of 5 N m with a scale of 5.
+        limits: inputs are clipped to ``(low, high)``, or to ``(-high, high)``: numbers, or one each input.
+
+    Raises:
+        InputError: onnxruntime is not installed, or this is no network with one input.
+    """
+
+    batched = True
+
+    def __init__(
+        self,
+        source: str | Path | bytes,
+        *,
+        observe: Observe | None = None,
+        scale: float | Array = 1.0,
+        limits: LimitsLike | None = None,
+    ) -> None:
+        self.network = OnnxNetwork(source)
+        self.observe = observe
+        self.scale = scale
+        self.limits = limits
+        if len(self.network.widths) != 1:
+            raise InputError(
+                f"a policy must have one input, the observations; the network has {', '.join(self.network.names)}."
+            )
+
+    def design(self, task: Task, model: Model) -> BoundOnnxPolicy:
+        """Return the policy bound to the task."""
+        return BoundOnnxPolicy(self, task)
+
+
+@dataclass(frozen=True, eq=False)
+class BoundOnnxPolicy:
+    """The controller of :class:`OnnxPolicy` for one task or a batch."""
+
+    settings: OnnxPolicy
+    task: Task
+
+    def __call__(self, t: int, x: Array) -> Array:
+        """Return the inputs ``(..., m)`` at step t.
+
+        Raises:
+            ShapeError: there are not as many observations as the network takes.
+        """
+        observe, limits = self.settings.observe, self.settings.limits
+        observations: Any = x if observe is None else observe(t, x, self.task)
+        u = self.settings.network(np.asarray(observations, dtype=np.float64)) * self.settings.scale
+        return u if limits is None else Limits.of(limits, u.shape[-1]).clip(u)

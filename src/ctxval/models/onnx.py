@@ -1,0 +1,81 @@
+"""A learned model from an ONNX file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.errors import InputError, ShapeError
+from ctxval.onnx_network import OnnxNetwork
+
+
+class Onnx:
+    """A network from an ONNX file as a model, of any toolbox that writes one.
+
+    The network takes the state and the input as two inputs in this order, or as one with the state first. It runs
+    with onnxruntime; nothing in the file is executed as code.
+
+    A network in single precision rounds so coarsely that differences of 1e-5 are noise: its Jacobian is taken by
+    central differences over wider distances, of which some three digits are right.
+
+    Args:
+        source: the file, or its bytes.
+        increments: whether the network returns ``x_next - x`` instead of ``x_next``.
+
+    Raises:
+        InputError: onnxruntime is not installed, or this is no such network.
+    """
+
+    def __init__(self, source: str | Path | bytes, *, increments: bool = False) -> None:
+        self.network = OnnxNetwork(source)
+        self.increments = increments
+        if len(self.network.widths) not in (1, 2):
+            raise InputError(
+                f"a model must take (x, u) as one or two inputs, the network has {', '.join(self.network.names)}."
+            )
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
+
+        Raises:
+            ShapeError: the network has other numbers of states or inputs.
+        """
+        output = self.network(*self._arguments(x, u))
+        if output.shape[-1] != x.shape[-1]:
+            raise ShapeError(
+                f"the network must return {x.shape[-1]} states like those it takes, got {output.shape[-1]}."
+            )
+        return x + output if self.increments else output
+
+    def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """Return A ``(..., n, n)`` and B ``(..., n, m)`` by central differences that suit the network's precision."""
+        n = x.shape[-1]
+        z = np.concatenate(_paired(x, u), axis=-1)
+        # The cube root of the precision balances truncation against rounding.
+        h = np.cbrt(self.network.precision) * np.maximum(1.0, np.abs(z))
+        moves = np.eye(z.shape[-1]) * h[..., None, :]
+        up, down = z[..., None, :] + moves, z[..., None, :] - moves
+        difference = self._outputs(up, n) - self._outputs(down, n)
+        jacobian = np.swapaxes(difference / (2 * h[..., :, None]), -1, -2)
+        A, B = jacobian[..., :n], jacobian[..., n:]
+        return (A + np.eye(n) if self.increments else A), B
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this model in a store."""
+        return {**self.network.describe(), "increments": self.increments}
+
+    def _outputs(self, z: Array, n: int) -> Array:
+        return self.network(*self._arguments(z[..., :n], z[..., n:]))
+
+    def _arguments(self, x: Array, u: Array) -> tuple[Array, ...]:
+        if len(self.network.widths) == 2:
+            return x, u
+        return (np.concatenate(_paired(x, u), axis=-1),)
+
+
+def _paired(x: Array, u: Array) -> tuple[Array, Array]:
+    batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+    return np.broadcast_to(x, (*batch, x.shape[-1])), np.broadcast_to(u, (*batch, u.shape[-1]))

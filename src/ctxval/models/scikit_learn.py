@@ -1,0 +1,82 @@
+"""A regressor of scikit-learn as a learned model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.errors import InputError, ShapeError
+from ctxval.trajectory import Transitions
+
+
+class ScikitLearn:
+    """A fitted regressor of scikit-learn as a model: a pipeline, a forest, ridge regression, a Gaussian process.
+
+    Its features are the state, then the input. Where it is smooth its Jacobian is taken by differences; a forest or
+    nearest neighbours are constant in between, and LQR and iLQR see a Jacobian of zero.
+
+    Args:
+        regressor: with ``predict``, from features ``(N, n + m)`` to ``(N, n)``.
+        increments: whether it predicts ``x_next - x`` instead of ``x_next``.
+        data: the transitions that it was learned from, if any.
+
+    Raises:
+        InputError: the regressor is not fitted, or is none.
+    """
+
+    def __init__(self, regressor: Any, *, increments: bool = True, data: Transitions | None = None) -> None:
+        self.regressor = regressor
+        self.increments = increments
+        self.data = data
+        features = getattr(regressor, "n_features_in_", None)
+        if features is None or not callable(getattr(regressor, "predict", None)):
+            raise InputError(f"the regressor must be fitted and have predict and n_features_in_, got {regressor!r}.")
+        self.features = int(features)
+
+    @classmethod
+    def fit(cls, regressor: Any, data: Transitions, *, increments: bool = True) -> ScikitLearn:
+        """Fit a regressor on recorded transitions; it is fitted itself, not a copy of it.
+
+        Raises:
+            InputError: the data are not finite, or it is no regressor.
+        """
+        if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
+            raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
+        if not callable(getattr(regressor, "fit", None)):
+            raise InputError(f"the regressor must have fit and predict, got {regressor!r}.")
+        targets = data.x_next - data.x if increments else data.x_next
+        # Of one column scikit-learn wants none.
+        regressor.fit(np.concatenate([data.x, data.u], axis=1), targets[:, 0] if targets.shape[1] == 1 else targets)
+        return cls(regressor, increments=increments, data=data)
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
+
+        Raises:
+            ShapeError: the regressor was fitted on other numbers of states and inputs.
+        """
+        n, width = x.shape[-1], x.shape[-1] + u.shape[-1]
+        if width != self.features:
+            raise ShapeError(
+                f"the regressor was fitted on {self.features} features, got {n} states and {width - n} inputs."
+            )
+        batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+        pairs = np.empty((*batch, width))
+        pairs[..., :n], pairs[..., n:] = x, u
+        output = np.asarray(self.regressor.predict(pairs.reshape(-1, width)), dtype=np.float64)
+        if output.shape not in ((int(np.prod(batch)), n), *([(int(np.prod(batch)),)] if n == 1 else [])):
+            raise ShapeError(f"the regressor must predict {n} states like those it takes, got shape {output.shape}.")
+        output = output.reshape(*batch, n)
+        return x + output if self.increments else output
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this model in a store: its kind and what it predicts at some points."""
+        probes = np.random.default_rng(0).normal(size=(3, self.features))
+        return {
+            "regressor": type(self.regressor).__qualname__,
+            "features": self.features,
+            "increments": self.increments,
+            "predictions": np.asarray(self.regressor.predict(probes), dtype=np.float64),
+        }

@@ -1,0 +1,50 @@
+"""State-space models of python-control as learned models."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ctxval.arrays import Array, as_finite
+from ctxval.errors import InputError, ShapeError
+from ctxval.models.linear import Linear
+
+
+def state_space(system: Any, dt: float) -> Linear:
+    """Return the linear model, with its Jacobian, of a ``StateSpace`` of python-control or of scipy.
+
+    The model's state is the system's; C and D play no part. A continuous system is discretised exactly for inputs
+    that are held over a step.
+
+    Args:
+        system: with A, B and dt: 0 or None for a continuous one, True for a discrete one of any time step.
+        dt: seconds in a step of the tasks.
+
+    Raises:
+        InputError: it is no such system, or a discrete one with another time step.
+    """
+    if not all(hasattr(system, name) for name in ("A", "B")):
+        raise InputError(f"a state-space model must have A and B, got {system!r}.")
+    if not isinstance(dt, int | float | np.number) or isinstance(dt, bool) or not (np.isfinite(dt) and dt > 0):
+        raise InputError(f"dt must be a positive number of seconds, got {dt!r}.")
+    A, B = as_finite("A", system.A), as_finite("B", system.B)
+    if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
+        raise ShapeError(f"a state-space model needs A (n, n) and B (n, m), got {A.shape} and {B.shape}.")
+    own = getattr(system, "dt", None)
+    if own is True:
+        return Linear(A, B)
+    if not own:
+        return Linear(*_held(A, B, dt))
+    if not np.isclose(own, dt, rtol=1e-9, atol=0):
+        raise InputError(f"dt must be that of the discrete system, {own:g} s, got {dt:g} s.")
+    return Linear(A, B)
+
+
+def _held(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
+    """Discretise ``dx/dt = A x + B u`` for an input held over dt: the exponential of [[A, B], [0, 0]] dt."""
+    from scipy.linalg import expm
+
+    n, m = B.shape
+    whole = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
+    return whole[:n, :n], whole[:n, n:]

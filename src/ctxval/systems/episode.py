@@ -1,0 +1,88 @@
+"""One closed loop on a system that keeps its own state and is stepped from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ctxval.arrays import Array
+from ctxval.controller import Controller
+from ctxval.errors import InputError, ShapeError
+from ctxval.task import Task
+from ctxval.trajectory import COMPLETE, Trajectory
+
+SAME_STATE = 1e-6
+"""By how much a system may miss the task's initial state, relative to the larger of 1 and that state."""
+
+Advance = Callable[[Array], tuple[Array, str]]
+"""``u -> (x_next, reason)``: one control step; the reason is empty where the episode goes on."""
+
+
+def run_episode(advance: Advance, controller: Controller, task: Task, inputs: int) -> Trajectory:
+    """Run a controller over the task's horizon, or until a step gives a reason why the episode has ended.
+
+    What comes after that step is NaN, and the trajectory's ``ended`` is the reason. An episode that ends with the last
+    step of the horizon is whole.
+
+    Args:
+        advance: takes ``(m,)`` and returns the next state ``(n,)`` and a reason.
+        controller, task: of one task, not a batch.
+        inputs: m.
+
+    Raises:
+        ShapeError: the controller returns another number of inputs.
+    """
+    x = np.array(task.initial_state)
+    states, applied = np.full((task.horizon + 1, len(x)), np.nan), np.full((task.horizon, inputs), np.nan)
+    states[0] = x
+    for t in range(task.horizon):
+        u = np.asarray(controller(t, x), dtype=np.float64)
+        if u.shape != (inputs,):
+            raise ShapeError(
+                f"the controller must return the system's {inputs} inputs, shape ({inputs},), got {u.shape}."
+            )
+        applied[t] = u
+        x, reason = advance(u) if np.isfinite(u).all() else (np.full_like(x, np.nan), "an input is not finite")
+        states[t + 1] = x
+        if not np.isfinite(x).all():
+            reason = reason or "the state is not finite"
+        elif t + 1 == task.horizon:
+            reason = ""
+        if reason:
+            return Trajectory(task.times, states, applied, f"{reason} at step {t + 1}")
+    return Trajectory(task.times, states, applied, COMPLETE)
+
+
+def require_one(task: Task) -> None:
+    """Check that a task is one, not a batch.
+
+    Raises:
+        ShapeError: it is a batch.
+    """
+    if task.batch_shape:
+        raise ShapeError(f"this system executes one task at a time, got a batch of shape {task.batch_shape}.")
+
+
+def require_time_step(task: Task, dt: float, what: str) -> None:
+    """Check that a task has the system's time step.
+
+    Raises:
+        InputError: it has another; the message says what the system's is.
+    """
+    if not np.isclose(task.dt, dt, rtol=1e-9, atol=0):
+        raise InputError(f"the task's dt must be {what}, {dt:g} s, got {task.dt:g} s.")
+
+
+def require_started(task: Task, state: Array) -> None:
+    """Check that a system stands in the task's initial state.
+
+    Raises:
+        ShapeError: it has another number of states.
+        InputError: it stands elsewhere.
+    """
+    wanted = task.initial_state
+    if state.shape != wanted.shape:
+        raise ShapeError(f"the task must have the system's {state.size} states, got {wanted.size}.")
+    if not (np.abs(state - wanted) <= SAME_STATE * np.maximum(1.0, np.abs(wanted))).all():
+        raise InputError(f"the system was set to the initial state {wanted.tolist()}, but stands at {state.tolist()}.")

@@ -1,0 +1,51 @@
+"""A function that runs a whole execution, as the true system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ctxval.arrays import as_floats
+from ctxval.controller import Controller
+from ctxval.errors import ExecutionError, InputError
+from ctxval.task import Task
+from ctxval.trajectory import Trajectory
+
+
+class Function:
+    """A plain function ``(controller, task) -> trajectory`` as the true system: a robot's own driver, a simulator.
+
+    A function of one step, ``(x, u) -> x_next``, is a :class:`Simulated` system instead.
+
+    Args:
+        execute: runs the closed loop. It returns a trajectory, or the states ``(H + 1, n)`` and the inputs
+            ``(H, m)``. What it raises is the reason of a failed execution.
+        batched: whether it takes a batch of tasks, and returns ``(..., H + 1, n)`` and ``(..., H, m)``.
+
+    Raises:
+        InputError: it is no function.
+    """
+
+    def __init__(self, execute: Callable[[Controller, Task], Any], *, batched: bool = False) -> None:
+        if not callable(execute):
+            raise InputError(f"a system must be a function (controller, task) -> trajectory, got {execute!r}.")
+        self.function = execute
+        self.batched = batched
+
+    def execute(self, controller: Controller, task: Task) -> Trajectory:
+        """Run one task, or a batch.
+
+        Raises:
+            ExecutionError: what the function returned is no trajectory of this task.
+        """
+        returned = self.function(controller, task)
+        if isinstance(returned, Trajectory):
+            return returned
+        try:
+            states, inputs = (as_floats(name, part) for name, part in zip(("states", "inputs"), returned, strict=True))
+            return Trajectory(task.times, states, inputs)
+        except (InputError, TypeError, ValueError) as error:
+            raise ExecutionError(
+                f"the system's function must return a Trajectory, or states (H + 1, n) and inputs (H, m) with "
+                f"H = {task.horizon}: {error}"
+            ) from error

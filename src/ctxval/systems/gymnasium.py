@@ -1,0 +1,190 @@
+"""A gymnasium environment as the true system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ctxval.arrays import Array, as_floats
+from ctxval.controller import Controller
+from ctxval.errors import InputError, ShapeError
+from ctxval.systems.episode import require_one, require_started, require_time_step, run_episode
+from ctxval.task import Task
+from ctxval.trajectory import Trajectory
+
+StateGetter = Callable[[Any], Any]
+StateSetter = Callable[[Any, Array], None]
+
+
+class Gymnasium:
+    """A gymnasium environment with continuous actions as the true system.
+
+    An execution resets the environment with its seed, sets the task's initial state and steps the closed loop. MuJoCo
+    environments work as they are: their state is ``(qpos, qvel)``. Others need ``get_state`` and ``set_state``.
+
+    Actions go to the environment as the controller gave them, in the type of its action space: it is the environment
+    that clips them, as MuJoCo does to the control range. The trajectory keeps what the controller asked for.
+
+    A terminated or truncated episode ends the trajectory: the rest is NaN and ``ended`` says why, so that a campaign
+    records a failed trial. A simulation that MuJoCo warns of (an unstable state) has ended too, although MuJoCo resets
+    it silently.
+
+    Args:
+        environment: an id such as ``"Reacher-v5"``, or a function that makes an environment.
+        get_state: ``environment -> x``, of the environment without its wrappers; ``(qpos, qvel)`` by default.
+        set_state: ``(environment, x)``, likewise; by default the first of x go to MuJoCo's ``set_state``.
+        dt: seconds in one step; by default what the environment says.
+        seed: of every reset, so that executions repeat; None for another one each time.
+        ignore_termination: go on although the environment says that the episode has ended.
+        options: passed on to ``gymnasium.make`` or to the function, such as ``max_episode_steps=-1``.
+
+    Raises:
+        InputError: gymnasium is not installed, or the environment cannot be made or used.
+    """
+
+    def __init__(
+        self,
+        environment: str | Callable[..., Any],
+        *,
+        get_state: StateGetter | None = None,
+        set_state: StateSetter | None = None,
+        dt: float | None = None,
+        seed: int | None = 0,
+        ignore_termination: bool = False,
+        **options: Any,
+    ) -> None:
+        self.environment = environment
+        self.options = options
+        self.get_state, self.set_state = get_state, set_state
+        self.seed = seed
+        self.ignore_termination = ignore_termination
+        first = self._made()
+        self._idle = [first]  # each execution takes one, so that threads do not share any
+        self.inputs = _action_size(first)
+        self.dt = _time_step(first, dt)
+        if (get_state is None or set_state is None) and not _is_mujoco(first.unwrapped):
+            raise InputError(
+                f"{first.unwrapped} has no MuJoCo state: give get_state=(environment -> x) and "
+                "set_state=(environment, x)."
+            )
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this system in a store."""
+        fields = ("environment", "options", "get_state", "set_state", "seed", "ignore_termination", "dt")
+        return {name: getattr(self, name) for name in fields}
+
+    def state(self) -> Array:
+        """Return the state ``(n,)`` after a reset: how many states there are, and in which order of magnitude."""
+        environment = self._idle.pop() if self._idle else self._made()
+        environment.reset(seed=self.seed)
+        state = self._read(environment.unwrapped)
+        self._idle.append(environment)
+        return state
+
+    def execute(self, controller: Controller, task: Task) -> Trajectory:
+        """Run the closed loop from the task's initial state over its horizon.
+
+        Raises:
+            InputError: the task's dt is not the environment's, or its initial state cannot be set.
+            ShapeError: states or inputs are not as many as the environment's.
+        """
+        require_one(task)
+        require_time_step(task, self.dt, "that of the environment")
+        environment = self._idle.pop() if self._idle else self._made()
+        try:
+            self._start(environment, task)
+            trajectory = run_episode(lambda u: self._advance(environment, u), controller, task, self.inputs)
+        except BaseException:
+            environment.close()  # nobody knows what state it is in
+            raise
+        self._idle.append(environment)
+        return trajectory
+
+    def close(self) -> None:
+        """Close the environments; the next execution makes a new one."""
+        while self._idle:
+            self._idle.pop().close()
+
+    def _made(self) -> Any:
+        try:
+            import gymnasium
+        except ImportError as error:
+            raise InputError('gymnasium is not installed: pip install "ctxval[mujoco]".') from error
+        if not isinstance(self.environment, str):
+            return self.environment(**self.options)
+        try:
+            # The passive checker warns of actions beyond the action space, which the environment is asked to clip.
+            return gymnasium.make(self.environment, **{"disable_env_checker": True, **self.options})
+        except (gymnasium.error.Error, ImportError, TypeError, AttributeError) as error:
+            raise InputError(f"the environment {self.environment!r} cannot be made: {error}") from error
+
+    def _start(self, environment: Any, task: Task) -> None:
+        environment.reset(seed=self.seed)
+        bare = environment.unwrapped
+        x = np.array(task.initial_state)
+        if self.set_state is not None:
+            self.set_state(bare, x)
+        else:
+            _set_mujoco_state(bare, x)
+        require_started(task, self._read(bare))
+
+    def _read(self, bare: Any) -> Array:
+        if self.get_state is None:
+            return np.concatenate([bare.data.qpos, bare.data.qvel])
+        # A copy: an environment may hand out the array that it goes on writing into.
+        return np.array(as_floats("the state of the environment", self.get_state(bare)))
+
+    def _advance(self, environment: Any, u: Array) -> tuple[Array, str]:
+        space = environment.action_space
+        _, _, terminated, truncated, _ = environment.step(u.astype(space.dtype).reshape(space.shape))
+        state = self._read(environment.unwrapped)
+        warning = _mujoco_warning(environment.unwrapped)
+        if warning:
+            return np.full_like(state, np.nan), f"MuJoCo warned of {warning}"
+        if self.ignore_termination or not (terminated or truncated):
+            return state, ""
+        return state, f"the environment {'terminated' if terminated else 'truncated'} the episode"
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Environments do not go to other processes; they are made there again.
+        return {**vars(self), "_idle": []}
+
+
+def _is_mujoco(bare: Any) -> bool:
+    return all(hasattr(bare, name) for name in ("set_state", "data", "model")) and hasattr(bare.data, "qpos")
+
+
+def _set_mujoco_state(bare: Any, x: Array) -> None:
+    nq, nv = len(bare.data.qpos), len(bare.data.qvel)
+    if len(x) < nq + nv:
+        raise ShapeError(f"the task must have at least {nq + nv} states, {nq} qpos and {nv} qvel, got {len(x)}.")
+    bare.set_state(x[:nq], x[nq : nq + nv])
+
+
+def _action_size(environment: Any) -> int:
+    space = environment.action_space
+    if not np.issubdtype(space.dtype or object, np.floating) or not space.shape:
+        raise InputError(f"the environment must have continuous actions, a Box, got {space}.")
+    return int(np.prod(space.shape))
+
+
+def _time_step(environment: Any, given: float | None) -> float:
+    own = getattr(environment.unwrapped, "dt", None)
+    dt = own if given is None else given
+    if not isinstance(dt, int | float | np.number) or not (np.isfinite(dt) and dt > 0):
+        raise InputError(f"dt must be the positive number of seconds in one step of the environment, got {dt!r}.")
+    if given is not None and own is not None and not np.isclose(own, given, rtol=1e-9, atol=0):
+        raise InputError(f"dt must be that of the environment, {own:g} s, got {given:g} s.")
+    return float(dt)
+
+
+def _mujoco_warning(bare: Any) -> str:
+    """Return the first kind of warning since the reset; empty without one, and for what is not MuJoCo."""
+    counts = getattr(getattr(getattr(bare, "data", None), "warning", None), "number", None)
+    if counts is None or not np.any(counts):
+        return ""
+    from mujoco import mjtWarning
+
+    return str(mjtWarning(int(np.argmax(np.asarray(counts) > 0))).name).removeprefix("mjWARN_")

@@ -1,0 +1,48 @@
+"""A system that people execute."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NoReturn
+
+import numpy as np
+
+from ctxval.controller import Controller
+from ctxval.errors import ExecutionError, InputError
+from ctxval.task import Task
+
+
+class Manual:
+    """A system that only people can execute: take tasks with ``campaign.ask()``, report with ``campaign.tell()``.
+
+    Attributes:
+        states, inputs: names of the components and their units, for files.
+        dt: seconds in a step.
+
+    Raises:
+        InputError: there is no state, a name or a unit is no text, or dt is not positive.
+    """
+
+    manual = True
+    """Nothing can be executed from here."""
+
+    def __init__(self, *, states: Mapping[str, str], inputs: Mapping[str, str], dt: float) -> None:
+        self.states, self.inputs = dict(states), dict(inputs)
+        if not self.states or not all(
+            isinstance(t, str) for d in (self.states, self.inputs) for t in (*d, *d.values())
+        ):
+            raise InputError(f"states and inputs must be names with units, got {self.states} and {self.inputs}.")
+        if not isinstance(dt, int | float | np.number) or isinstance(dt, bool) or not (np.isfinite(dt) and dt > 0):
+            raise InputError(f"dt must be a positive number of seconds, got {dt!r}.")
+        self.dt = float(dt)
+
+    def execute(self, controller: Controller, task: Task) -> NoReturn:
+        """Refuse.
+
+        Raises:
+            ExecutionError: always.
+        """
+        raise ExecutionError(
+            "a manual system is executed by people: take tasks with campaign.ask() and report what happened with "
+            "campaign.tell(), instead of campaign.run()."
+        )

@@ -1,0 +1,172 @@
+"""A command as the true system: a rig's own program, a simulator, any language."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ctxval.controller import Controller
+from ctxval.errors import CtxvalError, ExecutionError, InputError
+from ctxval.exchange import write_controller, write_task
+from ctxval.systems.episode import require_one
+from ctxval.task import Task
+from ctxval.trajectory import COMPLETE, Trajectory
+
+_TIMES = 0.01
+"""By how much the times of a trajectory may miss the task's, in steps."""
+
+_TAIL = 4096
+"""Bytes at the end of stderr in which its last line is looked for."""
+
+
+class Subprocess:
+    """A command that executes one task as the true system.
+
+    Every execution has a fresh folder, with ``task.json`` and the controller as ``controller.json`` and
+    ``controller.npz`` (see :mod:`ctxval.exchange`). The command is run with that folder as its last argument, and
+    writes ``trajectory.npz`` (times, states, inputs, perhaps ended) or ``trajectory.csv`` (columns ``t, x0, ..., u0,
+    ...``, no inputs in the last row) into it. An exit status other than 0 is a failed execution, whose reason is the
+    last line of stderr. Whatever the command started is ended with it.
+
+    Args:
+        command: the program and its arguments; a string is split as a shell would. No shell runs it.
+        timeout: seconds after which the command and all that it started are killed.
+        states, inputs: names and units for the files.
+        keep: a folder in which the folders of all executions stay, for a look at what went wrong.
+
+    Raises:
+        InputError: the program does not exist, or the timeout is not positive.
+    """
+
+    def __init__(
+        self,
+        command: str | Sequence[str],
+        *,
+        timeout: float,
+        states: Mapping[str, str] | None = None,
+        inputs: Mapping[str, str] | None = None,
+        keep: str | Path | None = None,
+    ) -> None:
+        self.command = shlex.split(command) if isinstance(command, str) else [str(part) for part in command]
+        if not self.command or shutil.which(self.command[0]) is None:
+            raise InputError(f"the command must begin with a program that can be run, got {self.command}.")
+        if not (isinstance(timeout, int | float) and timeout > 0):
+            raise InputError(f"timeout must be a positive number of seconds, got {timeout!r}.")
+        self.timeout = timeout
+        self.states = None if states is None else dict(states)
+        self.inputs = None if inputs is None else dict(inputs)
+        self.keep = None if keep is None else Path(keep)
+
+    def describe(self) -> dict[str, object]:
+        """Return what identifies this system in a store."""
+        return {"command": self.command, "states": self.states, "inputs": self.inputs}
+
+    def execute(self, controller: Controller, task: Task) -> Trajectory:
+        """Run the command on one task.
+
+        Raises:
+            InputError: the controller cannot be written to a file.
+            ExecutionError: the command fails, takes too long, or leaves no trajectory of this task.
+        """
+        require_one(task)
+        with self._folder() as folder:
+            write_task(folder / "task.json", task, states=self.states)
+            for kind in ("json", "npz"):
+                path = folder / f"controller.{kind}"
+                write_controller(path, controller, dt=task.dt, states=self.states, inputs=self.inputs)
+            _run([*self.command, str(folder)], folder, self.timeout)
+            return _of_task(_trajectory(folder), task)
+
+    @contextlib.contextmanager
+    def _folder(self) -> Iterator[Path]:
+        if self.keep is not None:
+            self.keep.mkdir(parents=True, exist_ok=True)
+            yield Path(tempfile.mkdtemp(prefix="execution-", dir=self.keep)).resolve()
+            return
+        with tempfile.TemporaryDirectory(prefix="ctxval-", ignore_cleanup_errors=True) as name:
+            yield Path(name).resolve()
+
+
+def _run(command: Sequence[str], folder: Path, timeout: float) -> None:
+    # Output goes to files: a pipe that a grandchild keeps open would make us wait for it.
+    with (folder / "stdout.txt").open("wb") as stdout, (folder / "stderr.txt").open("wb") as stderr:
+        try:
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr, start_new_session=True
+            )
+        except OSError as error:
+            raise ExecutionError(f"the command cannot be started: {error}") from error
+        try:
+            status = process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            raise ExecutionError(f"the command did not end within {timeout:g} s and was killed") from None
+        finally:
+            _kill_group(process)
+    if status:
+        how = f"was ended by {_signal_name(-status)}" if status < 0 else f"ended with status {status}"
+        raise ExecutionError(f"the command {how}: {_last_line(folder / 'stderr.txt') or 'nothing on stderr'}")
+
+
+def _kill_group(process: subprocess.Popen[bytes]) -> None:
+    """Kill the command and its descendants, also those that outlived it."""
+    if hasattr(os, "killpg"):
+        # The command leads its own group; there is none left where nothing of it runs any more.
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    else:
+        process.kill()
+    process.wait()
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _last_line(path: Path) -> str:
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _TAIL))
+        lines = [line.strip() for line in file.read().decode("utf-8", "replace").splitlines() if line.strip()]
+    return lines[-1][:300] if lines else ""
+
+
+def _trajectory(folder: Path) -> Trajectory:
+    try:
+        if (folder / "trajectory.npz").exists():
+            return Trajectory.from_npz((folder / "trajectory.npz").read_bytes())
+        if (folder / "trajectory.csv").exists():
+            return Trajectory.from_csv(folder / "trajectory.csv")
+    except (CtxvalError, OSError, MemoryError) as error:
+        raise ExecutionError(f"the command's trajectory cannot be used: {error}") from error
+    raise ExecutionError("the command ended well but wrote neither trajectory.npz nor trajectory.csv")
+
+
+def _of_task(trajectory: Trajectory, task: Task) -> Trajectory:
+    """Return the trajectory if it is one of this task."""
+    if trajectory.ended != COMPLETE:
+        return trajectory
+    n = task.initial_state.size
+    if trajectory.states.shape != (task.horizon + 1, n):
+        raise ExecutionError(
+            f"the command's trajectory must have states of shape ({task.horizon + 1}, {n}), "
+            f"got {trajectory.states.shape}"
+        )
+    misses = np.abs(trajectory.times - trajectory.times[0] - task.times)
+    if not (misses <= _TIMES * task.dt).all():
+        worst = int(np.argmax(np.where(np.isnan(misses), np.inf, misses)))
+        raise ExecutionError(
+            f"the command's trajectory must have steps of {task.dt:g} s: time {worst} must be {task.times[worst]:g} s "
+            f"after the first, got {trajectory.times[worst] - trajectory.times[0]:g} s"
+        )
+    return trajectory

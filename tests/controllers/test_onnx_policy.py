@@ -1,0 +1,84 @@
+"""A trained policy as an ONNX file, built here with onnx itself."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ctxval import Task, testing
+from ctxval.arrays import Array
+from ctxval.controllers import OnnxPolicy
+from ctxval.describe import describe, first_difference
+from ctxval.errors import InputError, ShapeError
+from ctxval.models import Linear
+from ctxval.rollout import rollout
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+from onnx import TensorProto, helper, numpy_helper  # noqa: E402
+
+CART = Linear([[1.0, 0.1], [0.0, 0.95]], [[0.0], [0.1]])
+TASKS = Task([np.linspace(-1, 1, 4), 0.0], goal=[0.3, 0.0], horizon=12, dt=0.1)
+GAIN = np.array([[-1.0], [-1.5]], dtype=np.float32)
+
+
+def policy(rows: object = "N", inputs: int = 1) -> bytes:
+    """Return ``tanh(x GAIN)`` as ONNX."""
+    names = ["x", "y"][:inputs]
+    nodes = [helper.make_node("MatMul", ["x", "K"], ["a"]), helper.make_node("Tanh", ["a"], ["u"])]
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, [rows, 2]) for name in names],
+        [helper.make_tensor_value_info("u", TensorProto.FLOAT, [rows, 1])],
+        [numpy_helper.from_array(GAIN, "K")],
+    )
+    content: bytes = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8
+    ).SerializeToString()
+    return content
+
+
+def deviation(t: int, x: Array, task: Task) -> Array:
+    return x - task.goal
+
+
+@pytest.mark.parametrize("rows", ["N", 1])
+def test_inputs_are_what_the_network_says(rows: object) -> None:
+    controller = OnnxPolicy(policy(rows), observe=deviation, scale=2.0).design(TASKS, CART)
+    x = np.random.default_rng(0).normal(size=(4, 2))
+    np.testing.assert_allclose(controller(0, x), 2 * np.tanh((x - TASKS.goal) @ GAIN), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("rows", ["N", 1])
+def test_it_keeps_the_contract_of_a_synthesizer(rows: object) -> None:
+    testing.check_synthesizer(OnnxPolicy(policy(rows), observe=deviation), TASKS, Linear(CART.A, np.float64(CART.B)))
+
+
+def test_states_are_observed_unless_said_otherwise_and_limits_clip(tmp_path: Path) -> None:
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(policy())
+    controller = OnnxPolicy(path, scale=5.0, limits=1.0).design(TASKS[0], CART)
+    np.testing.assert_array_equal(controller(0, np.array([9.0, 0.0])), [-1.0])
+    assert rollout(CART.step, controller, TASKS[0]).inputs.shape == (12, 1)
+
+
+def test_it_can_be_described_and_sent_to_another_process() -> None:
+    synthesizer = OnnxPolicy(policy(), observe=deviation, limits=1.0)
+    other = pickle.loads(pickle.dumps(synthesizer.design(TASKS, CART)))
+    x = TASKS.initial_state
+    np.testing.assert_array_equal(other(0, x), synthesizer.design(TASKS, CART)(0, x))
+    assert (
+        first_difference(describe(synthesizer), describe(OnnxPolicy(policy(), observe=deviation, limits=1.0))) is None
+    )
+    assert first_difference(describe(synthesizer), describe(OnnxPolicy(policy(), observe=deviation))) is not None
+
+
+def test_other_networks_and_observations_are_refused() -> None:
+    with pytest.raises(InputError, match="must have one input, the observations; the network has x, y"):
+        OnnxPolicy(policy(inputs=2))
+    with pytest.raises(ShapeError, match="input 'x' takes 2 numbers, got 3"):
+        OnnxPolicy(policy()).design(Task(np.zeros(3), horizon=2, dt=0.1), CART)(0, np.zeros(3))

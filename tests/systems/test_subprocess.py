@@ -1,0 +1,244 @@
+"""The adapter of commands, with real processes in several languages."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, searches, systems, testing
+from ctxval.arrays import Array
+from ctxval.controller import AffineFeedback
+from ctxval.errors import ExecutionError, InputError
+from ctxval.systems import Subprocess
+from ctxval.systems import subprocess as adapter
+
+MODEL = models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.05]])
+TASK = Task([1.0, -0.5], goal=[0.2, 0.0], horizon=20, dt=0.1)
+
+# A rig's program, with nothing of ctxval in it.
+RIG = """
+import csv, json, sys
+from pathlib import Path
+
+folder = Path(sys.argv[-1])
+task, controller = (json.loads((folder / f"{name}.json").read_text()) for name in ("task", "controller"))
+x, rows = task["initial_state"], []
+for t in range(task["horizon"] + 1):
+    row = [t * task["dt"], *x]
+    if t < task["horizon"]:
+        K, v, x_0 = (controller[name][t] for name in ("gains", "inputs", "states"))
+        u = v[0] + sum(k * (a - b) for k, a, b in zip(K[0], x, x_0))
+        x = [x[0] + 0.1 * x[1], x[1] + 0.1 * (u - 0.1 * x[1] * abs(x[1])) / 2]
+        row.append(u)
+    rows.append(row)
+with open(folder / "trajectory.csv", "w", newline="") as file:
+    csv.writer(file).writerows([["t", "x0", "x1", "u0"], *rows])
+"""
+
+
+def cart(x: Array, u: Array) -> Array:
+    position, speed = x[..., 0], x[..., 1]
+    pull = u[..., 0] - 0.1 * speed * np.abs(speed)
+    return np.stack([position + 0.1 * speed, speed + 0.1 * pull / 2], axis=-1)
+
+
+def designed() -> AffineFeedback:
+    return controllers.LQR([10.0, 1.0], [0.1]).design(TASK, MODEL)
+
+
+def python(folder: Path, code: str, *arguments: str, **options: Any) -> Subprocess:
+    script = folder / "rig.py"
+    script.write_text(code)
+    # -S -E: as fast to start as Python can be.
+    return Subprocess([sys.executable, "-S", "-E", str(script), *arguments], **{"timeout": 30, **options})
+
+
+def test_a_program_that_knows_nothing_of_ctxval_executes_a_task(tmp_path: Path) -> None:
+    trajectory = python(tmp_path, RIG).execute(designed(), TASK)
+    expected = systems.Simulated(cart, vectorized=True).execute(designed(), TASK)
+    np.testing.assert_allclose(trajectory.states, expected.states, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(trajectory.inputs, expected.inputs, rtol=0, atol=1e-12)
+
+
+def test_it_keeps_the_contract_of_a_system(tmp_path: Path) -> None:
+    testing.check_system(python(tmp_path, RIG), designed(), TASK, tolerance=0)
+
+
+@pytest.mark.skipif(shutil.which("awk") is None, reason="no awk")
+def test_any_language_will_do(tmp_path: Path) -> None:
+    script = tmp_path / "rig.sh"
+    script.write_text(
+        "for folder; do :; done\n"
+        """awk 'BEGIN { print "t,x0,x1,u0"; for (t = 0; t < 20; t++) print t / 10 ",1,-0.5,0"; print "2,1,-0.5," }' """
+        '> "$folder/trajectory.csv"\n'
+    )
+    assert (Subprocess(f"sh '{script}'", timeout=30).execute(designed(), TASK).states == [1, -0.5]).all()
+
+
+def test_a_trajectory_may_come_as_npz_and_say_how_it_ended(tmp_path: Path) -> None:
+    code = f"""
+import sys
+sys.path[:0] = {sys.path!r}
+import numpy as np
+states = np.zeros((21, 2))
+states[5:] = np.nan
+np.savez(sys.argv[-1] + "/trajectory.npz", times=np.arange(21) / 10, states=states, inputs=np.zeros((20, 1)),
+         ended="the motor cut out")
+"""
+    assert python(tmp_path, code).execute(designed(), TASK).ended == "the motor cut out"
+
+
+def test_names_and_units_go_into_the_files_and_folders_can_be_kept(tmp_path: Path) -> None:
+    keep = tmp_path / "kept"
+    names: dict[str, Any] = {"states": {"position": "m", "speed": "m/s"}, "inputs": {"force": "N"}}
+    system = python(tmp_path, RIG + "print('done')", keep=keep, **names)
+    for _ in range(2):
+        system.execute(designed(), TASK)
+    folders = list(keep.iterdir())
+    assert len(folders) == 2
+    assert {path.name for path in folders[0].iterdir()} == {
+        *("task.json", "controller.json", "controller.npz", "trajectory.csv", "stdout.txt", "stderr.txt")
+    }
+    assert '"input_units": ["N"]' in (folders[0] / "controller.json").read_text()
+    assert (folders[0] / "stdout.txt").read_text() == "done\n"
+
+
+# Failures
+
+
+@pytest.mark.parametrize(
+    ("code", "sentence"),
+    [
+        ("import sys; print('warming up', file=sys.stderr); sys.exit('the brake is on')", "status 1: the brake is on$"),
+        ("raise RuntimeError('no power')", "ended with status 1: RuntimeError: no power$"),
+        ("import sys; sys.exit(7)", "ended with status 7: nothing on stderr$"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "ended by SIGKILL: nothing on stderr"),
+        ("pass", r"wrote neither trajectory\.npz nor trajectory\.csv"),
+        ("import sys; open(sys.argv[-1] + '/trajectory.npz', 'w').write('junk')", "cannot be used: these bytes"),
+        ("import sys; open(sys.argv[-1] + '/trajectory.csv', 'w').write('a,b\\n1,2\\n3,4\\n')", "columns t, x0"),
+        (RIG.replace('task["horizon"]', "5"), r"states of shape \(21, 2\), got \(6, 2\)"),
+        (RIG.replace('t * task["dt"]', "t * 0.2"), r"steps of 0\.1 s: time 20 must be 2 s after the first, got 4 s"),
+    ],
+)
+def test_a_failed_execution_says_why(code: str, sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(ExecutionError, match=sentence):
+        python(tmp_path, code).execute(designed(), TASK)
+
+
+@pytest.mark.parametrize("kind", ["npz", "csv"])
+def test_no_damage_of_a_trajectory_gives_anything_but_a_failed_execution(kind: str, tmp_path: Path) -> None:
+    trajectory = systems.Simulated(cart, vectorized=True).execute(designed(), TASK)
+    path, rng = tmp_path / f"trajectory.{kind}", np.random.default_rng(0)
+    trajectory.to_csv(path) if kind == "csv" else path.write_bytes(trajectory.to_npz())
+    whole = path.read_bytes()
+    for _ in range(150):
+        broken = bytearray(whole)
+        for position in rng.integers(len(whole), size=3):
+            broken[position] = rng.integers(256)
+        path.write_bytes(bytes(broken[: rng.integers(1, len(whole) + 1)] if rng.random() < 0.3 else broken))
+        with contextlib.suppress(ExecutionError):
+            adapter._of_task(adapter._trajectory(tmp_path), TASK)
+
+
+def test_executions_run_side_by_side(tmp_path: Path) -> None:
+    system = python(tmp_path, RIG)
+    alone = system.execute(designed(), TASK).states
+    with concurrent.futures.ThreadPoolExecutor(3) as pool:
+        for trajectory in pool.map(lambda _: system.execute(designed(), TASK), range(6)):
+            np.testing.assert_array_equal(trajectory.states, alone)
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # A zombie that nobody has collected yet does not count.
+    status = Path(f"/proc/{pid}/stat")
+    return not (status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z")
+
+
+def gone(pid: int) -> bool:
+    deadline = time.monotonic() + 5
+    while alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return not alive(pid)
+
+
+SPAWN = """
+import pathlib, subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(60)"])
+(pathlib.Path(sys.argv[1]) / "pid").write_text(str(child.pid))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
+@pytest.mark.parametrize(
+    ("end", "sentence"), [("time.sleep(60)", "did not end within 1 s and was killed"), ("sys.exit(3)", "status 3")]
+)
+def test_whatever_the_command_started_ends_with_it(end: str, sentence: str, tmp_path: Path) -> None:
+    started = time.monotonic()
+    with pytest.raises(ExecutionError, match=sentence):
+        python(tmp_path, SPAWN + end, str(tmp_path), timeout=1).execute(designed(), TASK)
+    assert time.monotonic() - started < 20
+    assert gone(int((tmp_path / "pid").read_text()))
+
+
+def test_the_group_is_killed_when_we_are_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pids = []
+
+    def interrupted(self: Any, timeout: Any = None) -> int:
+        if timeout is not None:
+            pids.append(self.pid)
+            raise KeyboardInterrupt
+        return original(self)
+
+    original = subprocess.Popen.wait
+    monkeypatch.setattr(subprocess.Popen, "wait", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        python(tmp_path, "import time; time.sleep(60)").execute(designed(), TASK)
+    assert gone(pids[0])
+
+
+def test_a_controller_that_cannot_leave_the_process_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="only affine feedback"):
+        python(tmp_path, RIG).execute(lambda t, x: x[:1], TASK)
+
+
+@pytest.mark.parametrize("command", ["", [], "no-such-program --fast"])
+def test_programs_must_exist(command: Any) -> None:
+    with pytest.raises(InputError, match="a program that can be run"):
+        Subprocess(command, timeout=1)
+
+
+@pytest.mark.parametrize("timeout", [0, -1, None, float("nan")])
+def test_timeouts_must_be_positive(timeout: Any) -> None:
+    with pytest.raises(InputError, match="timeout must be a positive number of seconds"):
+        Subprocess(["sh"], timeout=timeout)
+
+
+def test_a_campaign_on_a_command_records_its_failures(tmp_path: Path) -> None:
+    code = RIG.replace(
+        "x, rows = task", "sys.exit('over the edge') if task['reference'][-1][0] > 1 else 0; x, rows = task"
+    )
+    validation = Validation(
+        space=TaskSpace(goal=(0.5, 1.5, "m")),
+        task=lambda p: Task([0.0, 0.0], goal=[p.goal, 0.0], horizon=20, dt=0.1),
+        system=python(tmp_path, code),
+        model=MODEL,
+        synthesizer=controllers.LQR([10.0, 1.0], [0.1]),
+        distance=distances.FinalState(),
+    )
+    campaign = Campaign(validation, search=searches.Random()).run(6)
+    assert 0 < len(campaign.failed) < 6
+    assert all(str(trial.failure).endswith("over the edge") for trial in campaign.failed)

@@ -1,0 +1,64 @@
+"""Every how-to page does what it says: its blocks run one after the other, in a fresh folder."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PAGES = sorted((Path(__file__).parents[1] / "docs" / "how-to").glob("*.md"))
+NEEDS = {"gymnasium": ["gymnasium", "mujoco"], "mujoco": ["mujoco"], "fmu": ["fmpy", "pythonfmu"], "mpc": ["casadi"]}
+NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-space": ["control"]}
+PROGRAMS = {"python": [], "ctxval": ["-c", "from ctxval.cli import main; main()"]}
+
+
+def blocks(page: Path) -> list[tuple[str, str]]:
+    """Return the languages and contents of a page's blocks."""
+    return re.findall(r"^```(\w+)\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+
+
+def run_console(lines: str) -> None:
+    for line in lines.splitlines():
+        program, *arguments = shlex.split(line.removeprefix("$ "), comments=True)
+        command = [sys.executable, *PROGRAMS[program], *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "100"})
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in NEEDS.get(page.stem, []):
+        pytest.importorskip(module)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": "page"}
+    for language, content in blocks(page):
+        first, _, rest = content.partition("\n")
+        if first.startswith("# file: "):
+            Path(first.removeprefix("# file: ")).write_text(rest)
+        elif language == "console":
+            run_console(content)
+        else:
+            assert language == "python", f"{page.name} has a block that nobody runs: {language}"
+            exec(compile(content, page.name, "exec"), names)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+        assert (page.parent / target).exists(), target
+
+
+def test_every_adapter_has_a_page() -> None:
+    from ctxval import controllers, models, systems
+
+    text = "".join(page.read_text() for page in PAGES)
+    own = {"MuJoCo", "Gymnasium", "FMU", "Function", "Subprocess", "Manual", "ScikitLearn", "Onnx", "state_space"}
+    own |= {"MPC", "StationaryLQR", "LQR", "ILQR", "OnnxPolicy", "Policy", "write_controller", "read_controller"}
+    for name in own:
+        assert any(hasattr(room, name) for room in (controllers, models, systems)), name
+        assert f".{name}" in text or f"`{name}" in text, name
