@@ -1,9 +1,10 @@
 """What the data say of a Gaussian process's hyperparameters: draws from their posterior instead of one best guess.
 
-The process is ``f = mu + sigma g``, g with unit variance and a Matern kernel with one length-scale for each dimension.
+The process is ``f = mu + sigma g``, g with unit variance and a Matern kernel with one length-scale for each dimension,
+or, for values that cannot be negative, the logarithm of the values is.
 The prior is flat in mu and in log sigma, so that both integrate out in closed form (O'Hagan 1978; Rasmussen and
-Williams 2006, Sec. 2.7) and whatever is said does not depend on the units of f. What is left, the smoothness, the
-length-scales and the noise, is drawn by slice sampling (Neal 2003), which has no step size to tune.
+Williams 2006, Sec. 2.7) and whatever is said does not depend on the units of f. What is left, the scale of the values, the
+smoothness, the length-scales and the noise, is drawn by slice sampling (Neal 2003), which has no step size to tune.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
-from ctxval.arrays import Array
+from ctxval.arrays import Array, ArrayLike
 from ctxval.errors import InputError
 from ctxval.kernels import Matern
 
@@ -27,6 +28,35 @@ _MOST_SHRINKS = 60
 
 
 @dataclass(frozen=True)
+class Warp:
+    """A scale on which values are a Gaussian process.
+
+    Attributes:
+        offset: c of ``log(y + c)``; infinity for the values themselves.
+    """
+
+    offset: float = np.inf
+
+    def forward(self, y: ArrayLike) -> Array:
+        """Return values on the process's scale."""
+        values = np.asarray(y, dtype=np.float64)
+        return values if np.isinf(self.offset) else np.log(values + self.offset)
+
+    def backward(self, z: ArrayLike) -> Array:
+        """Return values on their own scale."""
+        values = np.asarray(z, dtype=np.float64)
+        return values if np.isinf(self.offset) else np.exp(np.minimum(values, _LARGEST)) - self.offset
+
+    def log_slope(self, y: Array) -> float:
+        """Return the sum of the logarithms of the slopes at values ``(n,)``."""
+        return 0.0 if np.isinf(self.offset) else -float(np.log(y + self.offset).sum())
+
+
+_LARGEST = 700.0
+"""The largest exponent."""
+
+
+@dataclass(frozen=True)
 class Prior:
     """What is believed of the hyperparameters before the data.
 
@@ -35,12 +65,21 @@ class Prior:
         length_scale: median of the log-normal length-scales in the unit cube, times the square root of the dimension.
         spread: standard deviation of their logarithms.
         noise: bounds of the noise variance relative to sigma^2, log-uniform between; equal bounds fix it.
+        offset: of the logarithm, in means of the values; the logarithm is as likely as the values themselves, where
+            none is negative. None leaves it out.
     """
 
     smoothness: tuple[float, ...] = (1.5, 2.5)
     length_scale: float = 0.3
     spread: float = 1.0
     noise: tuple[float, float] = (EXACT, EXACT)
+    offset: float | None = 0.1
+
+    def warps(self, y: Array) -> tuple[Warp, ...]:
+        """Return the scales that values ``(n,)`` may have."""
+        if self.offset is None or y.min() < 0:
+            return (Warp(),)
+        return (Warp(), Warp(self.offset * float(y.mean())))
 
     def log_density(self, log_scales: Array) -> float:
         """Return the log density of the length-scales' logarithms ``(d,)``, up to a constant."""
@@ -89,6 +128,8 @@ class Conditioned:
 
     Attributes:
         hyperparameters: the draw.
+        warp: the scale of the values.
+        y: the values on that scale, shape ``(n,)``.
         L: lower Cholesky factor of the observations' correlations.
         mean: the most likely mu.
         mean_variance: its variance relative to sigma^2.
@@ -97,6 +138,8 @@ class Conditioned:
     """
 
     hyperparameters: Hyperparameters
+    warp: Warp
+    y: Array
     L: Array
     mean: float
     mean_variance: float
@@ -104,13 +147,14 @@ class Conditioned:
     log_likelihood: float
 
 
-def condition(hyperparameters: Hyperparameters, X: Array, y: Array) -> Conditioned:
-    """Return what the data ``(n, d)``, ``(n,)`` say under these hyperparameters.
+def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: Warp | None = None) -> Conditioned:
+    """Return what the data ``(n, d)``, ``(n,)`` say under these hyperparameters, on the values' own scale by default.
 
     Raises:
         InputError: the correlations are not positive definite.
     """
-    n = len(y)
+    scale = Warp() if warp is None else warp
+    n, y = len(values), scale.forward(values)
     correlations = hyperparameters.kernel(X, X)
     correlations[np.diag_indices(n)] += np.exp(hyperparameters.log_noise)
     try:
@@ -122,8 +166,10 @@ def condition(hyperparameters: Hyperparameters, X: Array, y: Array) -> Condition
     mean = float(pull[:, 1].sum() / precision)
     scale2 = float((y - mean) @ (pull[:, 1] - mean * pull[:, 0])) / (n - 1)
     scale2 = max(scale2, np.finfo(np.float64).tiny)
-    log_likelihood = -np.log(np.diag(L)).sum() - 0.5 * np.log(precision) - 0.5 * (n - 1) * np.log(scale2)
-    return Conditioned(hyperparameters, L, mean, float(1 / precision), scale2, float(log_likelihood))
+    log_likelihood = (
+        scale.log_slope(values) - np.log(np.diag(L)).sum() - 0.5 * np.log(precision) - 0.5 * (n - 1) * np.log(scale2)
+    )
+    return Conditioned(hyperparameters, scale, y, L, mean, float(1 / precision), scale2, float(log_likelihood))
 
 
 def draw_hyperparameters(
@@ -146,7 +192,8 @@ class _Sampler:
         self.X, self.y, self.prior, self.rng = X, y, prior, rng
         self.d = X.shape[1]
         self.low, self.high = np.log(prior.noise)
-        self.nu = prior.smoothness[0]
+        self.warps = prior.warps(y)
+        self.choice = (prior.smoothness[0], self.warps[0])
         centre = np.log(prior.length_scale) + 0.5 * np.log(self.d)
         self.state = np.append(np.full(self.d, centre), 0.5 * (self.low + self.high))
 
@@ -158,38 +205,41 @@ class _Sampler:
         for _ in range(count):
             self._sweep()
             self._sweep()
-            draws.append(condition(self._hyperparameters(self.nu, self.state), self.X, self.y))
+            nu, warp = self.choice
+            draws.append(condition(self._hyperparameters(nu, self.state), self.X, self.y, warp))
         return draws
 
     def _hyperparameters(self, nu: float, state: Array) -> Hyperparameters:
         return Hyperparameters(nu, state[: self.d], float(state[self.d]))
 
-    def _log_density(self, nu: float, state: Array) -> float:
+    def _log_density(self, choice: tuple[float, Warp], state: Array) -> float:
+        nu, warp = choice
         if not self.low <= state[-1] <= self.high or np.abs(state[:-1]).max() > 12:
             return -np.inf
         try:
-            conditioned = condition(self._hyperparameters(nu, state), self.X, self.y)
+            conditioned = condition(self._hyperparameters(nu, state), self.X, self.y, warp)
         except InputError:
             return -np.inf
         return conditioned.log_likelihood + self.prior.log_density(state[:-1])
 
     def _sweep(self) -> None:
-        """Move along each length-scale, along all of them together, along the noise, and to another smoothness."""
+        """Move along each length-scale, along all of them together and the noise, then to another smoothness or scale."""
         directions = [np.append(np.ones(self.d), 0.0)]
         if self.d > 1:
             directions += list(np.eye(self.d + 1)[: self.d])
         if self.high > self.low:
             directions.append(np.eye(self.d + 1)[self.d])
         for direction in directions:
-            self.state = _slice(lambda state: self._log_density(self.nu, state), self.state, direction, self.rng)
-        self._choose_smoothness()
+            self.state = _slice(lambda state: self._log_density(self.choice, state), self.state, direction, self.rng)
+        self._choose()
 
-    def _choose_smoothness(self) -> None:
-        if len(self.prior.smoothness) == 1:
+    def _choose(self) -> None:
+        choices = [(nu, warp) for nu in self.prior.smoothness for warp in self.warps]
+        if len(choices) == 1:
             return
-        densities = np.array([self._log_density(nu, self.state) for nu in self.prior.smoothness])
+        densities = np.array([self._log_density(choice, self.state) for choice in choices])
         shares = np.exp(densities - densities.max())
-        self.nu = float(self.rng.choice(self.prior.smoothness, p=shares / shares.sum()))
+        self.choice = choices[int(self.rng.choice(len(choices), p=shares / shares.sum()))]
 
 
 def _slice(log_density: Callable[[Array], float], state: Array, direction: Array, rng: np.random.Generator) -> Array:

@@ -51,6 +51,13 @@ class Paths:
         waves = _waves(Z, self.frequencies) @ self.amplitudes
         return np.asarray(self.means + self.scales * (waves + self._correlations(Z) @ self.corrections))
 
+    def roughly(self, Z: Array) -> Array:
+        """Return what a call returns, its waves to six digits and ten times as fast: enough to choose candidates."""
+        single = np.float32
+        waves = _waves(Z.astype(single), self.frequencies.astype(single)) @ self.amplitudes.astype(single)
+        # The corrections are sums of large terms that cancel: single precision would not do.
+        return np.asarray(self.means + self.scales * (waves + self._correlations(Z) @ self.corrections))
+
     def own(self, Z: Array) -> Array:
         """Return the values of each path at points of its own ``(s, q, d)``, shape ``(s, q)``."""
         return self.own_with_gradient(Z)[0]
@@ -86,13 +93,12 @@ def _waves(Z: Array, frequencies: Array) -> Array:
     return np.asarray(np.concatenate([np.cos(phases), np.sin(phases)], axis=1) / np.sqrt(len(frequencies)))
 
 
-def draw_paths(conditioned: Conditioned, X: Array, y: Array, count: int, rng: np.random.Generator) -> Paths:
-    """Return paths given values ``(n,)`` at points ``(n, d)``, with mu and sigma drawn from their posterior.
+def draw_paths(conditioned: Conditioned, X: Array, count: int, rng: np.random.Generator) -> Paths:
+    """Return paths on the process's scale given points ``(n, d)``, with mu and sigma drawn from their posterior.
 
     Args:
         conditioned: the data under one draw of hyperparameters.
         X: the data's points.
-        y: the data's values.
         count: how many paths.
         rng: where everything random comes from.
     """
@@ -105,7 +111,7 @@ def draw_paths(conditioned: Conditioned, X: Array, y: Array, count: int, rng: np
     means = rng.normal(conditioned.mean, scales * np.sqrt(conditioned.mean_variance))
     noise = np.exp(hyperparameters.log_noise)
     errors = np.zeros((n, count)) if noise <= EXACT else np.sqrt(noise) * rng.normal(size=(n, count))
-    gaps = (y[:, None] - means) / scales - _waves(X, frequencies) @ amplitudes - errors
+    gaps = (conditioned.y[:, None] - means) / scales - _waves(X, frequencies) @ amplitudes - errors
     corrections = cho_solve((conditioned.L, True), gaps, check_finite=False)
     return Paths(conditioned, X, frequencies, amplitudes, corrections, means, scales)
 
@@ -118,15 +124,11 @@ def maxima(paths: Paths, known: Array, rng: np.random.Generator) -> tuple[Array,
     """
     d = paths.X.shape[1]
     candidates = _candidates(known, d, rng)
-    values = paths(candidates)
-    points = _climb(paths, _starts(candidates, values))
+    starts = _starts(candidates, paths.roughly(candidates))
+    points = np.concatenate([starts, _climb(paths, starts)], axis=1)
     heights = paths.own(points)
-    best = np.argmax(heights, axis=1)
-    rows = np.arange(len(paths))
+    best, rows = np.argmax(heights, axis=1), np.arange(len(paths))
     tops, where = heights[rows, best], points[rows, best]
-    highest = values.argmax(axis=0)
-    better = values[highest, rows] > tops
-    tops, where = np.where(better, values[highest, rows], tops), np.where(better[:, None], candidates[highest], where)
     return _polish(paths, tops, where) if d > 2 else (tops, where)
 
 

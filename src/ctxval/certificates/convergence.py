@@ -83,14 +83,15 @@ def certify_convergence(
     """Return the bound ``best_n + r_n`` of Proposition 1.
 
     Args:
-        sample: the trials of a GP-UCB campaign.
+        sample: the trials of a GP-UCB campaign; n counts those that the acquisition function chose.
         constant: C, in the distance's units; the paper does not give it, and nothing can compute it from the trials.
             :class:`TheoremConstants` computes it from what one is ready to state.
         confidence: 1 - eps.
         kernel: of the prior.
 
     Raises:
-        CertificateError: no distance is known, an execution failed, or C is not positive.
+        CertificateError: no distance is known, an execution failed, no task was chosen by an acquisition function, or C
+            is not positive.
     """
     require_probability("confidence", confidence)
     if not (constant > 0 and np.isfinite(constant)):
@@ -99,7 +100,7 @@ def certify_convergence(
         raise CertificateError(
             f"Proposition 1 needs a distance from every execution, but {sample.failed} of {len(sample)} failed."
         )
-    n, dimension = sample.points.shape
+    n, dimension = require_iterations(sample), sample.points.shape[1]
     best, gap = float(sample.distances.max()), constant * rate(n, dimension, kernel)
     return Certificate(
         kind="convergence",
@@ -107,7 +108,7 @@ def certify_convergence(
         upper_bound=best + gap,
         confidence=confidence,
         volume=0.0,
-        trials=n,
+        trials=len(sample),
         assumptions=(
             f"the distance is a draw from a Gaussian process with zero mean and a {kernel} kernel",
             "the kernel's hyperparameters are known; here they were estimated",
@@ -115,5 +116,17 @@ def certify_convergence(
             "the theorem needs sample paths smoother than Matern 3/2 gives (nu > 2)",
             f"C = {constant:g} is yours: the paper does not say what it is, and it grows as eps falls",
         ),
-        details={"best": best, "gap": gap, "constant": constant, "kernel": kernel},
+        details={"best": best, "gap": gap, "iterations": n, "constant": constant, "kernel": kernel},
     )
+
+
+def require_iterations(sample: Sample) -> int:
+    """Return how many tasks an acquisition function chose.
+
+    Raises:
+        CertificateError: none.
+    """
+    count = len(sample.only("acquisition"))
+    if not count:
+        raise CertificateError("Proposition 1 is about tasks that GP-UCB chose, and none of these was.")
+    return count

@@ -41,12 +41,12 @@ class Diagnosis:
         return {"surprise": self.surprise, "trial": self.trial, "left_out": self.left_out}
 
 
-def diagnose(conditioned: list[Conditioned], X: Array, y: Array, level: float = LEVEL) -> Diagnosis:
-    """Return how the values ``(n,)`` at ``(n, d)``, in the order of the trials, agree with the process."""
-    exceed = np.mean([_exceedances(one, y) for one in conditioned], axis=0)
+def diagnose(conditioned: list[Conditioned], level: float = LEVEL) -> Diagnosis:
+    """Return how the values, in the order of the trials, agree with the process."""
+    exceed = np.mean([_exceedances(one) for one in conditioned], axis=0)
     worst = int(exceed.argmin())
     surprise = float(-np.expm1(len(exceed) * np.log1p(-min(exceed[worst], 1 - 1e-16))))
-    left_out = float(np.sqrt(np.mean([_left_out(one, y) for one in conditioned])))
+    left_out = float(np.sqrt(np.mean([_left_out(one) for one in conditioned])))
     doubt = None
     if surprise < level:
         doubt = (
@@ -56,8 +56,9 @@ def diagnose(conditioned: list[Conditioned], X: Array, y: Array, level: float = 
     return Diagnosis(surprise, worst + 2, left_out, doubt)
 
 
-def _exceedances(conditioned: Conditioned, y: Array) -> Array:
+def _exceedances(conditioned: Conditioned) -> Array:
     """Return Pr(a value as large) for trials 3 to n, given those before each, shape ``(n - 2,)``."""
+    y = conditioned.y
     whitened = solve_triangular(conditioned.L, np.stack([np.ones(len(y)), y], axis=1), lower=True, check_finite=False)
     a, b = whitened.T
     precision = np.cumsum(a**2)
@@ -68,8 +69,9 @@ def _exceedances(conditioned: Conditioned, y: Array) -> Array:
     return np.asarray(stdtr(freedom, -residuals[1:] / np.maximum(scales, np.finfo(np.float64).tiny)))
 
 
-def _left_out(conditioned: Conditioned, y: Array) -> float:
+def _left_out(conditioned: Conditioned) -> float:
     """Return the mean square of the standardised leave-one-out errors (Rasmussen and Williams 2006, eq. 5.12)."""
+    y = conditioned.y
     inverse = cho_solve((conditioned.L, True), np.eye(len(y)), check_finite=False)
     pull = inverse @ (y - conditioned.mean)
     return float(np.mean(pull**2 / np.diag(inverse)) / conditioned.scale2)

@@ -55,6 +55,9 @@ def forecast(
         confidence: of the bound.
         seed: of the futures.
         futures: how many.
+
+    Raises:
+        CertificateError: so high a confidence needs more draws of d*.
     """
     rng = np.random.default_rng(seed)
     lengths, kept = [], 0
@@ -78,12 +81,15 @@ class _Future:
         candidates = np.concatenate(
             [found.points[:: max(1, len(found.points) // 100)], rng.random((_CANDIDATES, sample.points.shape[1]))]
         )
-        self.best = sample.best
-        self.mean, self.covariance = _joint(conditioned, sample.points, sample.distances, candidates)
+        self.warp = conditioned.warp  # from here on everything is on the process's scale
+        self.best = float(self.warp.forward(sample.best))
+        self.mean, self.covariance = _joint(conditioned, sample.points, candidates)
         L = np.linalg.cholesky(self.covariance + _JITTER * conditioned.scale2 * np.eye(len(candidates)))
         self.truth = self.mean + L @ rng.normal(size=len(candidates))
         tops = (self.mean[:, None] + L @ rng.normal(size=(len(candidates), 256))).max(axis=0)
         self.width = self._width(max(float(np.quantile(tops, confidence)), self.best))
+        # The present bound is that of all draws together: what they leave undecided is not decided by one of them.
+        self.bound = max(float(self.warp.forward(found.upper(confidence))), self.best)
 
     def _width(self, bound: float) -> float:
         """Return the z at which ``max (mean + z deviation)`` is the bound."""
@@ -101,12 +107,14 @@ class _Future:
 
     def play(self, threshold: float) -> tuple[float, bool]:
         """Return after how many executions it is decided, infinity for never, and whether the threshold is kept."""
+        limit = float(self.warp.forward(threshold))
         for executions in range(HORIZON + 1):
-            if self.best > threshold:
+            if self.best > limit:
                 return executions, False
-            if max(self._upper(self.width), self.best) <= threshold:
+            if self.bound <= limit:
                 return executions, True
             self._execute()
+            self.bound = max(self._upper(self.width), self.best)
         return np.inf, False
 
     def _execute(self) -> None:
@@ -122,12 +130,12 @@ class _Future:
         self.best = max(self.best, float(self.truth[row]))
 
 
-def _joint(conditioned: Conditioned, X: Array, y: Array, Z: Array) -> tuple[Array, Array]:
+def _joint(conditioned: Conditioned, X: Array, Z: Array) -> tuple[Array, Array]:
     """Return posterior mean ``(m,)`` and covariance ``(m, m)`` at Z, with the uncertainty of the prior's mean."""
     hyperparameters = conditioned.hyperparameters
     k = hyperparameters.kernel(Z, X)
     weights = cho_solve((conditioned.L, True), k.T, check_finite=False)
-    mean = conditioned.mean + weights.T @ (y - conditioned.mean)
+    mean = conditioned.mean + weights.T @ (conditioned.y - conditioned.mean)
     missing = 1 - weights.sum(axis=0)
     covariance = hyperparameters.kernel(Z, Z) - k @ weights + conditioned.mean_variance * np.outer(missing, missing)
     return mean, conditioned.scale2 * covariance

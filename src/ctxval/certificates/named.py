@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ctxval.certificates.base import Certificate, Sample
-from ctxval.certificates.convergence import TheoremConstants, certify_convergence
+from ctxval.certificates.convergence import TheoremConstants, certify_convergence, require_iterations
 from ctxval.certificates.posterior import certify_posterior
 from ctxval.certificates.scenario import certify_audit, certify_scenario
 from ctxval.errors import CertificateError, UnknownNameError
@@ -58,7 +58,7 @@ def _constant(sample: Sample, confidence: float, options: Options) -> float:
     if options.constant is not None:
         return options.constant
     if options.theorem is not None:
-        return options.theorem.constant(len(sample), sample.points.shape[1], confidence)
+        return options.theorem.constant(require_iterations(sample), sample.points.shape[1], confidence)
     raise CertificateError(
         "Proposition 1 needs its constant C, which the paper does not give: state it, or what it is computed from."
     )

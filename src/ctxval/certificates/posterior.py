@@ -53,7 +53,7 @@ class Maxima:
         Raises:
             CertificateError: so high a confidence needs more draws.
         """
-        rank = int(np.ceil((len(self.draws) + 1) * require_probability("confidence", confidence) - 1e-9))
+        rank = max(1, int(np.ceil((len(self.draws) + 1) * require_probability("confidence", confidence) - 1e-9)))
         if rank > len(self.draws):
             raise CertificateError(
                 f"a confidence of {confidence:g} needs more than the {len(self.draws)} draws of d* that there are."
@@ -93,9 +93,12 @@ def draw_maxima(
     best_first = X[np.argsort(-y, kind="stable")]
     with single_threaded():
         conditioned = draw_hyperparameters(X, y, draws, rng, believed)
-        found = [maxima(draw_paths(one, X, y, paths, rng), best_first, rng) for one in conditioned]
+        found = [maxima(draw_paths(one, X, paths, rng), best_first, rng) for one in conditioned]
     tops = np.concatenate(
-        [top + _EXACTNESS * np.sqrt(one.scale2) for (top, _), one in zip(found, conditioned, strict=True)]
+        [
+            one.warp.backward(top + _EXACTNESS * np.sqrt(one.scale2))
+            for (top, _), one in zip(found, conditioned, strict=True)
+        ]
     )
     if not stochastic:
         tops = np.maximum(tops, y.max())
@@ -134,7 +137,7 @@ def certify_posterior(
     require_probability("confidence", confidence)
     maxima_found = draw_maxima(sample, stochastic=stochastic, seed=seed) if found is None else found
     upper, best = maxima_found.upper(confidence), float(sample.distances.max())
-    diagnosis = diagnose(maxima_found.conditioned, sample.points, sample.distances)
+    diagnosis = diagnose(maxima_found.conditioned)
     what = "the largest expected distance" if stochastic else "d*"
     return Certificate(
         kind="posterior",
@@ -163,8 +166,8 @@ def _assumptions(stochastic: bool) -> tuple[str, ...]:
         else "each task has one distance: the system is deterministic"
     )
     return (
-        "the distance is a draw from a Gaussian process: a constant mean, a Matern kernel of smoothness 3/2 or 5/2, "
-        "one length-scale for each parameter, all of them unknown and integrated over",
+        "the distance, or its logarithm, is a draw from a Gaussian process: a constant mean, a Matern kernel of "
+        "smoothness 3/2 or 5/2, one length-scale for each parameter, all of them unknown and integrated over",
         "it is as rough in one part of the task space as in another: a peak narrower than the gaps between the trials, "
         "of which no trial shows a trace, is not covered; audit for that",
         noise,
@@ -178,6 +181,7 @@ def _summary(conditioned: list[Conditioned]) -> dict[str, object]:
     rough = float(np.mean([one.hyperparameters.nu == 1.5 for one in conditioned]))
     return {
         "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
+        "logarithm": float(np.mean([np.isfinite(one.warp.offset) for one in conditioned])),
         "length_scales": np.median(scales, axis=0).tolist(),
     }
 

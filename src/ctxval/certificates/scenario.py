@@ -127,8 +127,8 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
         raise CertificateError("an audit needs independent draws of tasks, and there is none; run certify --audit N.")
     if drawn.failed:
         raise CertificateError(
-            f"{drawn.failed} of {len(drawn)} independently drawn executions failed and count as violations; "
-            f"--kind sampling-discarding --discard {drawn.failed} says what can be said."
+            f"{drawn.failed} of {len(drawn)} independently drawn executions failed and count as violations, larger "
+            "than any distance; leave such tasks out of the task space, and audit what is left."
         )
     volume, h = volume_bound(len(drawn), 0, beta), sample.best
     return Certificate(
