@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 from conftest import make_validation
 from ctxval import Campaign, TaskSpace, Validation, searches
@@ -266,6 +267,117 @@ def test_the_sketch_of_the_readme_runs() -> None:
         distance=validation.distance,
     )
     assert Campaign(again, search=searches.GPUCB(beta=2.0), seed=7).run(budget=6).executions == 6
+
+
+# Audits, and stopping early
+
+
+def origins(campaign: Campaign) -> list[str]:
+    return [trial.origin for trial in campaign.trials]
+
+
+def test_an_audit_adds_independent_draws_until_there_are_so_many(validation: Validation) -> None:
+    campaign = Campaign(validation, seed=2).run(7)
+    assert origins(campaign.audit(4))[7:] == ["iid"] * 4
+    assert len(campaign.audit(4).trials) == 11  # a total, as the budget is
+    assert len(campaign.audit(6).trials) == 13
+    assert campaign.executions == 13
+    points = np.array([trial.unit_point for trial in campaign.trials if trial.origin == "iid"])
+    assert ((points >= 0) & (points < 1)).all()
+    assert len(np.unique(points)) == 6
+
+
+def test_the_draws_of_a_random_search_are_an_audit_already(validation: Validation) -> None:
+    campaign = Campaign(validation, search=searches.Random(), seed=2).run(5)
+    assert len(campaign.audit(5).trials) == 5
+    assert origins(campaign.audit(8)) == ["iid"] * 8
+
+
+@pytest.mark.parametrize("search", ["gp-ucb", "random"])
+def test_an_audit_draws_what_no_search_draws(validation: Validation, search: str) -> None:
+    searched = Campaign(validation, search=searches.by_name(search), seed=2).run(12)
+    audited = Campaign(validation, search=searches.by_name(search), seed=2).audit(12)
+    others = {trial.unit_point.tobytes() for trial in searched.trials}
+    assert not others & {trial.unit_point.tobytes() for trial in audited.trials}
+
+
+@pytest.mark.parametrize("search", ["gp-ucb", "random"])
+def test_what_an_audit_draws_does_not_depend_on_the_search(validation: Validation, search: str) -> None:
+    campaign = Campaign(validation, search=searches.by_name(search), seed=2).audit(5)
+    plain = Campaign(validation, seed=2).audit(5)
+    assert facts(campaign.trials) == facts(plain.trials)
+    other = Campaign(validation, seed=3).audit(5)
+    assert {t.unit_point.tobytes() for t in plain.trials}.isdisjoint(t.unit_point.tobytes() for t in other.trials)
+
+
+def test_the_points_of_many_audits_are_uniform() -> None:
+    cheap = make_validation(horizon=1)
+    points = np.array([t.unit_point[0] for seed in range(25) for t in Campaign(cheap, seed=seed).audit(8).trials])
+    assert kstest(points, "uniform").pvalue > 1e-3
+    assert abs(np.corrcoef(points[:-1], points[1:])[0, 1]) < 0.25
+
+
+def test_a_search_goes_on_after_an_audit_and_knows_what_it_showed(validation: Validation, tmp_path: Path) -> None:
+    whole = Campaign(validation, seed=4).run(6).audit(3).run(12)
+    for act in (
+        lambda c: c.run(6),
+        lambda c: c.audit(1),
+        lambda c: c.audit(3),
+        lambda c: c.run(10),
+        lambda c: c.run(12),
+    ):
+        pieces = act(Campaign(validation, seed=4, store=tmp_path / "a.sqlite"))
+    assert facts(pieces.trials) == facts(whole.trials)
+    assert origins(whole) == ["initial"] * 5 + ["acquisition"] + ["iid"] * 3 + ["acquisition"] * 3
+
+
+def test_an_audit_finishes_what_was_interrupted_first(validation: Validation, tmp_path: Path) -> None:
+    class Interrupting(FaultyRig):
+        def execute(self, controller, task):  # type: ignore[no-untyped-def]
+            if self._executions in (5, 9):
+                self._executions += 1
+                raise KeyboardInterrupt
+            return super().execute(controller, task)
+
+    whole = Campaign(make_validation(system=FaultyRig(validation.system)), seed=1).run(7).audit(4)
+    stopped = make_validation(system=Interrupting(validation.system))
+    campaign = Campaign(stopped, seed=1, store=tmp_path / "a.sqlite")
+    with pytest.raises(KeyboardInterrupt):
+        campaign.run(7)
+    with pytest.raises(KeyboardInterrupt):
+        campaign.run(7).audit(4)
+    assert campaign.trials[-1].state == "open"
+    resumed = Campaign(stopped, seed=1, store=tmp_path / "a.sqlite").audit(4)
+    assert facts(resumed.trials) == facts(whole.trials)
+
+
+def test_a_failed_draw_of_an_audit_counts_as_one(validation: Validation) -> None:
+    rig = FaultyRig(validation.system, {1: "raise"})
+    seen: list[Trial] = []
+    campaign = Campaign(make_validation(system=rig)).audit(4, on_trial=seen.append)
+    assert [trial.state for trial in seen] == ["completed", "failed", "completed", "completed"]
+    assert origins(campaign) == ["iid"] * 4
+
+
+@pytest.mark.parametrize("draws", [0, -3, 2.5, True, None])
+def test_the_draws_of_an_audit_are_a_positive_integer(validation: Validation, draws: object) -> None:
+    with pytest.raises(InputError, match="positive number of draws"):
+        Campaign(validation).audit(draws)  # type: ignore[arg-type]
+
+
+def test_a_campaign_stops_before_the_execution_that_is_not_needed(validation: Validation) -> None:
+    asked: list[int] = []
+
+    def enough(campaign: Campaign) -> bool:
+        asked.append(campaign.executions)
+        return campaign.executions >= 7
+
+    campaign = Campaign(validation, seed=1)
+    assert campaign.run(20, until=enough).executions == 7
+    assert asked == list(range(8))
+    assert campaign.run(20, until=enough).executions == 7
+    assert campaign.run(5, until=lambda _: False).executions == 7
+    assert facts(campaign.trials) == facts(Campaign(validation, seed=1).run(7).trials)
 
 
 # What an attack on the campaign found, and must not find again

@@ -1,13 +1,19 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
+from conftest import make_validation
+from ctxval import Campaign
+from ctxval.certificates import Maxima, Sample, draw_maxima
 from ctxval.cli import app
 
 EXPERIMENT = """
@@ -31,6 +37,17 @@ leaving = lambda seed: sys.exit(0)
 broken = make_validation(model=lambda x, u: x * float("nan"))
 number = 3
 """
+
+
+@pytest.fixture(autouse=True)
+def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take few draws of d*: what is tested here does not depend on how many there are."""
+
+    def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
+        return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
+
+    for module in ("ctxval.verdict", "ctxval.certificates.posterior"):
+        monkeypatch.setattr(f"{module}.draw_maxima", fewer)
 
 
 @pytest.fixture
@@ -58,7 +75,9 @@ def test_json_is_one_object_with_everything_asked_for(invoke) -> None:  # type: 
     assert report["truth"]["distance"] >= report["worst"]["distance"] * (1 - 1e-9)
     error = 100 * (report["truth"]["distance"] - report["estimate"]) / report["truth"]["distance"]
     assert report["error_percent"] == pytest.approx(error)
-    assert (report["verdict"], report["threshold"]) == ("undecided", 9.0)
+    assert (report["verdict"], report["threshold"]) == ("validated", 9.0)
+    assert report["certificate"]["kind"] == "posterior"
+    assert report["worst"]["distance"] <= report["certificate"]["upper_bound"] <= 9.0
     assert report["store"] == "runs/short-gp-ucb-seed3.sqlite"
     assert all(Path(picture).stat().st_size > 1000 for picture in report["pictures"])
 
@@ -80,7 +99,8 @@ def test_the_human_report_names_the_worst_task_and_the_verdict(invoke) -> None: 
     result = invoke("run", "rig:validation", "--budget", "6", "--threshold", "5")
     assert result.exit_code == 0
     assert "goal =" in result.stdout
-    assert "undecided against 5" in result.stdout
+    assert "validated against 5" in result.stdout
+    assert "with confidence 0.95" in " ".join(result.stdout.split())
 
 
 @pytest.mark.parametrize("search", ["random", "sampling-discarding"])
@@ -167,6 +187,172 @@ def test_an_interrupt_says_how_to_go_on(invoke) -> None:  # type: ignore[no-unty
     result = invoke("run", "rig:slow")
     assert result.exit_code == 130
     assert "run the same command to go on" in result.stderr
+
+
+def test_a_confidence_that_no_bound_can_have_does_not_lose_the_report(invoke) -> None:  # type: ignore[no-untyped-def]
+    given = ("--budget", "6", "--threshold", "9", "--confidence", "0.9999999", "--json")
+    result = invoke("run", "rig:experiment", *given)
+    report = json.loads(result.stdout)
+    assert (result.exit_code, report["executions"], report["verdict"]) == (0, 6, "undecided")
+    assert "needs more than" in report["reason"]
+
+
+def test_a_campaign_stops_as_soon_as_its_verdict_is_reached(invoke) -> None:  # type: ignore[no-untyped-def]
+    given = ("run", "rig:experiment", "--budget", "30", "--until-decided", "--json")
+    validated = json.loads(invoke(*given, "--threshold", "9").stdout)
+    assert validated["verdict"] == "validated"
+    assert 4 <= validated["executions"] < 10
+    falsified = invoke(*given, "--threshold", "0.001", "--seed", "1")
+    assert falsified.exit_code == 1
+    assert json.loads(falsified.stdout)["executions"] == 1
+    assert "needs a threshold" in invoke(*given).stderr
+
+
+# Certificates of what is stored
+
+
+def stored(folder: Path, *arguments: str) -> Path:
+    """Return the store of a campaign that was run in a folder."""
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        result = CliRunner().invoke(app, ["run", *arguments, "--json"])
+        assert result.exit_code in (0, 1), result.stderr
+        return folder / json.loads(result.stdout)["store"]
+    finally:
+        os.chdir(before)
+
+
+@pytest.fixture(scope="session")
+def campaigns(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Campaigns of two cases, searched and drawn."""
+    folder = tmp_path_factory.mktemp("campaigns")
+    linear = ("linear", "--dim", "1", "--seed", "1")
+    return {
+        "pendulum": stored(folder, "pendulum", "--budget", "12"),
+        "linear": stored(folder, *linear, "--budget", "12"),
+        "pendulum drawn": stored(folder, "pendulum", "--budget", "12", "--search", "random"),
+        "linear drawn": stored(folder, *linear, "--budget", "20", "--search", "random"),
+    }
+
+
+KINDS = {
+    "posterior": (),
+    "scenario": (),
+    "sampling-discarding": ("--discard", "2"),
+    "convergence": ("--theorem", "0.5,1e-4,1,3,1"),
+    "audit": (),
+}
+
+
+def of_kind(campaigns: dict[str, Path], case: str, kind: str) -> list[str]:
+    drawn = kind in ("scenario", "sampling-discarding", "audit")
+    return ["certify", str(campaigns[f"{case} drawn" if drawn else case]), "--kind", kind, *KINDS[kind]]
+
+
+@pytest.mark.parametrize("case", ["pendulum", "linear"])
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_every_kind_certifies_stored_campaigns(invoke, campaigns: dict[str, Path], case: str, kind: str) -> None:  # type: ignore[no-untyped-def]
+    arguments = of_kind(campaigns, case, kind)
+    result = invoke(*arguments, "--threshold", "90", "--volume", "0.5", "--confidence", "0.9", "--json")
+    assert result.exit_code == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert (report["kind"], report["confidence"], report["verdict"]) == (kind, 0.9, "validated")
+    assert 0 < report["upper_bound"] <= 90
+    assert report["assumptions"]
+    assert report["trials"] >= 12
+    assert (report["volume"] == 0) == (kind in ("posterior", "convergence"))
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_every_kind_speaks_to_people(invoke, campaigns: dict[str, Path], kind: str) -> None:  # type: ignore[no-untyped-def]
+    result = invoke(*of_kind(campaigns, "linear", kind))
+    assert result.exit_code == 0
+    text = " ".join(result.stdout.split())
+    assert text.startswith(f"{kind}: With ")
+    assert "It assumes that - the " in text
+    assert "verdict" not in text
+    assert text.endswith("version 0.1.0")
+
+
+def test_what_was_executed_falsifies_without_any_certificate(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
+    arguments = ["certify", str(campaigns["linear"]), "--kind", "scenario", "--threshold", "0.001"]
+    refused = invoke(*arguments, "--json")
+    report = json.loads(refused.stdout)
+    assert refused.exit_code == 1
+    assert report["verdict"] == "falsified"
+    assert "independent draws alone" in report["refused"]
+    spoken = invoke(*arguments)
+    assert spoken.exit_code == 1
+    assert "falsified against 0.001" in spoken.stdout
+    assert "no certificate" in spoken.stdout
+
+
+def test_what_is_undecided_says_how_many_more_executions_would_decide(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
+    plain = json.loads(invoke("certify", str(campaigns["linear"]), "--json").stdout)
+    tau = 0.5 * (plain["details"]["best"] + plain["upper_bound"])
+    report = json.loads(invoke("certify", str(campaigns["linear"]), "--threshold", str(tau), "--json").stdout)
+    assert report["verdict"] == "undecided"
+    assert set(report["expected"]) == {"executions", "validated", "falsified"}
+    assert "verdict" not in plain
+
+
+def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
+    shutil.copy(campaigns["linear"], "a.sqlite")
+    arguments = ("certify", "a.sqlite", "--audit", "5", "--threshold", "90", "--volume", "0.5", "--json")
+    report = json.loads(invoke(*arguments).stdout)
+    assert (report["kind"], report["trials"], report["verdict"]) == ("audit", 5, "validated")
+    assert report["volume"] == pytest.approx(1 - 0.05 ** (1 / 5))
+    assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 17
+    assert json.loads(invoke(*arguments).stdout) == report
+    assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 17
+    # The campaign goes on with its own search.
+    again = invoke("run", "linear", "--dim", "1", "--seed", "1", "--store", "a.sqlite", "--budget", "18", "--json")
+    assert json.loads(again.stdout)["executions"] == 18
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--kind", "scenaro"], "did you mean 'scenario'"),
+        (["--kind", "scenario"], "independent draws alone, but 12 of 12"),
+        (["--kind", "audit"], "there is none; run certify --audit N"),
+        (["--kind", "sampling-discarding"], "how many to discard"),
+        (["--kind", "convergence"], "needs its constant C"),
+        (["--kind", "convergence", "--constant", "-1"], "must be a positive number"),
+        (["--kind", "convergence", "--theorem", "1,2,3"], "five numbers"),
+        (["--kind", "convergence", "--theorem", "1,2,3,4,x"], "five numbers"),
+        (["--kind", "convergence", "--theorem", "1,2,3,4,0"], "gain of the theorem"),
+        (["--threshold", "-1"], "threshold must be a positive number"),
+        (["--threshold", "nan"], "threshold must be a positive number"),
+        (["--confidence", "0"], "strictly between 0 and 1"),
+        (["--confidence", "1.5"], "strictly between 0 and 1"),
+        (["--volume", "1.5"], "share of the task space"),
+        (["--volume", "nan"], "share of the task space"),
+        (["--audit", "0"], "positive number of draws"),
+        (["--audit", "5", "--kind", "scenaro"], "did you mean 'scenario'"),
+        (["--audit", "5", "--confidence", "95"], "strictly between 0 and 1"),
+    ],
+)
+def test_what_cannot_be_certified_is_one_sentence_and_costs_no_execution(  # type: ignore[no-untyped-def]
+    invoke, campaigns: dict[str, Path], arguments: list[str], sentence: str
+) -> None:
+    shutil.copy(campaigns["linear"], "a.sqlite")
+    result = invoke("certify", "a.sqlite", *arguments)
+    assert result.exit_code == 2
+    assert sentence in result.stderr.replace("\n", " ")
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+    assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 12
+
+
+def test_a_store_that_no_command_made_cannot_be_audited_but_certified(invoke) -> None:  # type: ignore[no-untyped-def]
+    Campaign(make_validation(), store="own.sqlite").run(6)
+    result = invoke("certify", "own.sqlite", "--audit", "3")
+    assert result.exit_code == 2
+    assert "does not say what was run into it" in result.stderr.replace("\n", " ")
+    assert invoke("certify", "own.sqlite").exit_code == 0
+    assert "there is no store" in invoke("certify", "none.sqlite").stderr
 
 
 def test_status_and_cases_speak_to_people_and_to_programs(invoke) -> None:  # type: ignore[no-untyped-def]

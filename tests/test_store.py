@@ -9,6 +9,7 @@ import pytest
 
 from ctxval import Store, Trajectory, Trial
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
+from ctxval.store import _MIGRATIONS
 
 TRAJECTORY = Trajectory(np.arange(4.0), np.random.default_rng(0).normal(size=(4, 2)), np.ones((3, 1)))
 
@@ -33,6 +34,31 @@ def test_a_trial_comes_back_bit_for_bit(tmp_path: Path) -> None:
         ended.parameters,
     )
     assert (back.attempts, back.executed, back.failure, back.seconds) == (1, True, None, 1.5)
+
+
+def test_a_note_comes_back_bit_for_bit_and_none_as_none(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    note = {"engine": "climb", "climb": 2, "expected": 0.1 + 0.2, "radius": 1.0, "why": None}
+    store.open_trial(replace(trial(), note=note), TRAJECTORY)
+    store.open_trial(trial(1), TRAJECTORY)
+    store.record_failed_plan(replace(trial(2), state="failed", failure="x", note=note))
+    store.close()
+    assert [t.note for t in Store(tmp_path / "a.sqlite").trials()] == [note, None, note]
+
+
+def test_a_store_without_notes_is_migrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr("ctxval.store._MIGRATIONS", _MIGRATIONS[:1])
+        old = Store(tmp_path / "a.sqlite")
+        old._connection.execute(
+            "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, opened_at) "
+            "VALUES (0, 'iid', 'open', '[0.5]', '{}', 1, '')"
+        )
+        old.close()
+    migrated = Store(tmp_path / "a.sqlite")
+    assert [t.note for t in migrated.trials()] == [None]
+    migrated.record_failed_plan(replace(trial(1), state="failed", failure="x", note={"climb": 1}))
+    assert migrated.trials()[1].note == {"climb": 1}
 
 
 def test_trajectories_come_back_bit_for_bit_and_absent_ones_as_none() -> None:
@@ -124,3 +150,53 @@ def test_migrations_are_recorded(tmp_path: Path) -> None:
     version = connection.execute("PRAGMA user_version").fetchone()[0]
     connection.close()
     assert [row[0] for row in rows] == list(range(1, version + 1))
+
+
+def test_settings_come_back_and_the_last_ones_count(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    assert store.settings() == {}
+    store.keep_settings({"experiment": "pendulum", "budget": 5, "old": True})
+    kept = {"experiment": "pendulum", "budget": None, "search": {"name": "gp-ucb", "beta": 2.0}}
+    store.keep_settings(kept)
+    store.close()
+    assert Store(tmp_path / "a.sqlite").settings() == kept
+
+
+def test_settings_do_not_change_which_experiment_it_is() -> None:
+    store = Store()
+    store.identify({"seed": 1})
+    store.keep_settings({"budget": 5})
+    store.identify({"seed": 1})
+    assert store.description() == {"seed": 1}
+
+
+@pytest.mark.parametrize("version", range(1, len(_MIGRATIONS)))
+def test_a_store_of_any_older_version_is_brought_up_with_its_trials(tmp_path: Path, version: int) -> None:
+    path = tmp_path / "old.sqlite"
+    connection = sqlite3.connect(path, isolation_level=None)
+    for number, (title, script) in enumerate(_MIGRATIONS[:version], start=1):
+        connection.executescript(script)
+        connection.execute("INSERT INTO migrations VALUES (?, ?, 'then')", (number, title))
+    connection.execute("PRAGMA application_id = 0x63747876")
+    connection.execute(f"PRAGMA user_version = {version}")
+    connection.execute(
+        "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, distance, executed, opened_at) "
+        "VALUES (0, 'iid', 'completed', '[0.25]', '{\"a\": 1.5}', 1, 0.7, 1, 'then')"
+    )
+    connection.close()
+    store = Store(path)
+    (old,) = store.trials()
+    assert (old.origin, old.state, old.distance, old.parameters, old.note) == (
+        "iid",
+        "completed",
+        0.7,
+        {"a": 1.5},
+        None,
+    )
+    assert store.settings() == {}
+    store.keep_settings({"experiment": "pendulum"})
+    store.open_trial(trial(1), TRAJECTORY)
+    store.close()
+    again = Store(path)
+    assert [t.number for t in again.trials()] == [0, 1]
+    assert again.settings() == {"experiment": "pendulum"}

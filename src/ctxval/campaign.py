@@ -12,14 +12,18 @@ import numpy as np
 
 from ctxval.arrays import Array
 from ctxval.describe import describe
+from ctxval.dynamics import predict_distance
 from ctxval.errors import CtxvalError, DistanceError, ExecutionError, InputError
-from ctxval.searches import GPUCB, Search
+from ctxval.searches import GPUCB, Prediction, Search
 from ctxval.store import Store
 from ctxval.surrogate import Surrogate, fit_surrogate
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Origin, Trial
 from ctxval.validation import Plan, Validation, require_execution
-from ctxval.verdict import Verdict, judge
+from ctxval.verdict import CONFIDENCE, Verdict, judge
+
+_AUDIT = 0x6175
+"""Marks the randomness of an audit's draws; searches mark streams of theirs with small numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +99,8 @@ class Campaign:
         if self._trials:
             points = np.array([trial.unit_point for trial in self._trials])
             self.search.tell(points, [np.nan if t.distance is None else t.distance for t in self._trials])
+            if hasattr(self.search, "remember"):
+                self.search.remember([trial.note for trial in self._trials])
 
     # What is known
 
@@ -130,9 +136,18 @@ class Campaign:
         ordered = sorted((_distance(trial) for trial in self.completed), reverse=True)
         return ordered[discard] if len(ordered) > discard else None
 
-    def verdict(self, threshold: float) -> Verdict:
-        """Return whether M may be trusted up to a threshold tau, in the distance's units."""
-        return judge(self.worst, self.executions, len(self.failed), threshold)
+    def verdict(self, threshold: float, confidence: float = CONFIDENCE, *, stochastic: bool = False) -> Verdict:
+        """Return whether M may be trusted up to a threshold tau, in the distance's units.
+
+        Falsified by an executed counterexample, validated by the posterior bound with this confidence, undecided
+        otherwise; then it says what is expected to decide.
+
+        Args:
+            threshold: tau.
+            confidence: of a validation.
+            stochastic: whether two executions of one task may differ.
+        """
+        return judge(self.trials, threshold, confidence, stochastic=stochastic)
 
     def surrogate(self) -> Surrogate:
         """Return the GP of the distance over the task space, whichever search chose the trials.
@@ -153,7 +168,13 @@ class Campaign:
 
     # Running
 
-    def run(self, budget: int, on_trial: Callable[[Trial], None] | None = None) -> Campaign:
+    def run(
+        self,
+        budget: int,
+        on_trial: Callable[[Trial], None] | None = None,
+        *,
+        until: Callable[[Campaign], bool] | None = None,
+    ) -> Campaign:
         """Execute until ``budget`` executions have ended in all, earlier ones counted.
 
         A failed execution is a failed trial and counts; the campaign goes on.
@@ -161,6 +182,7 @@ class Campaign:
         Args:
             budget: total number of executions of S.
             on_trial: called with each trial that has ended.
+            until: asked before each execution; the campaign stops early once it answers yes.
 
         Raises:
             InputError: the budget is not a positive integer.
@@ -170,12 +192,38 @@ class Campaign:
         if not isinstance(budget, int | np.integer) or isinstance(budget, bool) or budget < 1:
             raise InputError(f"budget must be a positive integer, got {budget!r}.")
         with self.store.sole_writer():
-            for trial in [trial for trial in self._trials if trial.state == "open" and trial.attempts]:
+            for trial in self._interrupted():
                 if self.executions < budget:
                     self._execute(self._reopen(trial), on_trial)
-            while self.executions < budget:
+            while self.executions < budget and not (until is not None and until(self)):
                 self._execute(self._open(None, attempts=1), on_trial)
         return self
+
+    def audit(self, draws: int, on_trial: Callable[[Trial], None] | None = None) -> Campaign:
+        """Execute independent uniform draws of tasks, whatever the search, until there are so many among the trials.
+
+        Args:
+            draws: total number of independent draws.
+            on_trial: called with each trial that has ended.
+
+        Raises:
+            InputError: the number is not a positive integer.
+            ModelError, DesignError, DistanceError: as :meth:`run` does.
+        """
+        if not isinstance(draws, int | np.integer) or isinstance(draws, bool) or draws < 1:
+            raise InputError(f"an audit needs a positive number of draws, got {draws!r}.")
+        with self.store.sole_writer():
+            for trial in self._interrupted():
+                self._execute(self._reopen(trial), on_trial)
+            while sum(trial.origin == "iid" for trial in self._trials) < draws:
+                # Apart from the search's own randomness, which is that of [seed, number].
+                rng = np.random.default_rng(np.random.SeedSequence([self.seed, len(self._trials), _AUDIT]))
+                unit_point = rng.random(self.validation.space.dimension)
+                self._execute(self._open((unit_point, "iid"), attempts=1), on_trial)
+        return self
+
+    def _interrupted(self) -> list[Trial]:
+        return [trial for trial in self._trials if trial.state == "open" and trial.attempts]
 
     def _reopen(self, trial: Trial) -> OpenTrial:
         """Plan an interrupted trial again and count one more attempt."""
@@ -209,26 +257,30 @@ class Campaign:
             ModelError, DesignError: no controller could be designed and run on the model; the trial is stored as
                 failed and costs no execution.
         """
-        return self._open(parameters, attempts=0)
+        if parameters is None:
+            return self._open(None, attempts=0)
+        space = self.validation.space
+        return self._open((space.to_unit(space.point(parameters)), "manual"), attempts=0)
 
-    def _open(self, parameters: Mapping[str, Any] | None, attempts: int) -> OpenTrial:
+    def _open(self, given: tuple[Array, Origin] | None, attempts: int) -> OpenTrial:
         """Store a new trial ahead of its execution; one that is about to be executed counts as its first attempt."""
         try:
-            return self._store_next(parameters, attempts)
+            return self._store_next(given, attempts)
         except BaseException:
             # Whatever stopped it, the search must know the stored trials and no other.
             self._replay()
             raise
 
-    def _store_next(self, parameters: Mapping[str, Any] | None, attempts: int) -> OpenTrial:
-        origin = self._origin() if parameters is None else "manual"
-        if parameters is None:
-            unit_point = self._suggestion()
+    def _store_next(self, given: tuple[Array, Origin] | None, attempts: int) -> OpenTrial:
+        note = None
+        if given is None:
+            unit_point, origin = self._suggestion(), self._origin()
+            note = self.search.note() if hasattr(self.search, "note") else None
         else:
-            unit_point = self.validation.space.to_unit(self.validation.space.point(parameters))
+            unit_point, origin = given
             self.search.tell(unit_point[None], [np.nan])
         names = self.validation.space.describe_point(self.validation.space.from_unit(unit_point))
-        trial = Trial(len(self._trials), origin, "open", unit_point, names, attempts)
+        trial = Trial(len(self._trials), origin, "open", unit_point, names, attempts, note=note)
         try:
             plan = self._plan(trial)
         except CtxvalError as error:
@@ -271,6 +323,8 @@ class Campaign:
         return self.validation.plan(self.validation.space.from_unit(trial.unit_point))
 
     def _suggestion(self) -> Array:
+        if hasattr(self.search, "use_prediction"):
+            self.search.use_prediction(self._prediction())
         point: Array = np.asarray(self.search.ask(1), dtype=np.float64)
         if point.shape != (1, self.validation.space.dimension) or not ((point >= 0) & (point <= 1)).all():
             raise InputError(
@@ -278,6 +332,15 @@ class Campaign:
                 f"got {point.tolist()}."
             )
         return np.asarray(point[0])
+
+    def _prediction(self) -> Prediction | None:
+        """Return the distance that the trajectories executed so far predict."""
+        executed = [
+            (trial.unit_point, trajectory)
+            for trial in self.completed
+            if (trajectory := self.store.trajectory(trial.number, "system")) is not None
+        ]
+        return predict_distance(self.validation, executed)
 
     def _origin(self) -> Origin:
         if getattr(self.search, "iid", False):

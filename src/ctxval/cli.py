@@ -21,14 +21,15 @@ from ctxval.campaign import Campaign
 from ctxval.certificates import KINDS, Certificate, Options, Sample, TheoremConstants, certify
 from ctxval.config import Settings, read_settings, stored_settings
 from ctxval.describe import describe
-from ctxval.errors import CtxvalError, InputError, StoreError
+from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError, UnknownNameError
 from ctxval.experiment import Experiment
 from ctxval.store import Store
 from ctxval.trial import Trial
 from ctxval.truth import Truth
-from ctxval.verdict import CONFIDENCE, Verdict, is_decided, judge, judge_by, require_threshold
+from ctxval.verdict import CONFIDENCE, Verdict, counterexample, is_decided, judge, judge_by, require_threshold
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED = 1, 2, 3, 130
+_BAD = (InputError, StoreError, CertificateError)
 
 app = typer.Typer(
     name="ctxval",
@@ -56,7 +57,7 @@ def _command(function: Callable[..., Any]) -> Callable[..., Any]:
             return function(*args, **kwargs)
         except CtxvalError as error:
             _err.print(f"[bold red]error:[/] {_escaped(str(error))}", highlight=False, soft_wrap=True)
-            raise typer.Exit(BAD_INPUT if isinstance(error, InputError | StoreError) else CANNOT_GO_ON) from None
+            raise typer.Exit(BAD_INPUT if isinstance(error, _BAD) else CANNOT_GO_ON) from None
         except (typer.Exit, typer.Abort):
             raise
         except KeyboardInterrupt:
@@ -140,23 +141,48 @@ def certify_store(
     """Say what the trials of a store prove, and with what confidence; nothing is executed but for an audit."""
     opened = Store.existing(store)
     limit = None if threshold is None else require_threshold(threshold)
-    if audit is not None:
-        _run_audit(opened, audit, show=not as_json)
     chosen = kind or ("posterior" if audit is None else "audit")
     options = Options(stochastic, discard, constant, _theorem(theorem))
+    # All of it before an audit is paid for.
+    _require_shares(confidence, volume)
+    if chosen not in KINDS:
+        raise UnknownNameError.among("certificate", chosen, KINDS)
+    if audit is not None:
+        _run_audit(opened, audit, show=not as_json)
     trials = opened.trials()
-    certificate = certify(Sample.of(trials), chosen, confidence, options)
-    verdict = None if limit is None else judge_by(certificate, trials, limit, volume=volume)
+    found = None if limit is None else counterexample(trials, limit)
+    certificate, refusal = _certificate(trials, chosen, confidence, options, needed=found is None)
+    verdict = found if limit is None or certificate is None else judge_by(certificate, trials, limit, volume=volume)
     if verdict is not None and verdict.answer == "undecided" and chosen == "posterior":
         verdict = judge(trials, verdict.threshold, confidence, stochastic=stochastic)
     answer = {} if verdict is None else {"verdict": verdict.answer, "reason": verdict.reason, "threshold": limit}
-    report = {**answer, **certificate.to_json(), "expected": _certificate_of(verdict)["expected"], "store": str(store)}
+    said = {"kind": chosen, "refused": refusal} if certificate is None else certificate.to_json()
+    report = {**answer, **said, "expected": _certificate_of(verdict)["expected"], "store": str(store)}
     if as_json:
         print(json.dumps(describe(report), allow_nan=False))
     else:
-        _print_certificate(certificate, verdict)
+        _print_certificate(certificate, verdict, refusal)
     if verdict is not None and verdict.answer == "falsified":
         raise typer.Exit(FALSIFIED)
+
+
+def _require_shares(confidence: float, volume: float) -> None:
+    if not 0 < confidence < 1:
+        raise InputError(f"the confidence must be strictly between 0 and 1, got {confidence!r}.")
+    if not 0 <= volume < 1:
+        raise InputError(f"the volume must be a share of the task space, at least 0 and below 1, got {volume!r}.")
+
+
+def _certificate(
+    trials: list[Trial], kind: str, confidence: float, options: Options, *, needed: bool
+) -> tuple[Certificate | None, str | None]:
+    """Return the certificate; where a counterexample was executed, a refusal does not matter."""
+    try:
+        return certify(Sample.of(trials), kind, confidence, options), None
+    except CertificateError as error:
+        if needed:
+            raise
+        return None, str(error)
 
 
 def _run_audit(store: Store, draws: int, *, show: bool) -> None:
@@ -175,15 +201,20 @@ def _theorem(text: str | None) -> TheoremConstants | None:
         return None
     try:
         return TheoremConstants(*(float(part) for part in text.split(",")))
+    except CertificateError:
+        raise  # it names the number that is wrong
     except (ValueError, TypeError) as error:
         raise InputError(f"--theorem must be five numbers SCALE,NOISE,A,B,GAIN, got {text!r}.") from error
 
 
-def _print_certificate(certificate: Certificate, verdict: Verdict | None) -> None:
+def _print_certificate(certificate: Certificate | None, verdict: Verdict | None, refusal: str | None) -> None:
     if verdict is not None:
         _out.print(
             f"[bold]{verdict.answer}[/] against {verdict.threshold:g}: {_escaped(verdict.reason)}", highlight=False
         )
+    if certificate is None:
+        _out.print(f"no certificate: {_escaped(str(refusal))}", highlight=False)
+        return
     _out.print(f"{certificate.kind}: {_escaped(certificate.statement)}", highlight=False)
     if certificate.doubt is not None:
         _out.print(f"[bold red]withdrawn[/]: {_escaped(certificate.doubt)}.", highlight=False)

@@ -3,8 +3,8 @@
 The process is ``f = mu + sigma g``, g with unit variance and a Matern kernel with one length-scale for each dimension,
 or, for values that cannot be negative, the logarithm of the values is.
 The prior is flat in mu and in log sigma, so that both integrate out in closed form (O'Hagan 1978; Rasmussen and
-Williams 2006, Sec. 2.7) and whatever is said does not depend on the units of f. What is left, the scale of the values, the
-smoothness, the length-scales and the noise, is drawn by slice sampling (Neal 2003), which has no step size to tune.
+Williams 2006, Sec. 2.7) and whatever is said does not depend on the units of f. What is left, the scale of the values,
+the smoothness, the length-scales and the noise, is drawn by slice sampling (Neal 2003), which has no step size to tune.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ class _Sampler:
         return conditioned.log_likelihood + self.prior.log_density(state[:-1])
 
     def _sweep(self) -> None:
-        """Move along each length-scale, along all of them together and the noise, then to another smoothness or scale."""
+        """Move along each length-scale, all of them together and the noise, then to another smoothness or scale."""
         directions = [np.append(np.ones(self.d), 0.0)]
         if self.d > 1:
             directions += list(np.eye(self.d + 1)[: self.d])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ctxval.certificates import Certificate, Forecast, Maxima, Sample, certify_posterior, draw_maxima, forecast
+from ctxval.certificates.base import require_probability
 from ctxval.errors import CertificateError, InputError
 from ctxval.trial import Trial
 
@@ -116,17 +117,19 @@ def judge(
 
     Raises:
         InputError: the threshold is not a positive number.
-        CertificateError: the confidence is not a probability, or a trial is open.
+        CertificateError: the confidence is not a probability.
     """
+    require_probability("confidence", confidence)
     found = counterexample(trials, threshold)
     if found is not None:
         return found
     try:
         sample = Sample.of(trials)
         drawn = draw_maxima(sample, stochastic=stochastic)
+        certificate = certify_posterior(sample, confidence, stochastic=stochastic, found=drawn)
     except CertificateError as error:
         return Verdict("undecided", threshold, str(error))
-    verdict = judge_by(certify_posterior(sample, confidence, stochastic=stochastic, found=drawn), trials, threshold)
+    verdict = judge_by(certificate, trials, threshold)
     return verdict if verdict.answer == "validated" else _with_forecast(verdict, sample, drawn, confidence)
 
 
@@ -145,7 +148,9 @@ def is_decided(
 
     Raises:
         InputError: the threshold is not a positive number.
+        CertificateError: the confidence is not a probability.
     """
+    require_probability("confidence", confidence)
     if counterexample(trials, threshold) is not None:
         return True
     try:

@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval.certificates import Certificate, Sample, certify_scenario, samples_needed, tail, volume_bound
+from ctxval.certificates import (
+    Certificate,
+    Sample,
+    certify_audit,
+    certify_scenario,
+    samples_needed,
+    tail,
+    volume_bound,
+)
 from ctxval.errors import CertificateError
 
 DRAWS = 100_000
@@ -78,8 +86,9 @@ def test_a_certificate_says_everything() -> None:
     assert certificate.volume == pytest.approx(1 - 0.05 ** (1 / 3))
     assert "no bound on d*" in " ".join(certificate.assumptions)
     assert certificate.to_json()["kind"] == "scenario"
-    assert certificate.covers(0.4, volume=0.5)
-    assert not certificate.covers(0.39, volume=0.5)
+    assert certificate.covers(0.4, volume=0.7)
+    assert not certificate.covers(0.4, volume=0.6)
+    assert not certificate.covers(0.39, volume=0.7)
     assert not certificate.covers(0.4)
 
 
@@ -106,3 +115,76 @@ def test_open_trials_and_unequal_parts_are_refused() -> None:
         Sample(np.zeros((1, 1)), np.zeros(1), ["iid"], ["open"])
     with pytest.raises(CertificateError, match="equally many"):
         Sample(np.zeros((2, 1)), np.zeros(1), ["iid"], ["completed"])
+
+
+# The audit
+
+
+def mixed(adaptive: list[float], drawn: list[float]) -> Sample:
+    found = np.array([*adaptive, *drawn])
+    origins = ["acquisition"] * len(adaptive) + ["iid"] * len(drawn)
+    states = ["failed" if np.isnan(d) else "completed" for d in found]
+    return Sample(np.full((len(found), 1), 0.5), found, origins, states)  # type: ignore[arg-type]
+
+
+def test_an_audit_bounds_the_volume_above_the_worst_of_all_trials() -> None:
+    certificate = certify_audit(mixed([0.9, 0.2], [0.1, 0.3, 0.5]), 0.9)
+    assert certificate.upper_bound == 0.9
+    assert certificate.volume == pytest.approx(1 - 0.1 ** (1 / 3))
+    assert certificate.trials == 3
+    assert certificate.details == {
+        "largest_found": 0.9,
+        "largest_drawn": 0.5,
+        "largest_chosen": 0.9,
+        "exceeding": 0,
+    }
+    assert certify_audit(mixed([0.4, np.nan], [0.1, 0.5, 0.6])).details["exceeding"] == 2
+    assert certify_audit(mixed([], [0.1, 0.5])).details["exceeding"] is None
+    assert not certificate.covers(1.0)  # it is no bound on d*
+    assert certificate.covers(1.0, volume=0.6)
+
+
+@pytest.mark.parametrize("head_start", ["none", "random", "after looking"])
+def test_the_audits_statement_holds_after_adaptive_search(head_start: str) -> None:
+    # With uniform d, the volume above h is 1 - h.
+    n, confidence = 30, 0.9
+    rng = np.random.default_rng(len(head_start))
+    audited = rng.random((DRAWS, n)).max(axis=1)
+    searched = {
+        "none": np.zeros(DRAWS),
+        "random": rng.random((DRAWS, 3)).max(axis=1),
+        # A search that went on after the audit, from what it showed.
+        "after looking": audited + (1 - audited) * 0.5 * rng.random(DRAWS),
+    }[head_start]
+    volume = certify_audit(mixed([0.5], [0.1] * n), confidence).volume
+    held = (1 - np.maximum(audited, searched) <= volume).mean()
+    allowed = 4.5 * np.sqrt(confidence * (1 - confidence) / DRAWS)
+    assert held > confidence - allowed
+    assert (abs(held - confidence) < allowed) == (head_start == "none")  # exact, where the search adds nothing
+
+
+@given(st.integers(1, 300), betas)
+def test_more_audited_draws_never_widen_and_more_confidence_never_tightens(n: int, beta: float) -> None:
+    certificates = [certify_audit(mixed([0.5], [0.1] * m), 1 - b) for m, b in ((n, beta), (n + 1, beta), (n, beta / 2))]
+    assert certificates[1].volume <= certificates[0].volume <= certificates[2].volume
+
+
+def test_an_audit_without_draws_or_with_a_failed_one_is_refused() -> None:
+    with pytest.raises(CertificateError, match="there is none"):
+        certify_audit(mixed([0.5, 0.2], []))
+    with pytest.raises(CertificateError, match="count as violations"):
+        certify_audit(mixed([0.5], [0.2, np.nan]))
+
+
+def test_a_search_that_failed_does_not_spoil_an_audit() -> None:
+    assert certify_audit(mixed([0.5, np.nan], [0.2, 0.3])).upper_bound == 0.5
+
+
+def test_to_discard_as_many_as_failed_would_be_more_often_wrong_than_stated() -> None:
+    # Why an audit with failures is refused and not answered by discarding them: k must be chosen beforehand.
+    n, beta, failing, rng = 59, 0.05, 0.0494, np.random.default_rng(8)
+    badness = np.sort(rng.random((DRAWS, n)), axis=1)
+    failed = (badness > 1 - failing).sum(axis=1)
+    volume_left = 1 - badness[np.arange(DRAWS), n - 1 - failed]
+    claimed = np.array([volume_bound(n, k, beta) for k in range(n - 1)])[failed]
+    assert (volume_left > claimed).mean() > beta + 0.02

@@ -2,7 +2,9 @@ r"""The paper's Proposition 1 and Corollary 1: how far GP-UCB may still be from 
 
 With the information gain gamma_n of the kernel, and |P| the dimension of the task space,
 
-    Pr(d* > best_n + r_n for all n) < eps,   r_n = C sqrt(|P| gamma_n / n).
+    Pr(d* > best_n + r_n for some n) < eps,   r_n = C sqrt(|P| gamma_n / n)
+
+(the paper prints "for all n", from which its corollary would not follow; its proof gives "for some n").
 
 For a Matern kernel of smoothness nu, gamma_n = O(n^(e) log n) with e = |P|(|P|+1) / (2 nu + |P|(|P|+1)); without the
 logarithm, nu = 3/2 gives the printed r_n = C sqrt(|P| / n^(3 / (3 + |P|(|P|+1)))). For the squared exponential,

@@ -89,7 +89,9 @@ def draw_maxima(
     """
     X, y = _required(sample)
     rng = np.random.default_rng(seed)
-    believed = Prior(noise=STOCHASTIC if stochastic else (EXACT, EXACT)) if prior is None else prior
+    # Noise on the logarithms would bound the median: the expected distance is not the exponential of the expected one.
+    usual = Prior(noise=STOCHASTIC, offset=None) if stochastic else Prior()
+    believed = usual if prior is None else prior
     best_first = X[np.argsort(-y, kind="stable")]
     with single_threaded():
         conditioned = draw_hyperparameters(X, y, draws, rng, believed)
@@ -165,8 +167,9 @@ def _assumptions(stochastic: bool) -> tuple[str, ...]:
         if stochastic
         else "each task has one distance: the system is deterministic"
     )
+    what = "expected distance" if stochastic else "distance, or its logarithm,"
     return (
-        "the distance, or its logarithm, is a draw from a Gaussian process: a constant mean, a Matern kernel of "
+        f"the {what} is a draw from a Gaussian process: a constant mean, a Matern kernel of "
         "smoothness 3/2 or 5/2, one length-scale for each parameter, all of them unknown and integrated over",
         "it is as rough in one part of the task space as in another: a peak narrower than the gaps between the trials, "
         "of which no trial shows a trace, is not covered; audit for that",

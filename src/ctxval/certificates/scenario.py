@@ -147,8 +147,21 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
             "nothing is assumed of how the distance depends on the task",
             "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
         ),
-        details={"largest_drawn": drawn.best, "largest_found": h, "exceeding": int((drawn.distances >= h).sum())},
+        details={"largest_found": h, **_against_the_search(sample, drawn)},
     )
+
+
+def _against_the_search(sample: Sample, drawn: Sample) -> dict[str, float | int | None]:
+    """Return the largest distances that were drawn and that were found otherwise, and how many draws exceed these."""
+    chosen = sample.distances[[origin != "iid" for origin in sample.origins]]
+    if not np.isfinite(chosen).any():
+        return {"largest_drawn": drawn.best, "largest_chosen": None, "exceeding": None}
+    largest = float(np.nanmax(chosen))
+    return {
+        "largest_drawn": drawn.best,
+        "largest_chosen": largest,
+        "exceeding": int((drawn.distances > largest).sum()),
+    }
 
 
 def _name(discarded: int) -> str:

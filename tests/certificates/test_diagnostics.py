@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import kstest, t
+
+from ctxval.certificates import Sample, certify_posterior, diagnose, draw_maxima
+from ctxval.hyperposterior import EXACT, Conditioned, Hyperparameters, condition
+
+GRID = np.linspace(0, 1, 121)[:, None]
+KNOWN = Hyperparameters(1.5, np.array([np.log(0.3)]), float(np.log(EXACT)))
+
+
+def adaptive(hyper: Hyperparameters, rng: np.random.Generator, n: int = 10) -> tuple[np.ndarray, np.ndarray]:
+    """Points and values of a path, each point chosen from the values before it: near the best, or far from all."""
+    K = hyper.kernel(GRID, GRID) + 1e-9 * np.eye(len(GRID))
+    path = 5 + 3 * np.linalg.cholesky(K) @ rng.normal(size=len(GRID))
+    rows = [int(rng.integers(len(GRID)))]
+    while len(rows) < n:
+        free = [row for row in range(len(GRID)) if row not in rows]
+        best = rows[int(np.argmax(path[rows]))]
+        far = [min(abs(row - known) for known in rows) for row in free]
+        near = [abs(row - best) for row in free]
+        rows.append(free[int(np.argmin(near)) if len(rows) % 2 else int(np.argmax(far))])
+    return GRID[rows], path[rows]
+
+
+def surprises(hyper: Hyperparameters, assumed: Hyperparameters) -> list[float]:
+    drawn = [adaptive(hyper, np.random.default_rng([4, seed])) for seed in range(250)]
+    return [diagnose([condition(assumed, X, y)]).surprise for X, y in drawn]
+
+
+def test_surprises_of_the_process_itself_are_uniform_whatever_chose_the_tasks() -> None:
+    assert kstest(surprises(KNOWN, KNOWN), "uniform").pvalue > 1e-3
+
+
+def test_of_independent_values_the_surprise_is_the_t_tests_of_each_against_those_before() -> None:
+    X, y = np.linspace(0, 1, 7)[:, None], np.random.default_rng(3).normal(size=7)
+    independent = Hyperparameters(1.5, np.array([np.log(1e-4)]), float(np.log(EXACT)))
+    tails = [t(k - 1).sf((y[k] - y[:k].mean()) / (y[:k].std(ddof=1) * np.sqrt(1 + 1 / k))) for k in range(2, len(y))]
+    diagnosis = diagnose([condition(independent, X, y)])
+    assert diagnosis.surprise == pytest.approx(1 - (1 - min(tails)) ** len(tails), rel=1e-6)
+    assert diagnosis.trial == 2 + int(np.argmin(tails))
+
+
+def test_surprises_of_another_process_are_not() -> None:
+    rough = Hyperparameters(1.5, np.array([np.log(0.02)]), float(np.log(EXACT)))
+    assert kstest(surprises(rough, KNOWN), "uniform").pvalue < 1e-6
+
+
+def spiked(height: float) -> tuple[np.ndarray, np.ndarray]:
+    X = np.append(np.linspace(0, 1, 24), 0.5)[:, None]
+    y = np.sin(3 * X[:, 0])
+    y[-1] += height
+    return X, y
+
+
+@pytest.mark.parametrize(("height", "believed"), [(0.0, True), (20.0, False)])
+def test_a_spike_that_nothing_announced_withdraws_the_bound(height: float, believed: bool) -> None:
+    X, y = spiked(height)
+    sample = Sample(X, y, ["acquisition"] * len(y), ["completed"] * len(y))
+    certificate = certify_posterior(sample, 0.9, found=draw_maxima(sample, draws=12, paths=2))
+    assert (certificate.doubt is None) == believed
+    assert certificate.covers(1e6) == believed
+    if not believed:
+        assert certificate.doubt is not None
+        assert f"trial {len(y) - 1} " in certificate.doubt  # as trials are numbered, from 0
+        assert "withdrawn" in certificate.doubt
+
+
+def test_a_value_that_is_surprisingly_low_withdraws_nothing() -> None:
+    X, y = spiked(-5.0)
+    assert diagnose([condition(KNOWN, X, y)]).doubt is None
+
+
+def test_the_leave_one_out_error_is_that_of_leaving_each_out() -> None:
+    rng = np.random.default_rng(1)
+    X, hyper = rng.random((9, 2)), Hyperparameters(2.5, np.log([0.5, 0.7]), float(np.log(0.01)))
+    y = np.sin(4 * X).sum(axis=1)
+    seen = condition(hyper, X, y)
+    squares = []
+    for row in range(len(y)):
+        others = np.arange(len(y)) != row
+        K = hyper.kernel(X[others], X[others]) + 0.01 * np.eye(8)
+        k = hyper.kernel(X[row : row + 1], X[others])[0]
+        mean = seen.mean + k @ np.linalg.solve(K, y[others] - seen.mean)
+        variance = seen.scale2 * (1.01 - k @ np.linalg.solve(K, k))
+        squares.append((y[row] - mean) ** 2 / variance)
+    assert diagnose([seen]).left_out == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-8)
+
+
+def test_many_draws_of_hyperparameters_are_averaged() -> None:
+    X, y = adaptive(KNOWN, np.random.default_rng(2))
+    other = Hyperparameters(2.5, np.array([np.log(0.6)]), float(np.log(EXACT)))
+
+    def of(*hypers: Hyperparameters) -> float:
+        conditioned: list[Conditioned] = [condition(hyper, X, y) for hyper in hypers]
+        return diagnose(conditioned).surprise
+
+    low, high = sorted([of(KNOWN), of(other)])
+    assert of(KNOWN, KNOWN) == pytest.approx(of(KNOWN))
+    assert low - 1e-12 <= of(KNOWN, other) <= high + 0.5
+
+
+def test_a_diagnosis_is_ready_for_json() -> None:
+    X, y = spiked(1.0)
+    diagnosis = diagnose([condition(KNOWN, X, y)])
+    assert set(json.loads(json.dumps(diagnosis.to_json()))) >= {"surprise", "trial", "left_out"}
+    assert 0 <= diagnosis.surprise <= 1
+
+
+def test_units_do_not_matter() -> None:
+    X, y = spiked(1.0)
+    plain, moved = (diagnose([condition(KNOWN, X, values)]) for values in (y, 1000 * y - 7))
+    assert moved.surprise == pytest.approx(plain.surprise, rel=1e-3)
+    assert (moved.trial, moved.left_out) == (plain.trial, pytest.approx(plain.left_out, rel=1e-3))

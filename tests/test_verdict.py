@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ctxval import Trial
+from ctxval.certificates import (
+    Certificate,
+    Maxima,
+    Sample,
+    certify_audit,
+    certify_posterior,
+    certify_scenario,
+    draw_maxima,
+)
+from ctxval.errors import CertificateError, InputError
+from ctxval.trial import Origin, State
+from ctxval.verdict import counterexample, is_decided, judge, judge_by, require_threshold
+
+WORST = 1.0
+
+
+@pytest.fixture(autouse=True)
+def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take few draws of d*: what is tested here does not depend on how many there are."""
+
+    def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
+        return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
+
+    for module in ("ctxval.verdict", "ctxval.certificates.posterior"):
+        monkeypatch.setattr(f"{module}.draw_maxima", fewer)
+
+
+def trial(
+    number: int, x: float, distance: float | None, origin: Origin = "acquisition", state: State | None = None
+) -> Trial:
+    ended: State = state or ("failed" if distance is None else "completed")
+    return Trial(number, origin, ended, np.array([x]), {"x": x}, 1, ended != "open", distance)
+
+
+def trials(n: int = 8, origin: Origin = "acquisition") -> list[Trial]:
+    """A bump of height 1, known at n even points."""
+    return [trial(k, x, WORST * np.sin(3 * x)) for k, x in enumerate(np.linspace(0, 1.0, n).tolist())]
+
+
+def certificate(upper: float, doubt: str | None = None, volume: float = 0.0) -> Certificate:
+    return Certificate("posterior", "", upper, 0.95, volume, 5, (), doubt=doubt)
+
+
+# Counterexamples
+
+
+def test_an_executed_distance_above_the_threshold_falsifies() -> None:
+    known = trials()
+    largest = max(t.distance or 0.0 for t in known)
+    found = counterexample(known, 0.5)
+    assert found is not None
+    assert found.answer == "falsified"
+    assert found.witness is not None
+    assert found.witness.distance == largest
+    assert f"trial {found.witness.number} was executed" in str(found)
+    assert str(found).startswith("falsified: ")
+
+
+def test_a_distance_at_the_threshold_is_no_counterexample_and_neither_is_a_failure() -> None:
+    known = [trial(0, 0.1, 0.5), trial(1, 0.2, None), trial(2, 0.3, None, state="open")]
+    assert counterexample(known, 0.5) is None
+    assert counterexample(known, np.nextafter(0.5, 0)) is not None
+    assert counterexample([], 0.5) is None
+
+
+@pytest.mark.parametrize("threshold", [0.0, -1.0, np.nan, np.inf, "1", None])
+def test_a_threshold_is_a_positive_number(threshold: object) -> None:
+    with pytest.raises(InputError, match="positive number"):
+        require_threshold(threshold)  # type: ignore[arg-type]
+    for function in (counterexample, judge, is_decided):
+        with pytest.raises(InputError, match="positive number"):
+            function(trials(), threshold)  # type: ignore[operator]
+
+
+# By a certificate
+
+
+def test_a_bound_at_most_the_threshold_validates() -> None:
+    verdict = judge_by(certificate(1.2), trials(), 1.2)
+    assert verdict.answer == "validated"
+    assert verdict.certificate is not None
+    assert "with confidence 0.95" in verdict.reason
+
+
+def test_a_counterexample_wins_over_any_bound() -> None:
+    verdict = judge_by(certificate(0.1), trials(), 0.5)
+    assert verdict.answer == "falsified"
+    assert verdict.witness is not None
+    assert verdict.certificate is not None
+
+
+def test_a_bound_above_the_threshold_leaves_it_undecided() -> None:
+    verdict = judge_by(certificate(1.3), trials(), 1.2)
+    assert verdict.answer == "undecided"
+    assert "d* may be up to 1.3" in verdict.reason
+
+
+def test_a_withdrawn_bound_validates_nothing() -> None:
+    verdict = judge_by(certificate(1.1, doubt="trial 3 is too large"), trials(), 1.2)
+    assert verdict.answer == "undecided"
+    assert verdict.reason == "trial 3 is too large."
+
+
+def test_a_volume_is_left_out_only_where_that_is_accepted() -> None:
+    partial = certificate(1.1, volume=0.05)
+    refused = judge_by(partial, trials(), 1.2)
+    assert refused.answer == "undecided"
+    assert "leaves out 5 % of the task space" in refused.reason
+    assert judge_by(partial, trials(), 1.2, volume=0.04).answer == "undecided"
+    accepted = judge_by(partial, trials(), 1.2, volume=0.05)
+    assert accepted.answer == "validated"
+    assert "but for 5 % of the task space" in accepted.reason
+
+
+def test_scenario_and_audit_bounds_judge_too() -> None:
+    drawn = [trial(k, x, 0.5 * x, "iid") for k, x in enumerate(np.linspace(0, 1, 60).tolist())]
+    for made in (certify_scenario(Sample.of(drawn), 0.9), certify_audit(Sample.of(drawn), 0.9)):
+        assert judge_by(made, drawn, 0.6).answer == "undecided"
+        assert judge_by(made, drawn, 0.6, volume=0.05).answer == "validated"
+        assert judge_by(made, drawn, 0.4, volume=0.05).answer == "falsified"
+
+
+# By the posterior
+
+
+def test_the_posterior_bound_validates_what_is_far_above_it() -> None:
+    verdict = judge(trials(), 50.0)
+    assert verdict.answer == "validated"
+    assert verdict.certificate is not None
+    assert verdict.certificate.kind == "posterior"
+    assert verdict.expected is None
+
+
+def test_a_counterexample_needs_no_certificate_and_no_model() -> None:
+    known = [*trials(3), trial(3, 0.7, None), trial(4, 0.8, None, state="open")]
+    assert judge(known, 0.5).answer == "falsified"
+    assert is_decided(known, 0.5)
+
+
+def test_undecided_says_what_more_would_take() -> None:
+    known = trials(5)
+    upper = certify_posterior(Sample.of(known)).upper_bound
+    tau = 0.5 * (upper + max(t.distance or 0.0 for t in known))
+    verdict = judge(known, tau)
+    assert verdict.answer == "undecided"
+    assert verdict.expected is not None
+    assert verdict.expected.executions is None or verdict.expected.executions >= 1
+    assert "more executions are expected to decide" in verdict.reason
+    assert not is_decided(known, tau)
+
+
+def test_a_bound_that_is_withdrawn_is_not_forecast() -> None:
+    known = [*trials(25), trial(25, 0.51, 30.0)]
+    verdict = judge(known, 1e6)
+    assert verdict.answer == "undecided"
+    assert "withdrawn" in verdict.reason
+    assert verdict.expected is None
+    assert not is_decided(known, 1e6)
+
+
+@pytest.mark.parametrize(
+    ("known", "sentence"),
+    [
+        ([], "nothing was executed"),
+        (trials(3), "at least 4 trials"),
+        ([*trials(), trial(8, 0.4, None)], "1 of 9 executions failed"),
+        ([*trials(), trial(8, 0.4, None, state="open")], "are open"),
+        ([trial(k, k / 9, 0.3) for k in range(9)], "they say nothing of d"),
+    ],
+)
+def test_where_nothing_can_be_certified_the_verdict_is_open_and_says_why(known: list[Trial], sentence: str) -> None:
+    verdict = judge(known, 5.0)
+    assert verdict.answer == "undecided"
+    assert sentence in verdict.reason
+    assert not is_decided(known, 5.0)
+
+
+def test_a_confidence_beyond_the_draws_is_undecided_and_one_that_is_none_is_refused() -> None:
+    verdict = judge(trials(), 50.0, confidence=1 - 1e-9)
+    assert verdict.answer == "undecided"
+    assert "needs more than" in verdict.reason
+    for function in (judge, is_decided):
+        with pytest.raises(CertificateError, match="strictly between 0 and 1"):
+            function(trials(), 50.0, confidence=1.5)
+        with pytest.raises(CertificateError, match="strictly between 0 and 1"):
+            function(trials(), 0.5, confidence=0.0)
+
+
+@pytest.mark.parametrize("stochastic", [False, True])
+def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> None:
+    known = trials(6)
+    upper = certify_posterior(Sample.of(known), 0.95, stochastic=stochastic).upper_bound
+    best = max(t.distance or 0.0 for t in known)
+    for threshold in (0.9 * best, 1.02 * upper, best + 0.2 * (upper - best)):
+        verdict = judge(known, threshold, stochastic=stochastic)
+        assert is_decided(known, threshold, stochastic=stochastic) == (verdict.answer != "undecided")
