@@ -133,7 +133,7 @@ def test_the_logarithm_is_recognised_and_never_taken_of_negative_values() -> Non
     z = np.linalg.cholesky(dense(hyperparameters(2.5, (0.2,), 1e-9), X)) @ np.random.default_rng(2).normal(size=30)
 
     def share(y: np.ndarray) -> float:
-        draws = draw_hyperparameters(X, y, 10, np.random.default_rng(0))
+        draws = draw_hyperparameters(X, y, 10, np.random.default_rng(0), Prior(spread_share=1.0))
         return float(np.mean([np.isfinite(draw.warp.offset) for draw in draws]))
 
     assert share(np.exp(2 * z)) > 0.9

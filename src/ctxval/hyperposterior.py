@@ -15,12 +15,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
-from ctxval.arrays import Array, ArrayLike
+from ctxval.arrays import Array, ArrayLike, Rows
 from ctxval.errors import InputError
 from ctxval.kernels import Matern
 
 EXACT = 1e-10
 """Noise variance, relative to sigma^2, of values without noise: it keeps the Cholesky factor safe."""
+
+_FEWEST = 6
+"""Data that are asked apart at least."""
 
 _STEP = 1.0
 _MOST_STEPS = 8
@@ -67,6 +70,11 @@ class Prior:
         noise: bounds of the noise variance relative to sigma^2, log-uniform between; equal bounds fix it.
         offset: of the logarithm, in means of the values; the logarithm is as likely as the values themselves, where
             none is negative. None leaves it out.
+        spread_share: share of the data, those spread best, that are asked apart from the others. A search crowds its
+            points where the values are smooth and high, and there they speak for smoothness everywhere. Each draw
+            given all data is made as rough as one given these alone, where that one is rougher. With 1 there is
+            none of this: then bounds are exact on draws of the prior, and too low on kinks, jumps and heavy tails
+            (docs/calibration.md).
     """
 
     smoothness: tuple[float, ...] = (1.5, 2.5)
@@ -74,6 +82,7 @@ class Prior:
     spread: float = 1.0
     noise: tuple[float, float] = (EXACT, EXACT)
     offset: float | None = 0.1
+    spread_share: float = 0.5
 
     def warps(self, y: Array) -> tuple[Warp, ...]:
         """Return the scales that values ``(n,)`` may have."""
@@ -182,7 +191,20 @@ def draw_hyperparameters(
     """
     if len(y) < 3 or not np.isfinite(y).all() or np.ptp(y) == 0:
         raise InputError(f"hyperparameters need at least three finite values that differ, got {y.tolist()}.")
-    return _Sampler(X, y, Prior() if prior is None else prior, rng).draw(count)
+    believed = Prior() if prior is None else prior
+    drawn = _Sampler(X, y, believed, rng).draw(count)
+    apart = max(_FEWEST, int(np.ceil(believed.spread_share * len(y))))
+    if apart < len(y):
+        rows = _spread(X, y, apart)
+        rougher = _Sampler(X[rows], y[rows], believed, rng).draw(count)
+        drawn = [(_as_rough_as(own, other), warp) for (own, warp), (other, _) in zip(drawn, rougher, strict=True)]
+    return [condition(own, X, y, warp) for own, warp in drawn]
+
+
+def _as_rough_as(own: Hyperparameters, other: Hyperparameters) -> Hyperparameters:
+    """Return hyperparameters with the length-scales shrunk to those of others in the mean, and no smoother."""
+    shrink = min(0.0, float((other.log_scales - own.log_scales).mean()))
+    return Hyperparameters(min(own.nu, other.nu), own.log_scales + shrink, own.log_noise)
 
 
 class _Sampler:
@@ -197,7 +219,7 @@ class _Sampler:
         centre = np.log(prior.length_scale) + 0.5 * np.log(self.d)
         self.state = np.append(np.full(self.d, centre), 0.5 * (self.low + self.high))
 
-    def draw(self, count: int) -> list[Conditioned]:
+    def draw(self, count: int) -> list[tuple[Hyperparameters, Warp]]:
         """Return draws two sweeps apart, after a burn-in."""
         for _ in range(20):
             self._sweep()
@@ -206,7 +228,7 @@ class _Sampler:
             self._sweep()
             self._sweep()
             nu, warp = self.choice
-            draws.append(condition(self._hyperparameters(nu, self.state), self.X, self.y, warp))
+            draws.append((self._hyperparameters(nu, self.state), warp))
         return draws
 
     def _hyperparameters(self, nu: float, state: Array) -> Hyperparameters:
@@ -240,6 +262,17 @@ class _Sampler:
         densities = np.array([self._log_density(choice, self.state) for choice in choices])
         shares = np.exp(densities - densities.max())
         self.choice = choices[int(self.rng.choice(len(choices), p=shares / shares.sum()))]
+
+
+def _spread(X: Array, y: Array, count: int) -> Rows:
+    """Return the rows of the largest value and of the points farthest from those before, in the data's order."""
+    rows = [int(y.argmax())]
+    gaps = np.linalg.norm(X - X[rows[0]], axis=1)
+    while len(rows) < min(count, len(y)):
+        gaps[rows[-1]] = -1.0  # never again, though other points are where it is
+        rows.append(int(gaps.argmax()))
+        gaps = np.minimum(gaps, np.linalg.norm(X - X[rows[-1]], axis=1))
+    return np.sort(rows)
 
 
 def _slice(log_density: Callable[[Array], float], state: Array, direction: Array, rng: np.random.Generator) -> Array:

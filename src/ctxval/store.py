@@ -15,7 +15,7 @@ import numpy as np
 from ctxval.describe import first_difference
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
 from ctxval.trajectory import Trajectory
-from ctxval.trial import Trial
+from ctxval.trial import Origin, State, Trial
 
 Side = Literal["model", "system"]
 
@@ -49,6 +49,8 @@ _MIGRATIONS = (
         );
         """,
     ),
+    ("what the search thought when it chose a trial", "ALTER TABLE trials ADD COLUMN note TEXT"),
+    ("what was run, for commands that go on", "CREATE TABLE settings (key TEXT PRIMARY KEY, value TEXT NOT NULL)"),
 )
 
 
@@ -134,20 +136,34 @@ class Store:
             rows = self._connection.execute("SELECT key, value FROM experiment ORDER BY rowid").fetchall()
         return {key: json.loads(value) for key, value in rows}
 
+    def keep_settings(self, settings: dict[str, Any]) -> None:
+        """Write how to make the experiment again, for commands that are given the store alone."""
+        with self._transaction():
+            self._connection.execute("DELETE FROM settings")
+            for key, value in settings.items():
+                self._connection.execute("INSERT INTO settings VALUES (?, ?)", (key, json.dumps(value)))
+
+    def settings(self) -> dict[str, Any]:
+        """Return how to make the experiment again; empty where it was not made by a command."""
+        with self._translating():
+            rows = self._connection.execute("SELECT key, value FROM settings ORDER BY rowid").fetchall()
+        return {key: json.loads(value) for key, value in rows}
+
     # Trials
 
     def open_trial(self, trial: Trial, model_trajectory: Trajectory) -> None:
         """Store a new trial with its model trajectory, before its execution starts."""
         with self._transaction():
             self._connection.execute(
-                "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, opened_at) "
-                "VALUES (?, ?, 'open', ?, ?, ?, ?)",
+                "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, note, opened_at) "
+                "VALUES (?, ?, 'open', ?, ?, ?, ?, ?)",
                 (
                     trial.number,
                     trial.origin,
                     json.dumps(trial.unit_point.tolist()),
                     json.dumps(trial.parameters),
                     trial.attempts,
+                    json.dumps(trial.note),
                     _now(),
                 ),
             )
@@ -157,14 +173,15 @@ class Store:
         """Store a new trial that failed before S was touched."""
         with self._transaction():
             self._connection.execute(
-                "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, failure, opened_at, "
-                "closed_at) VALUES (?, ?, 'failed', ?, ?, 0, ?, ?, ?)",
+                "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, failure, note, "
+                "opened_at, closed_at) VALUES (?, ?, 'failed', ?, ?, 0, ?, ?, ?, ?)",
                 (
                     trial.number,
                     trial.origin,
                     json.dumps(trial.unit_point.tolist()),
                     json.dumps(trial.parameters),
                     trial.failure,
+                    json.dumps(trial.note),
                     _now(),
                     _now(),
                 ),
@@ -204,13 +221,10 @@ class Store:
         """Return all trials in their order."""
         with self._translating():
             rows = self._connection.execute(
-                "SELECT number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds "
-                "FROM trials ORDER BY number"
+                "SELECT number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds, "
+                "note FROM trials ORDER BY number"
             ).fetchall()
-        return [
-            Trial(number, origin, state, np.array(json.loads(unit)), json.loads(names), attempts, bool(executed), *rest)
-            for number, origin, state, unit, names, attempts, executed, *rest in rows
-        ]
+        return [_trial(*row) for row in rows]
 
     def trajectory(self, number: int, side: Side) -> Trajectory | None:
         """Return a stored trajectory of a trial; None if there is none."""
@@ -276,6 +290,14 @@ class Store:
             if isinstance(error, InputError):
                 raise
             raise StoreAccessError(f"{self._name} cannot be used as a store: {error}.") from error
+
+
+def _trial(number: int, origin: Origin, state: State, point: str, names: str, *rest: Any) -> Trial:
+    attempts, executed, distance, failure, seconds, note = rest
+    return Trial(
+        *(number, origin, state, np.array(json.loads(point)), json.loads(names), attempts, bool(executed)),
+        *(distance, failure, seconds, json.loads(note or "null")),
+    )
 
 
 def _now() -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from ctxval.arrays import Array
 from ctxval.space import Point
@@ -29,6 +29,7 @@ class Trial:
         distance: d(p), if completed.
         failure: why it failed, if it did.
         seconds: how long the execution took.
+        note: what the search thought when it chose the point, plain enough for JSON; it is reminded of it on resuming.
     """
 
     number: int
@@ -41,3 +42,4 @@ class Trial:
     distance: float | None = None
     failure: str | None = None
     seconds: float | None = None
+    note: dict[str, Any] | None = None

@@ -6,7 +6,9 @@ from typing import Any
 
 from ctxval.errors import InputError, UnknownNameError
 from ctxval.searches.annealing import Annealing
-from ctxval.searches.base import Search, SequentialSearch
+from ctxval.searches.auto import Auto
+from ctxval.searches.base import Note, Prediction, Search, SequentialSearch
+from ctxval.searches.climbs import Climbs
 from ctxval.searches.cma_es import CMAES
 from ctxval.searches.gp_ucb import GPUCB
 from ctxval.searches.random import Random, SamplingDiscarding
@@ -16,6 +18,10 @@ __all__ = [
     "GPUCB",
     "NAMES",
     "Annealing",
+    "Auto",
+    "Climbs",
+    "Note",
+    "Prediction",
     "Random",
     "SamplingDiscarding",
     "Search",
@@ -25,6 +31,8 @@ __all__ = [
 
 NAMES: dict[str, type[Any]] = {
     "annealing": Annealing,
+    "auto": Auto,
+    "climbs": Climbs,
     "cma-es": CMAES,
     "gp-ucb": GPUCB,
     "random": Random,

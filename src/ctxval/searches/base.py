@@ -3,12 +3,35 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ctxval.arrays import Array, ArrayLike, as_floats
+from ctxval.arrays import Array, ArrayLike, Rows, as_floats
 from ctxval.errors import InputError, ShapeError
+
+Note = dict[str, Any]
+"""What a search thought when it chose a point, plain enough for JSON."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What is expected of values before they are known, as a plain function of points of the unit cube.
+
+    Attributes:
+        expected: points ``(m, d)`` -> the values expected ``(m,)``, and the doubt in what leads to each, ``(m,)``: 0
+            where all of it was seen before, about 1 where nothing was. Both are NaN where there is no saying.
+        left_out: rows ``(k,)`` of the points with a known value, in the order of asking -> what would be expected
+            there, ``(k,)``, had each not been evaluated.
+        budget: how many points may be asked about in choosing one, the known ones not counted; each may cost a
+            controller's design.
+    """
+
+    expected: Callable[[Array], tuple[Array, Array]]
+    left_out: Callable[[Rows], Array]
+    budget: int
 
 
 @runtime_checkable
@@ -23,6 +46,11 @@ class Search(Protocol):
         iid: whether every point is an independent uniform draw (default False).
         initial: how many first points are an initial design (default 0).
         discard: how many of the largest values its estimate of the maximum leaves out (default 0).
+
+    Optional methods:
+        use_prediction(prediction): takes a :class:`Prediction`, or None, before each question.
+        note(): what it thought when it chose the point asked for last, plain enough for JSON, or None.
+        remember(notes): takes back, after a history was told, the note of each of its points.
     """
 
     def reset(self, dimension: int, seed: int) -> None:
@@ -49,6 +77,8 @@ class SequentialSearch(ABC):
         self._dimension, self._seed = dimension, seed
         self._points: list[Array] = []
         self._values: list[float] = []
+        self._notes: list[Note | None] = []
+        self._thought: Note | None = None
 
     def ask(self, n: int = 1) -> Array:
         """Return the next points, shape ``(n, d)``; they are pending until told."""
@@ -58,9 +88,9 @@ class SequentialSearch(ABC):
         proposals = []
         for _ in range(n):
             rng = np.random.default_rng(np.random.SeedSequence([self._seed, len(self._points)]))
+            self._thought = None
             proposals.append(self.propose(rng))
-            self._points.append(proposals[-1])
-            self._values.append(np.nan)
+            self._append(proposals[-1], np.nan, self._thought)
         return np.array(proposals)
 
     def tell(self, points: ArrayLike, values: ArrayLike) -> None:
@@ -81,10 +111,30 @@ class SequentialSearch(ABC):
         for point, value in zip(rows, scalars.tolist(), strict=True):
             slot = self._waiting_slot(point)
             if slot is None:
-                self._points.append(point)
-                self._values.append(value)
+                self._append(point, value, None)
             else:
                 self._values[slot] = value
+
+    def note(self) -> Note | None:
+        """Return what it thought when it chose the point asked for last; None if nothing worth keeping."""
+        self._require_reset()
+        return self._thought
+
+    def remember(self, notes: Sequence[Note | None]) -> None:
+        """Take back the note of each point told so far, in their order.
+
+        Raises:
+            ShapeError: there are not as many notes as points.
+        """
+        self._require_reset()
+        if len(notes) != len(self._points):
+            raise ShapeError(f"there must be one note for each of {len(self._points)} points, got {len(notes)}.")
+        self._notes = list(notes)
+
+    def _append(self, point: Array, value: float, note: Note | None) -> None:
+        self._points.append(point)
+        self._values.append(value)
+        self._notes.append(note)
 
     def _require_reset(self) -> None:
         if not hasattr(self, "_points"):
@@ -114,3 +164,8 @@ class SequentialSearch(ABC):
     def values(self) -> Array:
         """Their values, shape ``(n,)``; NaN where pending or failed."""
         return np.array(self._values)
+
+    @property
+    def notes(self) -> tuple[Note | None, ...]:
+        """What was thought when each was chosen; None where nothing was, or the point was told by hand."""
+        return tuple(self._notes)

@@ -1,0 +1,421 @@
+"""Residual dynamics learned from executions, and the distance that they predict.
+
+An execution shows a whole trajectory of transitions (x, u, x'). From them ``r(x, u) = x' - M(x, u)`` is learned, and
+``M_hat = M + r`` is a model again; wrapped as a simulated system it is a system again. So the predicted distance at p
+is the ordinary validation of M against M_hat, which designs the controller at every p and sees where that jumps.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
+
+from ctxval import kernels
+from ctxval.arrays import Array, Rows, single_threaded
+from ctxval.model import Model
+from ctxval.rollout import rollout
+from ctxval.searches import Prediction
+from ctxval.trajectory import Trajectory, Transitions
+from ctxval.validation import Validation
+
+_CENTRES, _WORK = 450, 30_000
+"""Transitions that the residual is conditioned on at most, and their number times the horizon: the time of a loop."""
+_LEARNED_FROM = 120
+"""Transitions that its hyperparameters are learned from."""
+_POOL, _DATA = 3000, 600
+"""Transitions of executions that these are chosen from, and of the model's own data: those nearest to the tasks."""
+_LOOPS, _SLOW_LOOPS = 64, 3
+"""Closed loops on M that show which transitions the tasks need, and how often one is tried where batches fail."""
+_MUCH_BETTER = 0.7
+"""What is learned without M must have this share of the error, at most, to be preferred."""
+_NEGLIGIBLE = 1e-7
+"""A residual below this share of the state's typical change is rounding."""
+_ABSURD = 1e100
+"""What is larger has diverged, and squares of it would not be finite."""
+_REACH = 5.0
+"""No residual is believed beyond this many times the largest one recorded."""
+_DESIGNS, _SLOW_DESIGNS = 2000, 150
+"""Designs for one suggestion, where the synthesizer takes batches and where not."""
+_LOOKS = 12
+"""Moments of a predicted trajectory at which its familiarity is judged."""
+_NOISE = (1e-9, 0.1)
+"""Bounds of the noise variance, as a share of the residual's mean square; the least keeps the Cholesky factor safe."""
+_KERNEL = kernels.Sum(
+    kernels.Matern(2.5, ard=True, length_scale=(0.2, 200.0), variance=(1e-6, 1e4)),
+    kernels.Linear(centre=0.0, variance=(1e-6, 1e4)),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """The posterior mean of a Gaussian process for each state's ``r(x, u)``; they share a covariance.
+
+    Attributes:
+        theta: logarithms of the hyperparameters of a Matern 5/2 kernel, a length-scale for each column, and a linear
+            kernel.
+        noise: variance of the outputs' noise.
+        centres: standardised state-input pairs that it is conditioned on, shape ``(M, n + m)``.
+        outputs: standardised residuals there, shape ``(M, n)``.
+        sources: which execution each is of; -1 for data that the model came with, shape ``(M,)``.
+        shift_in, scale_in: of the state-input pair, shapes ``(n + m,)``.
+        scale_out: of the residual, shape ``(n,)``.
+        limit: the largest standardised residual believed, shape ``(n,)``.
+        unit: a standardised residual of 1 as a share of a typical step of the system.
+        spare: more pairs, outputs and sources, which stand in where an execution is left out; None where one is.
+    """
+
+    theta: Array
+    noise: float
+    centres: Array
+    outputs: Array
+    sources: Rows
+    shift_in: Array
+    scale_in: Array
+    scale_out: Array
+    limit: Array
+    unit: float
+    spare: tuple[Array, Array, Rows] | None = None
+
+    @functools.cached_property
+    def _factor(self) -> Array:
+        covariance = _KERNEL(self.theta, self.centres, self.centres)
+        noise = self.noise
+        while True:
+            try:
+                return np.asarray(cho_factor(covariance + noise * np.eye(len(covariance)), lower=True)[0])
+            except LinAlgError:  # centres too much alike for so little noise
+                noise *= 10
+
+    @functools.cached_property
+    def _inverse_factor(self) -> Array:
+        return np.asarray(solve_triangular(self._factor, np.eye(len(self.centres)), lower=True))
+
+    @functools.cached_property
+    def _weights(self) -> Array:
+        return np.asarray(cho_solve((self._factor, True), self.outputs))
+
+    @functools.cached_property
+    def _scaled(self) -> tuple[Array, Array, Array]:
+        """What every evaluation needs: centres over length-scales, weights of the Matern and of the linear part."""
+        variance, scales, constant, slope = _parts(self.theta)
+        linear = np.vstack([constant * self._weights.sum(axis=0), slope * (self.centres.T @ self._weights)])
+        return self.centres / scales, variance * self._weights, linear
+
+    def inputs(self, x: Array, u: Array) -> Array:
+        """Return standardised pairs ``(..., n + m)``."""
+        batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+        n = x.shape[-1]
+        z = np.empty((*batch, n + u.shape[-1]))
+        z[..., :n], z[..., n:] = x, u
+        return (z - self.shift_in) / self.scale_in
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        """Return r, shapes ``(..., n), (..., m) -> (..., n)``."""
+        z = self.inputs(x, u)
+        rows = z.reshape(-1, z.shape[-1])
+        centres, weights, linear = self._scaled
+        scales = np.exp(self.theta[1:-2])
+        output = _matern(cdist(rows / scales, centres)) @ weights + linear[0] + rows @ linear[1:]
+        bounded = np.clip(output, -self.limit, self.limit)
+        return np.asarray((self.scale_out * bounded).reshape(x.shape))
+
+    def variance(self, x: Array, u: Array) -> Array:
+        """Return the posterior variance of the standardised residual, ``(...)``."""
+        z = self.inputs(x, u)
+        rows = z.reshape(-1, z.shape[-1])
+        half = self._inverse_factor @ _KERNEL(self.theta, self.centres, rows)
+        variance = _KERNEL.diagonal(self.theta, rows) - np.einsum("ij,ij->j", half, half)
+        return np.asarray(np.maximum(variance, 0.0).reshape(z.shape[:-1]))
+
+    def unfamiliarity(self, trajectory: Trajectory) -> Array:
+        """Return how uncertain a step along trajectories is, as a share of a typical step, ``(...)``."""
+        at = np.linspace(0, trajectory.horizon - 1, min(_LOOKS, trajectory.horizon)).astype(int)
+        variance = self.variance(trajectory.states[..., at, :], trajectory.inputs[..., at, :])
+        return np.asarray(self.unit * np.sqrt(variance.mean(axis=-1)))
+
+    def typical_error(self) -> float:
+        """Return the error of a step, median over the centres, each left out: a share of a typical step.
+
+        Rasmussen and Williams 2006, eq. 5.12.
+        """
+        left_out = self._weights / (self._inverse_factor**2).sum(axis=0)[:, None]
+        return self.unit * float(np.median(np.sqrt((left_out**2).mean(axis=1))))
+
+    def without(self, source: int) -> Residual:
+        """Return the residual as it is without one execution."""
+        known = (self.centres, self.outputs, self.sources)
+        both = known if self.spare is None else [np.concatenate(pair) for pair in zip(known, self.spare, strict=True)]
+        kept = [part[both[2] != source] for part in both]
+        return replace(self, centres=kept[0], outputs=kept[1], sources=kept[2], spare=None)
+
+
+def _parts(theta: Array) -> tuple[float, Array, float, float]:
+    """Return Matern variance, length-scales, and the linear kernel's constant and slope variances."""
+    values = np.exp(theta)
+    return float(values[0]), values[1:-2], float(values[-2]), float(values[-1])
+
+
+def _matern(r: Array) -> Array:
+    """Return the Matern 5/2 covariance of distances, which are overwritten."""
+    r *= np.sqrt(5.0)
+    decay = np.exp(-r)
+    decay *= 1 + r * (1 + r / 3)
+    return decay
+
+
+def learn_residual(model: Model, transitions: Transitions, sources: Rows, centres: int = _CENTRES) -> Residual | None:
+    """Learn ``r(x, u) = x' - M(x, u)`` from recorded transitions; None where there is nothing to be learned.
+
+    Args:
+        model: M.
+        transitions: of the system, N of them.
+        sources: which execution each is of, shape ``(N,)``.
+        centres: how many transitions it is conditioned on at most.
+    """
+    with np.errstate(all="ignore"):
+        residuals = transitions.x_next - model.step(transitions.x, transitions.u)
+        steps = transitions.x_next - transitions.x
+    pairs = np.concatenate([transitions.x, transitions.u], axis=1)
+    usable = (np.abs(np.concatenate([pairs, residuals, steps], axis=1)) < _ABSURD).all(axis=1)
+    if usable.sum() < 2:
+        return None
+    pairs, residuals, sources, steps = pairs[usable], residuals[usable], sources[usable], _spread(steps[usable])
+    sizes = np.sqrt((residuals**2).mean(axis=0))
+    learned = sizes > _NEGLIGIBLE * steps
+    if not learned.any():
+        return None
+    shift, scale = pairs.mean(axis=0), _spread(pairs)
+    Z, Y = (pairs - shift) / scale, residuals / np.where(learned, sizes, np.inf)
+    with single_threaded():
+        theta, noise = _most_likely(Z, Y[:, learned])
+        chosen = _well_spread(theta, noise, Z, centres)
+        others = np.setdiff1d(np.arange(len(Z)), chosen)
+        spare = others[_well_spread(theta, noise, Z[others], centres // 3)]
+    return Residual(
+        *(theta, noise, Z[chosen], Y[chosen], sources[chosen], shift, scale),
+        scale_out=np.where(learned, sizes, 0.0),
+        limit=_REACH * np.abs(Y).max(axis=0),
+        unit=float(np.sqrt(((sizes / steps)[learned] ** 2).mean())),
+        spare=(Z[spare], Y[spare], sources[spare]),
+    )
+
+
+def _spread(columns: Array) -> Array:
+    spread = columns.std(axis=0)
+    return np.where(spread > 1e-12 * np.maximum(1.0, np.abs(columns).max(axis=0)), spread, 1.0)
+
+
+def _most_likely(Z: Array, Y: Array) -> tuple[Array, float]:
+    """Return the hyperparameters and the noise that make outputs ``(N, n)`` of well-spread inputs most likely."""
+    start = np.log([1.0, *[3.0] * Z.shape[1], 0.1, 0.1, 1e-6])
+    rows = _well_spread(start[:-1], _NOISE[0], Z, _LEARNED_FROM)
+    Z, Y = Z[rows], Y[rows]
+
+    def negative(theta: Array) -> tuple[float, Array]:
+        try:
+            value, gradient = log_likelihood(theta, Z, Y)
+        except LinAlgError:
+            return 1e25, np.zeros_like(theta)
+        return -value, -gradient
+
+    bounds = [*_KERNEL.bounds(Z.shape[1]), (float(np.log(_NOISE[0])), float(np.log(_NOISE[1])))]
+    found = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
+    return np.asarray(found.x[:-1]), float(np.exp(found.x[-1]))
+
+
+def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
+    """Return ``sum_o log p(Y[:, o] | Z, theta)``, but for a constant, and its gradient (Rasmussen and Williams, 5.9).
+
+    The last of theta is the logarithm of the noise variance.
+    """
+    K = _KERNEL(theta[:-1], Z, Z)
+    noise = float(np.exp(theta[-1]))
+    K[np.diag_indices_from(K)] += noise
+    factor = cho_factor(K, lower=True)
+    alpha = cho_solve(factor, Y)
+    value = -0.5 * (Y * alpha).sum() - Y.shape[1] * np.log(np.diag(factor[0])).sum()
+    W = 0.5 * (alpha @ alpha.T - Y.shape[1] * cho_solve(factor, np.eye(len(Z))))
+    return float(value), np.append(_KERNEL.weighted_gradient(theta[:-1], Z, W), noise * np.trace(W))
+
+
+def _well_spread(theta: Array, noise: float, Z: Array, count: int) -> Rows:
+    """Return the rows that tell most of all others: those of pivoted Cholesky, each the least certain of what is left.
+
+    Fewer than ``count`` where the rest adds nothing.
+    """
+    left = _KERNEL.diagonal(theta, Z)
+    columns = np.zeros((min(count, len(Z)), len(Z)))
+    chosen: list[int] = []
+    for k in range(len(columns)):
+        pivot = int(np.argmax(left))
+        if left[pivot] <= 0.1 * noise:
+            break
+        row = _KERNEL(theta, Z[pivot : pivot + 1], Z)[0] - columns[:k, pivot] @ columns[:k]
+        columns[k] = row / np.sqrt(left[pivot])
+        left = left - columns[k] ** 2
+        left[pivot] = 0.0
+        chosen.append(pivot)
+    return np.array(chosen, dtype=np.intp)
+
+
+class Staying:
+    """The model ``x_next = x``: what is left to be learned are the system's own steps."""
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the state itself."""
+        return x
+
+
+class CorrectedModel:
+    """The model ``M_hat(x, u) = M(x, u) + r(x, u)``.
+
+    Args:
+        model: M.
+        residual: r.
+    """
+
+    def __init__(self, model: Model, residual: Residual) -> None:
+        self.model = model
+        self.residual = residual
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
+        return self.model.step(x, u) + self.residual(x, u)
+
+
+def learn_corrected(model: Model, transitions: Transitions, sources: Rows, centres: int) -> CorrectedModel | None:
+    """Return the corrected model, learned around M or, where that predicts much better, from nothing; None without any.
+
+    Around a model that is rougher than the system, such as a small network, all its kinks would have to be learned.
+    """
+    of_model = learn_residual(model, transitions, sources, centres)
+    if of_model is None:
+        return None
+    of_steps = learn_residual(Staying(), transitions, sources, centres)
+    with single_threaded():
+        if of_steps is not None and of_steps.typical_error() < _MUCH_BETTER * of_model.typical_error():
+            return CorrectedModel(Staying(), of_steps)
+    return CorrectedModel(model, of_model)
+
+
+def predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
+    """Return what the executions so far, and the data that the model came with, let one expect of d at other points.
+
+    None where nothing was recorded, where M is not wrong in it, or where no task can be planned.
+
+    Args:
+        validation: the map p -> d(p).
+        executed: points of the unit cube ``(d,)`` with the system's trajectories there.
+    """
+    with single_threaded():
+        return _predict_distance(validation, executed)
+
+
+def _predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
+    loops = _closed_loops_on_model(validation)
+    if loops is None:
+        return None
+    parts = [trajectory.transitions() for _, trajectory in executed]
+    sources = [np.full(len(part), k) for k, part in enumerate(parts)]
+    data = getattr(validation.model, "data", None)
+    if isinstance(data, Transitions) and len(data):
+        parts.append(_nearest(data, loops))
+        sources.append(np.full(len(parts[-1]), -1))
+    if not parts:
+        return None
+    together, of = Transitions.joined(parts), np.concatenate(sources)
+    if len(of) > _POOL:
+        kept = np.sort(np.random.default_rng(len(of)).permutation(len(of))[:_POOL])
+        together, of = Transitions(together.x[kept], together.u[kept], together.x_next[kept]), of[kept]
+    centres = int(np.clip(_WORK // loops.horizon, 100, _CENTRES))
+    corrected = learn_corrected(validation.model, together, of, centres)
+    if corrected is None:
+        return None
+    batched = bool(loops.batch_shape)
+    forecast = _Forecast(validation, corrected, batched, executed)
+    return Prediction(forecast, forecast.left_out, _DESIGNS if batched else _SLOW_DESIGNS)
+
+
+def _closed_loops_on_model(validation: Validation) -> Trajectory | None:
+    """Return what M promises for some tasks: a batch, or one task where there can be no batch; None for none at all."""
+    space = validation.space
+    points = space.from_unit(np.random.default_rng(0).random((_LOOPS, space.dimension)))
+    batches = [points] if getattr(validation.synthesizer, "batched", False) else []
+    for rows in [*batches, *points[:_SLOW_LOOPS]]:
+        try:
+            task = validation.task(space.parameters(rows))
+            loops = rollout(validation.model.step, validation.synthesizer.design(task, validation.model), task)
+        except Exception:  # the user's own parts, on tasks that nobody may ever ask for
+            continue
+        if loops.batch_shape == rows.shape[:-1]:
+            return loops
+    return None
+
+
+def _nearest(data: Transitions, loops: Trajectory) -> Transitions:
+    """Return the transitions that are nearest to where the tasks lead."""
+    if len(data) <= _DATA:
+        return data
+    needed = loops.transitions()
+    there = np.concatenate([needed.x, needed.u], axis=1)
+    there = there[np.isfinite(there).all(axis=1)][:: max(1, len(there) // _POOL)]
+    here = np.concatenate([data.x, data.u], axis=1)
+    if not len(there):
+        return data
+    scale = _spread(here)
+    kept = np.sort(np.argsort(cdist(here / scale, there / scale).min(axis=1), kind="stable")[:_DATA])
+    return Transitions(data.x[kept], data.u[kept], data.x_next[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class _Forecast:
+    """The validation of M against M_hat, in the unit cube."""
+
+    validation: Validation
+    corrected: CorrectedModel
+    batched: bool
+    executed: Sequence[tuple[Array, Trajectory]]
+
+    def __call__(self, points: Array) -> tuple[Array, Array]:
+        """Return the predicted distances ``(m,)`` and how little of the predicted trajectories was seen, ``(m,)``."""
+        with single_threaded():
+            return self._looped(points, self.corrected)
+
+    def left_out(self, rows: Rows) -> Array:
+        """Return the distances predicted at executed points, each from all other executions, ``(k,)``."""
+        with single_threaded():
+            return np.array([self._looped(self.executed[k][0][None], self._without(k))[0][0] for k in rows.tolist()])
+
+    def _without(self, source: int) -> CorrectedModel:
+        return CorrectedModel(self.corrected.model, self.corrected.residual.without(source))
+
+    def _looped(self, points: Array, corrected: CorrectedModel) -> tuple[Array, Array]:
+        """Halve what fails, so that a task without a prediction, NaN, costs the others nothing."""
+        if self.batched or len(points) == 1:
+            try:
+                return self._closed_loops(points, corrected)
+            except Exception:  # a task, a synthesizer or a distance of the user's, on points that nobody may ever run
+                if len(points) == 1:
+                    return np.array([np.nan]), np.array([np.nan])
+        half = len(points) // 2
+        parts = [self._looped(part, corrected) for part in (points[:half], points[half:])]
+        return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+    def _closed_loops(self, points: Array, corrected: CorrectedModel) -> tuple[Array, Array]:
+        parts, space = self.validation, self.validation.space
+        rows = points if self.batched else points[0]
+        task = parts.task(space.parameters(space.from_unit(rows)))
+        controller = parts.synthesizer.design(task, parts.model)
+        promised = rollout(parts.model.step, controller, task)
+        predicted = rollout(corrected.step, controller, task)
+        with np.errstate(all="ignore"):
+            distance = np.reshape(parts.distance(promised, predicted, task), len(points))
+            doubt = np.reshape(corrected.residual.unfamiliarity(predicted), len(points))
+        finite = np.isfinite(distance) & np.isfinite(doubt)
+        return np.where(finite, distance, np.nan), np.where(finite, doubt, np.nan)
