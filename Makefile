@@ -2,11 +2,12 @@
 PYTHON ?= python3
 BIN := .venv/bin
 KILLS ?= 50
+CAMPAIGNS ?= 120
 
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test check reliability bench study reproduce pictures clean
+.PHONY: demo test check reliability bench study reproduce calibrate pictures clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -31,6 +32,10 @@ study: .venv/.test  ## the running example over many seeds; writes docs/main-job
 pictures: .venv/.installed  ## those of the README
 	$(BIN)/ctxval run pendulum --seed 1 --store docs/pictures/pendulum.sqlite
 	rm docs/pictures/pendulum.sqlite
+
+calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/calibration.md, and resumes
+	$(BIN)/python benchmarks/calibrate.py --campaigns $(CAMPAIGNS)
+	$(BIN)/python benchmarks/calibration_page.py
 
 clean:
 	rm -rf .venv build dist

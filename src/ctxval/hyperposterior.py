@@ -36,9 +36,12 @@ class Warp:
 
     Attributes:
         offset: c of ``log(y + c)``; infinity for the values themselves.
+        unit: what the values themselves are measured in when their likelihood is compared with that of the logarithm,
+            whose mean has no unit.
     """
 
     offset: float = np.inf
+    unit: float = 1.0
 
     def forward(self, y: ArrayLike) -> Array:
         """Return values on the process's scale."""
@@ -51,8 +54,8 @@ class Warp:
         return values if np.isinf(self.offset) else np.exp(np.minimum(values, _LARGEST)) - self.offset
 
     def log_slope(self, y: Array) -> float:
-        """Return the sum of the logarithms of the slopes at values ``(n,)``."""
-        return 0.0 if np.isinf(self.offset) else -float(np.log(y + self.offset).sum())
+        """Return the sum of the logarithms of the slopes at values ``(n,)``, the flat prior of mu included."""
+        return -float(np.log(self.unit)) if np.isinf(self.offset) else -float(np.log(y + self.offset).sum())
 
 
 _LARGEST = 700.0
@@ -88,7 +91,8 @@ class Prior:
         """Return the scales that values ``(n,)`` may have."""
         if self.offset is None or y.min() < 0:
             return (Warp(),)
-        return (Warp(), Warp(self.offset * float(y.mean())))
+        mean = float(y.mean())
+        return (Warp(unit=mean), Warp(self.offset * mean))
 
     def log_density(self, log_scales: Array) -> float:
         """Return the log density of the length-scales' logarithms ``(d,)``, up to a constant."""

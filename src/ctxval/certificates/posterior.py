@@ -1,11 +1,12 @@
 r"""The Gaussian-process bound: the posterior of ``d* = max_p d(p)`` given all trials, however they were chosen.
 
 Paths are drawn from the posterior, each is maximised over the task space, and the bound is an order statistic of the
-maxima: of S draws and the truth, all alike under the prior, the truth is at most the k-th smallest draw with
-probability ``k / (S + 1)``. Smoothness, length-scales, mean, variance and noise are drawn as well, not plugged in.
-Bayes' rule does not ask why a task was chosen, nor why the campaign stopped, so the bound holds after adaptive
-sampling; what it does rest on is the prior, and :mod:`ctxval.certificates.diagnostics` says when the trials speak
-against it.
+maxima: of S independent draws and the truth, all alike under the prior, the truth is at most the k-th smallest draw
+with probability ``k / (S + 1)``; ours share hyperparameters by the handful, so that it is nearly so. Smoothness,
+length-scales, mean, variance and noise are drawn as well, not plugged in, and made no smoother than the trials that are
+spread best say. Bayes' rule does not ask why a task was chosen, nor why the campaign stopped, so the bound holds after
+adaptive sampling; what it does rest on is the prior, and :mod:`ctxval.certificates.diagnostics` says when the trials
+speak against it.
 """
 
 from __future__ import annotations
@@ -90,7 +91,8 @@ def draw_maxima(
     X, y = _required(sample)
     rng = np.random.default_rng(seed)
     # Noise on the logarithms would bound the median: the expected distance is not the exponential of the expected one.
-    usual = Prior(noise=STOCHASTIC, offset=None) if stochastic else Prior()
+    # And what is noise and what is roughness only all trials together can tell.
+    usual = Prior(noise=STOCHASTIC, offset=None, spread_share=1.0) if stochastic else Prior()
     believed = usual if prior is None else prior
     best_first = X[np.argsort(-y, kind="stable")]
     with single_threaded():
