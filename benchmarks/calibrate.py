@@ -233,7 +233,7 @@ def certified(points: Array, values: Array, seed: int, prior: Prior | None = Non
         "max_ucb": (details["instantaneous"] or {}).get("max_ucb"),
         "surprise": details["diagnosis"]["surprise"],
         "left_out": details["diagnosis"]["left_out"],
-        "doubt": certificates[0].doubt,
+        "farthest": details["diagnosis"]["farthest"],
         "logarithm": details["logarithm"],
     }
 

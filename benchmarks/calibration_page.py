@@ -12,6 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import beta, binom
 
+from ctxval.certificates.diagnostics import LEVEL, RESOLUTION
+
 from calibrate import CONFIDENCES, DRAWS, FAMILIES, PATHS, RESULTS, ROOT, SYSTEMS, Run, stored
 
 PAGE = ROOT / "docs" / "calibration.md"
@@ -51,8 +53,13 @@ class Cell:
     def falsely_validated(self, relative: float, level: int = 1) -> tuple[int, int]:
         """Return how many campaigns say validated for a threshold of so much of d*, and of how many."""
         positive = [(truth, check) for truth, check in self.results if truth > 0]
-        wrong = sum(not check["doubt"] and check["bounds"][level] <= relative * truth for truth, check in positive)
+        wrong = sum(not is_doubted(check) and check["bounds"][level] <= relative * truth for truth, check in positive)
         return wrong, len(positive)
+
+
+def is_doubted(check: dict[str, Any]) -> bool:
+    """Return whether the diagnosis withdraws a bound."""
+    return bool(check["surprise"] < LEVEL or check["farthest"] > RESOLUTION)
 
 
 def cells(names: Iterable[tuple[str, int]], key: str = "checks") -> list[Cell]:
@@ -113,7 +120,7 @@ def used_table(names: Iterable[tuple[str, int]]) -> str:
                 f"{cell.dimension}-D",
                 str(cell.n),
                 *(coverage(cell.missed(k), len(cell.results), c) for k, c in enumerate(CONFIDENCES)),
-                f"{100 * cell.share(lambda _, check: bool(check['doubt'])):.0f} %",
+                f"{100 * cell.share(lambda _, check: is_doubted(check)):.0f} %",
                 f"{100 * plugged:.0f} %",
                 f"{100 * middle:.2g} % ({100 * low:.2g} to {100 * high:.2g})",
             ]
@@ -210,7 +217,8 @@ Here the stated confidence must be the measured coverage, and the 95 % interval 
 
 Real distances are no draws from the prior. What is used is therefore no smoother than the trials that are spread best
 say (`spread_share` in `hyperposterior.py`): too wide on draws of the prior, and meant to hold on functions that are
-none. `withdrawn`: the diagnosis told the user not to believe it. `max UCB covers`: how often the paper's GP with its
+none. `withdrawn`: the diagnosis told the user not to believe it, for a surprise among the trials or a task farther than
+{resolution:g} diagonals from all of them; the coverage is of all bounds, withdrawn or not. `max UCB covers`: how often the paper's GP with its
 hyperparameters plugged in, `max (mu + sqrt(2) sigma)`, is above d*.
 
 {used}
@@ -252,6 +260,7 @@ def main() -> None:
             bounds=sum(len(cell.results) for cell in all_cells),
             draws=DRAWS,
             paths=PATHS,
+            resolution=RESOLUTION,
             exact=exact_table(),
             used=used_table(names),
             systems=used_table(systems),

@@ -6,7 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from ctxval.certificates import Certificate, Forecast, Maxima, Sample, certify_posterior, draw_maxima, forecast
+from ctxval.certificates import (
+    RESOLUTION,
+    Certificate,
+    Forecast,
+    Maxima,
+    Sample,
+    certify_posterior,
+    draw_maxima,
+    farthest_task,
+    forecast,
+)
 from ctxval.certificates.base import require_probability
 from ctxval.errors import CertificateError, InputError
 from ctxval.trial import Trial
@@ -105,7 +115,12 @@ def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
 
 
 def judge(
-    trials: Sequence[Trial], threshold: float, confidence: float = CONFIDENCE, *, stochastic: bool = False
+    trials: Sequence[Trial],
+    threshold: float,
+    confidence: float = CONFIDENCE,
+    *,
+    stochastic: bool = False,
+    resolution: float = RESOLUTION,
 ) -> Verdict:
     """Return the verdict by an executed counterexample or the posterior bound; undecided says what more would take.
 
@@ -114,6 +129,7 @@ def judge(
         threshold: tau, in the distance's units.
         confidence: of a validation.
         stochastic: whether two executions of one task may differ.
+        resolution: how far from every trial a task may be, in diagonals of the task space.
 
     Raises:
         InputError: the threshold is not a positive number.
@@ -126,7 +142,7 @@ def judge(
     try:
         sample = Sample.of(trials)
         drawn = draw_maxima(sample, stochastic=stochastic)
-        certificate = certify_posterior(sample, confidence, stochastic=stochastic, found=drawn)
+        certificate = certify_posterior(sample, confidence, stochastic=stochastic, resolution=resolution, found=drawn)
     except CertificateError as error:
         return Verdict("undecided", threshold, str(error))
     verdict = judge_by(certificate, trials, threshold)
@@ -142,7 +158,12 @@ def _with_forecast(verdict: Verdict, sample: Sample, drawn: Maxima, confidence: 
 
 
 def is_decided(
-    trials: Sequence[Trial], threshold: float, confidence: float = CONFIDENCE, *, stochastic: bool = False
+    trials: Sequence[Trial],
+    threshold: float,
+    confidence: float = CONFIDENCE,
+    *,
+    stochastic: bool = False,
+    resolution: float = RESOLUTION,
 ) -> bool:
     """Return whether the verdict is reached, for less than it costs where it is far away.
 
@@ -155,10 +176,12 @@ def is_decided(
         return True
     try:
         sample = Sample.of(trials)
+        if farthest_task(sample.points) > resolution:
+            return False
         # A quarter of the draws already tell most of the times that the bound is too high.
         coarse = draw_maxima(sample, draws=32, stochastic=stochastic)
         if coarse.probability(threshold) < confidence - 0.05:
             return False
-        return certify_posterior(sample, confidence, stochastic=stochastic).covers(threshold)
+        return certify_posterior(sample, confidence, stochastic=stochastic, resolution=resolution).covers(threshold)
     except CertificateError:
         return False

@@ -29,7 +29,7 @@ def adaptive(hyper: Hyperparameters, rng: np.random.Generator, n: int = 10) -> t
 
 def surprises(hyper: Hyperparameters, assumed: Hyperparameters) -> list[float]:
     drawn = [adaptive(hyper, np.random.default_rng([4, seed])) for seed in range(250)]
-    return [diagnose([condition(assumed, X, y)]).surprise for X, y in drawn]
+    return [diagnose([condition(assumed, X, y)], X).surprise for X, y in drawn]
 
 
 def test_surprises_of_the_process_itself_are_uniform_whatever_chose_the_tasks() -> None:
@@ -40,7 +40,7 @@ def test_of_independent_values_the_surprise_is_the_t_tests_of_each_against_those
     X, y = np.linspace(0, 1, 7)[:, None], np.random.default_rng(3).normal(size=7)
     independent = Hyperparameters(1.5, np.array([np.log(1e-4)]), float(np.log(EXACT)))
     tails = [t(k - 1).sf((y[k] - y[:k].mean()) / (y[:k].std(ddof=1) * np.sqrt(1 + 1 / k))) for k in range(2, len(y))]
-    diagnosis = diagnose([condition(independent, X, y)])
+    diagnosis = diagnose([condition(independent, X, y)], X)
     assert diagnosis.surprise == pytest.approx(1 - (1 - min(tails)) ** len(tails), rel=1e-6)
     assert diagnosis.trial == 2 + int(np.argmin(tails))
 
@@ -72,7 +72,7 @@ def test_a_spike_that_nothing_announced_withdraws_the_bound(height: float, belie
 
 def test_a_value_that_is_surprisingly_low_withdraws_nothing() -> None:
     X, y = spiked(-5.0)
-    assert diagnose([condition(KNOWN, X, y)]).doubt is None
+    assert diagnose([condition(KNOWN, X, y)], X).doubt is None
 
 
 def test_the_leave_one_out_error_is_that_of_leaving_each_out() -> None:
@@ -88,7 +88,7 @@ def test_the_leave_one_out_error_is_that_of_leaving_each_out() -> None:
         mean = seen.mean + k @ np.linalg.solve(K, y[others] - seen.mean)
         variance = seen.scale2 * (1.01 - k @ np.linalg.solve(K, k))
         squares.append((y[row] - mean) ** 2 / variance)
-    assert diagnose([seen]).left_out == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-8)
+    assert diagnose([seen], X).left_out == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-8)
 
 
 def test_many_draws_of_hyperparameters_are_averaged() -> None:
@@ -97,7 +97,7 @@ def test_many_draws_of_hyperparameters_are_averaged() -> None:
 
     def of(*hypers: Hyperparameters) -> float:
         conditioned: list[Conditioned] = [condition(hyper, X, y) for hyper in hypers]
-        return diagnose(conditioned).surprise
+        return diagnose(conditioned, X).surprise
 
     low, high = sorted([of(KNOWN), of(other)])
     assert of(KNOWN, KNOWN) == pytest.approx(of(KNOWN))
@@ -106,13 +106,13 @@ def test_many_draws_of_hyperparameters_are_averaged() -> None:
 
 def test_a_diagnosis_is_ready_for_json() -> None:
     X, y = spiked(1.0)
-    diagnosis = diagnose([condition(KNOWN, X, y)])
+    diagnosis = diagnose([condition(KNOWN, X, y)], X)
     assert set(json.loads(json.dumps(diagnosis.to_json()))) >= {"surprise", "trial", "left_out"}
     assert 0 <= diagnosis.surprise <= 1
 
 
 def test_units_do_not_matter() -> None:
     X, y = spiked(1.0)
-    plain, moved = (diagnose([condition(KNOWN, X, values)]) for values in (y, 1000 * y - 7))
+    plain, moved = (diagnose([condition(KNOWN, X, values)], X) for values in (y, 1000 * y - 7))
     assert moved.surprise == pytest.approx(plain.surprise, rel=1e-3)
     assert (moved.trial, moved.left_out) == (plain.trial, pytest.approx(plain.left_out, rel=1e-3))

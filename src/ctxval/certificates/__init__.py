@@ -2,7 +2,7 @@
 
 from ctxval.certificates.base import Certificate, Sample
 from ctxval.certificates.convergence import TheoremConstants, certify_convergence, rate
-from ctxval.certificates.diagnostics import Diagnosis, diagnose
+from ctxval.certificates.diagnostics import RESOLUTION, Diagnosis, diagnose, farthest_task
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.named import KINDS, Options, certify
 from ctxval.certificates.posterior import Maxima, certify_posterior, draw_maxima
@@ -10,6 +10,7 @@ from ctxval.certificates.scenario import certify_audit, certify_scenario, sample
 
 __all__ = [
     "KINDS",
+    "RESOLUTION",
     "Certificate",
     "Diagnosis",
     "Forecast",
@@ -24,6 +25,7 @@ __all__ = [
     "certify_scenario",
     "diagnose",
     "draw_maxima",
+    "farthest_task",
     "forecast",
     "rate",
     "samples_needed",

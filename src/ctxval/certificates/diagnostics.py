@@ -1,4 +1,6 @@
-"""Do the trials speak against the Gaussian process? Each is predicted from those before it, and from all others.
+"""Do the trials speak against the Gaussian process, and do they cover the tasks? When a bound is not to be believed.
+
+Each trial is predicted from those before it, and from all others.
 
 Under the process, the standardised error of each prediction from the trials before it follows a t distribution, and
 these errors are independent, whatever chose the tasks (recursive residuals; Brown, Durbin and Evans 1975).
@@ -11,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
+from scipy.spatial import KDTree
 from scipy.special import ndtri, stdtr
 
 from ctxval.arrays import Array
@@ -18,6 +21,12 @@ from ctxval.hyperposterior import Conditioned
 
 LEVEL = 0.01
 """How unlikely a surprise must be for the bound to be withdrawn."""
+
+RESOLUTION = 0.3
+"""How far from every trial a task may be, in diagonals of the task space, unless the user states more; what lies
+farther away may be unlike anything that was seen (docs/calibration.md)."""
+
+_PROBES = 8192
 
 
 @dataclass(frozen=True)
@@ -28,32 +37,58 @@ class Diagnosis:
         surprise: the probability that the largest upward surprise of so many trials is as large as the one seen.
         trial: in which trial it was seen.
         left_out: root mean square of the leave-one-out errors in their standard deviations; about 1 if all is well.
+        farthest: how far from every trial a task is at most, in diagonals of the task space.
         doubt: one sentence, where the bound is withdrawn.
     """
 
     surprise: float
     trial: int
     left_out: float
+    farthest: float
     doubt: str | None
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers."""
-        return {"surprise": self.surprise, "trial": self.trial, "left_out": self.left_out}
+        return {"surprise": self.surprise, "trial": self.trial, "left_out": self.left_out, "farthest": self.farthest}
 
 
-def diagnose(conditioned: list[Conditioned], level: float = LEVEL) -> Diagnosis:
-    """Return how the values, in the order of the trials, agree with the process."""
+def diagnose(
+    conditioned: list[Conditioned], X: Array, *, level: float = LEVEL, resolution: float = RESOLUTION
+) -> Diagnosis:
+    """Return how the values, in the order of the trials, agree with the process, and how well the trials cover it.
+
+    Args:
+        conditioned: the values under draws of the hyperparameters.
+        X: the trials' points ``(n, d)``.
+        level: how unlikely a surprise withdraws the bound.
+        resolution: how far from every trial a task may be without withdrawing it, in diagonals.
+    """
     exceed = np.mean([_exceedances(one) for one in conditioned], axis=0)
     worst = int(exceed.argmin())
     surprise = float(-np.expm1(len(exceed) * np.log1p(-min(exceed[worst], 1 - 1e-16))))
     left_out = float(np.sqrt(np.mean([_left_out(one) for one in conditioned])))
-    doubt = None
+    farthest, doubt = farthest_task(X), None
     if surprise < level:
         doubt = (
             f"trial {worst + 2} came out {-ndtri(max(exceed[worst], 1e-300)):.1f} standard deviations above what the "
             "trials before it predict: the distance is not what the process takes it for, and the bound is withdrawn"
         )
-    return Diagnosis(surprise, worst + 2, left_out, doubt)
+    elif farthest > resolution:
+        doubt = (
+            f"some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the "
+            f"{resolution:g} within which the distance is taken to be like what was seen, and the bound is withdrawn; "
+            "execute tasks there, audit, or state a larger resolution"
+        )
+    return Diagnosis(surprise, worst + 2, left_out, farthest, doubt)
+
+
+def farthest_task(X: Array) -> float:
+    """Return how far a point of the cube is from ``(n, d)`` at most, in diagonals, by many random ones and corners."""
+    d = X.shape[1]
+    rng = np.random.default_rng(0)
+    corners = rng.integers(0, 2, (_PROBES, d)).astype(np.float64)
+    distances, _ = KDTree(X).query(np.concatenate([rng.random((_PROBES, d)), corners]))
+    return float(distances.max() / np.sqrt(d))
 
 
 def _exceedances(conditioned: Conditioned) -> Array:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from ctxval.certificates.base import Certificate, Sample
 from ctxval.certificates.convergence import TheoremConstants, certify_convergence, require_iterations
+from ctxval.certificates.diagnostics import RESOLUTION
 from ctxval.certificates.posterior import certify_posterior
 from ctxval.certificates.scenario import certify_audit, certify_scenario
 from ctxval.errors import CertificateError, UnknownNameError
@@ -20,6 +21,7 @@ class Options:
 
     Attributes:
         stochastic: posterior: whether two executions of one task may differ.
+        resolution: posterior: how far from every trial a task may be, in diagonals of the task space.
         discard: sampling-discarding: how many of the largest distances are discarded.
         constant: convergence: C, in the distance's units.
         theorem: convergence: what C is computed from, in place of it.
@@ -29,6 +31,7 @@ class Options:
     discard: int | None = None
     constant: float | None = None
     theorem: TheoremConstants | None = None
+    resolution: float = RESOLUTION
 
 
 def certify(sample: Sample, kind: str, confidence: float, options: Options | None = None) -> Certificate:
@@ -40,7 +43,7 @@ def certify(sample: Sample, kind: str, confidence: float, options: Options | Non
     """
     chosen = Options() if options is None else options
     if kind == "posterior":
-        return certify_posterior(sample, confidence, stochastic=chosen.stochastic)
+        return certify_posterior(sample, confidence, stochastic=chosen.stochastic, resolution=chosen.resolution)
     if kind == "audit":
         return certify_audit(sample, confidence)
     if kind == "scenario":

@@ -18,7 +18,7 @@ import numpy as np
 from ctxval.acquisition import UpperConfidenceBound, maximise
 from ctxval.arrays import Array, single_threaded
 from ctxval.certificates.base import Certificate, Sample, require_probability
-from ctxval.certificates.diagnostics import diagnose
+from ctxval.certificates.diagnostics import RESOLUTION, diagnose
 from ctxval.errors import CertificateError, InputError
 from ctxval.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
 from ctxval.paths import draw_paths, maxima
@@ -124,7 +124,13 @@ def _required(sample: Sample) -> tuple[Array, Array]:
 
 
 def certify_posterior(
-    sample: Sample, confidence: float = 0.95, *, stochastic: bool = False, seed: int = 0, found: Maxima | None = None
+    sample: Sample,
+    confidence: float = 0.95,
+    *,
+    stochastic: bool = False,
+    resolution: float = RESOLUTION,
+    seed: int = 0,
+    found: Maxima | None = None,
 ) -> Certificate:
     """Return the bound that d* stays below with the confidence, under the prior and given the trials.
 
@@ -132,6 +138,8 @@ def certify_posterior(
         sample: trials of any origin.
         confidence: 1 - eps.
         stochastic: whether two executions of one task may differ; then the largest expected distance is bounded.
+        resolution: how far from every trial a task may be, in diagonals of the task space, before the bound is
+            withdrawn; 1 trusts the process everywhere.
         seed: of the draws.
         found: draws of d* made before, from the same trials.
 
@@ -141,7 +149,7 @@ def certify_posterior(
     require_probability("confidence", confidence)
     maxima_found = draw_maxima(sample, stochastic=stochastic, seed=seed) if found is None else found
     upper, best = maxima_found.upper(confidence), float(sample.distances.max())
-    diagnosis = diagnose(maxima_found.conditioned)
+    diagnosis = diagnose(maxima_found.conditioned, sample.points, resolution=resolution)
     what = "the largest expected distance" if stochastic else "d*"
     return Certificate(
         kind="posterior",
@@ -150,7 +158,7 @@ def certify_posterior(
         confidence=confidence,
         volume=0.0,
         trials=len(sample),
-        assumptions=_assumptions(stochastic),
+        assumptions=_assumptions(stochastic, resolution),
         details={
             "best": best,
             "gap": upper - best,
@@ -163,7 +171,7 @@ def certify_posterior(
     )
 
 
-def _assumptions(stochastic: bool) -> tuple[str, ...]:
+def _assumptions(stochastic: bool, resolution: float) -> tuple[str, ...]:
     noise = (
         "executions of one task differ by independent normal noise of one size"
         if stochastic
@@ -173,8 +181,8 @@ def _assumptions(stochastic: bool) -> tuple[str, ...]:
     return (
         f"the {what} is a draw from a Gaussian process: a constant mean, a Matern kernel of "
         "smoothness 3/2 or 5/2, one length-scale for each parameter, all of them unknown and integrated over",
-        "it is as rough in one part of the task space as in another: a peak narrower than the gaps between the trials, "
-        "of which no trial shows a trace, is not covered; audit for that",
+        f"it is as rough in one part of the task space as in another, as far as {resolution:g} of its diagonal from "
+        "the trials: a peak in a gap between them, of which no trial shows a trace, is not covered; audit for that",
         noise,
         "how the tasks were chosen and when the campaign stopped does not matter",
     )
