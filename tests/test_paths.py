@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from scipy.optimize import check_grad
+from scipy.optimize import check_grad, minimize
 from scipy.stats import chi2, kstest, t
 
 from ctxval.hyperposterior import EXACT, Conditioned, Hyperparameters, condition
@@ -131,3 +131,24 @@ def test_noisy_paths_stay_off_the_data_by_what_the_noise_allows() -> None:
     np.testing.assert_allclose(values.mean(axis=1), mean, atol=5 * spread.max() / np.sqrt(800))
     np.testing.assert_allclose(values.std(axis=1), spread, rtol=0.25)
     assert np.abs(mean - y).max() > 0.1
+
+
+@pytest.mark.parametrize(("d", "missed"), [(6, 0.003), (11, 0.003)])
+def test_maxima_in_many_dimensions_are_found_but_for_a_little(d: int, missed: float) -> None:
+    rng = np.random.default_rng(d)
+    X = rng.random((8 * d, d))
+    conditioned = condition(
+        Hyperparameters(1.5, np.full(d, np.log(0.35 * np.sqrt(d))), np.log(EXACT)), X, np.sin(5 * X).sum(1)
+    )
+    paths = draw_paths(conditioned, X, 4, rng)
+    tops, _ = maxima(paths, X, rng)
+    starts = rng.random((4, 150, d))
+
+    def negative(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        values, slopes = paths.own_with_gradient(flat.reshape(starts.shape))
+        return -float(values.sum()), -slopes.ravel()
+
+    bounds = [(0.0, 1.0)] * starts.size
+    climbed = minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 150})
+    brute = paths.own(climbed.x.reshape(starts.shape)).max(axis=1)
+    assert np.mean((brute - tops) / paths.scales) < missed

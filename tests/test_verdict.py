@@ -202,3 +202,14 @@ def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> No
     for threshold in (0.9 * best, 1.02 * upper, best + 0.2 * (upper - best)):
         verdict = judge(known, threshold, stochastic=stochastic)
         assert is_decided(known, threshold, stochastic=stochastic) == (verdict.answer != "undecided")
+
+
+def test_a_reason_does_not_round_its_comparison_away() -> None:
+    falsified = counterexample([trial(0, 0, 0.50000001)], 0.5)
+    assert falsified is not None
+    assert "its distance 0.50000001 exceeds 0.5." in falsified.reason
+    assert "is 1.23456, at most 1.23457" in judge_by(certificate(1.234561), trials(), 1.234569).reason
+    assert (
+        "above 1.23456 was executed, but d* may be up to 1.235"
+        in judge_by(certificate(1.23457), trials(), 1.23456).reason
+    )

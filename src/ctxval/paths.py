@@ -120,12 +120,16 @@ def maxima(paths: Paths, known: Array, rng: np.random.Generator) -> tuple[Array,
     """Return the largest value of each path over the unit cube, shape ``(s,)``, and where it is, ``(s, d)``.
 
     Candidates that are uniform, near ``known`` points (best first) and at corners; climbs from the best of several
-    lots of them; then, beyond two dimensions, coordinates moved to their bounds one by one, as long as that pays.
+    lots of them. Beyond two dimensions there are more lots, only the highest of them climb all the way, and then
+    coordinates are moved to their bounds one by one, as long as that pays.
     """
     d = paths.X.shape[1]
     candidates = _candidates(known, d, rng)
-    starts = _starts(candidates, paths.roughly(candidates))
-    points = np.concatenate([starts, _climb(paths, starts)], axis=1)
+    many = _STARTS if d <= 2 else _STARTS * (1 + d)
+    starts = _starts(candidates, paths.roughly(candidates), many)
+    if d > 2:
+        starts = _highest(paths, _climb(paths, starts, 20))
+    points = np.concatenate([starts, _climb(paths, starts, 30 if d <= 2 else 80)], axis=1)
     heights = paths.own(points)
     best, rows = np.argmax(heights, axis=1), np.arange(len(paths))
     tops, where = heights[rows, best], points[rows, best]
@@ -139,13 +143,18 @@ def _candidates(known: Array, d: int, rng: np.random.Generator) -> Array:
     return np.concatenate([known, near, corners, rng.random((min(2048, 512 * d), d))])
 
 
-def _starts(candidates: Array, values: Array) -> Array:
-    """Return the best candidates of several lots for each path, shape ``(s, q, d)``: they are spread, yet good."""
-    lots = [candidates[lot::_STARTS][values[lot::_STARTS].argmax(axis=0)] for lot in range(_STARTS)]
-    return np.stack(lots, axis=1)
+def _starts(candidates: Array, values: Array, many: int) -> Array:
+    """Return the best candidates of many lots for each path, shape ``(s, many, d)``: they are spread, yet good."""
+    return np.stack([candidates[lot::many][values[lot::many].argmax(axis=0)] for lot in range(many)], axis=1)
 
 
-def _climb(paths: Paths, starts: Array) -> Array:
+def _highest(paths: Paths, points: Array) -> Array:
+    """Return the few highest of each path's points ``(s, q, d)``."""
+    order = np.argsort(-paths.own(points), axis=1)[:, :_STARTS]
+    return np.take_along_axis(points, order[..., None], axis=1)
+
+
+def _climb(paths: Paths, starts: Array, steps: int) -> Array:
     """Climb from all starts at once: their sum is separable, so one quasi-Newton search serves them all."""
     units = paths.scales[:, None]
 
@@ -154,7 +163,7 @@ def _climb(paths: Paths, starts: Array) -> Array:
         return -float((values / units).sum()), -(gradients / units[..., None]).ravel()
 
     bounds = [(0.0, 1.0)] * starts.size
-    result = minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 30})
+    result = minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps})
     return np.asarray(np.clip(result.x, 0.0, 1.0).reshape(starts.shape))
 
 

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from ctxval.certificates import (
     RESOLUTION,
     Certificate,
@@ -73,8 +75,18 @@ def counterexample(trials: Sequence[Trial], threshold: float) -> Verdict | None:
     if not above:
         return None
     worst = max(above, key=lambda trial: trial.distance or 0.0)
-    reason = f"trial {worst.number} was executed and its distance {worst.distance:.4g} exceeds {tau:g}."
+    distance, limit = _told_apart(worst.distance or 0.0, tau)
+    reason = f"trial {worst.number} was executed and its distance {distance} exceeds {limit}."
     return Verdict("falsified", tau, reason, worst)
+
+
+def _told_apart(value: float, tau: float) -> tuple[str, str]:
+    """Return two numbers as texts of as many digits as tell which one is larger."""
+    for digits in range(4, 17):
+        texts = f"{value:.{digits}g}", f"{tau:.{max(digits, 6)}g}"
+        if np.sign(float(texts[0]) - float(texts[1])) == np.sign(value - tau):
+            return texts
+    return repr(value), repr(tau)
 
 
 def judge_by(certificate: Certificate, trials: Sequence[Trial], threshold: float, *, volume: float = 0.0) -> Verdict:
@@ -95,9 +107,10 @@ def judge_by(certificate: Certificate, trials: Sequence[Trial], threshold: float
         return Verdict("falsified", tau, found.reason, found.witness, certificate)
     if certificate.covers(tau, volume):
         but = f", but for {100 * certificate.volume:.3g} % of the task space" if certificate.volume else ""
+        upper, limit = _told_apart(certificate.upper_bound, tau)
         reason = (
-            f"the {certificate.kind} bound of {certificate.trials} trials is {certificate.upper_bound:.4g}, at most "
-            f"{tau:g}, with confidence {certificate.confidence:g}{but}."
+            f"the {certificate.kind} bound of {certificate.trials} trials is {upper}, at most {limit}, with confidence "
+            f"{certificate.confidence}{but}."
         )
         return Verdict("validated", tau, reason, certificate=certificate)
     return Verdict("undecided", tau, _why_not(certificate, tau, volume), certificate=certificate)
@@ -107,7 +120,8 @@ def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
     if certificate.doubt is not None:
         return f"{certificate.doubt}."
     if certificate.upper_bound > tau:
-        return f"no distance above {tau:g} was executed, but d* may be up to {certificate.upper_bound:.4g}."
+        upper, limit = _told_apart(certificate.upper_bound, tau)
+        return f"no distance above {limit} was executed, but d* may be up to {upper}."
     return (
         f"the {certificate.kind} bound leaves out {100 * certificate.volume:.3g} % of the task space, "
         f"more than the {100 * volume:.3g} % that are acceptable; it is no bound on d*."

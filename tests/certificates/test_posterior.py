@@ -18,6 +18,7 @@ from ctxval.certificates import (
     certify_posterior,
     draw_maxima,
 )
+from ctxval.certificates.base import at_most
 from ctxval.errors import CertificateError, UnknownNameError
 from ctxval.hyperposterior import Prior
 
@@ -233,3 +234,60 @@ def test_what_a_kind_needs_and_is_not_given_is_asked_for() -> None:
         certify(trials, "convergence", 0.9)
     with pytest.raises(UnknownNameError, match="did you mean 'posterior'"):
         certify(trials, "posteriour", 0.9)
+
+
+def of(X: np.ndarray, y: np.ndarray) -> Sample:
+    return Sample(X, np.asarray(y, float), ["acquisition"] * len(y), ["completed"] * len(y))
+
+
+@pytest.mark.parametrize("factor", [1e-200, 1e155, 1e300])
+def test_numbers_whose_squares_no_float_holds_are_refused(factor: float) -> None:
+    with pytest.raises(CertificateError, match="take other units"):
+        draw_maxima(sample(factor=factor))
+
+
+def test_distances_that_differ_by_rounding_are_refused() -> None:
+    with pytest.raises(CertificateError, match="by rounding alone"):
+        draw_maxima(of(sample().points, 1 + 2.3e-16 * np.arange(9)))
+
+
+def test_one_task_with_two_distances_is_not_deterministic() -> None:
+    X, y = sample().points.copy(), sample().distances
+    X[5] = X[2]
+    with pytest.raises(CertificateError, match=r"trials 2 and 5 executed one task.*say --stochastic"):
+        draw_maxima(of(X, y))
+    assert np.isfinite(quick(of(X, y), stochastic=True).draws).all()
+    same = y.copy()
+    same[5] = y[2]
+    assert np.isfinite(quick(of(X, same)).draws).all()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1.23441, "1.235"),
+        (0.00099999, "0.001"),
+        (-1.23459, "-1.234"),
+        (2, "2"),
+        (0, "0"),
+        (99.991, "100"),
+        (1e-12, "1e-12"),
+        (12345.6, "1.235e+04"),
+    ],
+)
+def test_a_printed_bound_is_not_smaller_than_the_bound(value: float, text: str) -> None:
+    assert float(at_most(value)) >= value
+    assert at_most(value) == text
+    assert float(at_most(float("inf"))) == float("inf")
+
+
+def test_a_confidence_below_1_is_not_printed_as_1() -> None:
+    certificate = certify(
+        Sample(np.zeros((9, 1)), np.arange(9.0), ["iid"] * 9, ["completed"] * 9), "scenario", 0.9999999
+    )
+    assert "confidence 0.9999999," in certificate.statement
+
+
+def test_proposition_1_is_refused_where_another_search_chose_the_tasks() -> None:
+    with pytest.raises(CertificateError, match="CMAES chose these"):
+        certify(sample(), "convergence", 0.9, Options(constant=1.0, search="CMAES"))

@@ -4,7 +4,7 @@ from ctxval.certificates.base import Certificate, Sample
 from ctxval.certificates.convergence import TheoremConstants, certify_convergence, rate
 from ctxval.certificates.diagnostics import RESOLUTION, Diagnosis, diagnose, farthest_task
 from ctxval.certificates.forecast import Forecast, forecast
-from ctxval.certificates.named import KINDS, Options, certify
+from ctxval.certificates.named import KINDS, Options, certify, require_possible
 from ctxval.certificates.posterior import Maxima, certify_posterior, draw_maxima
 from ctxval.certificates.scenario import certify_audit, certify_scenario, samples_needed, tail, volume_bound
 
@@ -28,6 +28,7 @@ __all__ = [
     "farthest_task",
     "forecast",
     "rate",
+    "require_possible",
     "samples_needed",
     "tail",
     "volume_bound",

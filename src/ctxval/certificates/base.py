@@ -116,6 +116,14 @@ class Certificate:
         return asdict(self)
 
 
+def at_most(value: float, digits: int = 4) -> str:
+    """Return a bound as text, rounded up: what is printed must not be smaller than what holds."""
+    short = f"{value:.{digits}g}"
+    if float(short) >= value or not np.isfinite(value):
+        return short
+    return f"{value + 10.0 ** (np.floor(np.log10(abs(value))) - digits + 1):.{digits}g}"
+
+
 def require_probability(name: str, value: float) -> float:
     """Return a probability strictly between 0 and 1.
 

@@ -18,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 
-from ctxval.certificates.base import Certificate, Sample, require_probability
+from ctxval.certificates.base import Certificate, Sample, at_most, require_probability
 from ctxval.errors import CertificateError
 
 KernelName = Literal["matern-3/2", "matern-5/2", "squared-exponential"]
@@ -106,7 +106,7 @@ def certify_convergence(
     best, gap = float(sample.distances.max()), constant * rate(n, dimension, kernel)
     return Certificate(
         kind="convergence",
-        statement=f"With probability {confidence:g} under the prior, d* is at most {best + gap:.4g}.",
+        statement=f"With probability {confidence} under the prior, d* is at most {at_most(best + gap)}.",
         upper_bound=best + gap,
         confidence=confidence,
         volume=0.0,

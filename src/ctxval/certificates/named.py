@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from ctxval.certificates.base import Certificate, Sample
@@ -10,9 +11,12 @@ from ctxval.certificates.diagnostics import RESOLUTION
 from ctxval.certificates.posterior import certify_posterior
 from ctxval.certificates.scenario import certify_audit, certify_scenario
 from ctxval.errors import CertificateError, UnknownNameError
+from ctxval.trial import Origin
 
 KINDS = ("posterior", "audit", "scenario", "sampling-discarding", "convergence")
 """What can be certified, the bound that people will use first."""
+
+_NO_DISCARD = "sampling and discarding needs to be told how many to discard, at least 1."
 
 
 @dataclass(frozen=True)
@@ -25,12 +29,14 @@ class Options:
         discard: sampling-discarding: how many of the largest distances are discarded.
         constant: convergence: C, in the distance's units.
         theorem: convergence: what C is computed from, in place of it.
+        search: convergence: the type of the search that chose the tasks, where it is known.
     """
 
     stochastic: bool = False
     discard: int | None = None
     constant: float | None = None
     theorem: TheoremConstants | None = None
+    search: str | None = None
     resolution: float = RESOLUTION
 
 
@@ -50,11 +56,27 @@ def certify(sample: Sample, kind: str, confidence: float, options: Options | Non
         return certify_scenario(sample, confidence)
     if kind == "sampling-discarding":
         if not chosen.discard:
-            raise CertificateError("sampling and discarding needs to be told how many to discard, at least 1.")
+            raise CertificateError(_NO_DISCARD)
         return certify_scenario(sample, confidence, chosen.discard)
     if kind == "convergence":
+        if chosen.search not in (None, "GPUCB"):
+            raise CertificateError(f"Proposition 1 is about tasks that GP-UCB chose; {chosen.search} chose these.")
         return certify_convergence(sample, _constant(sample, confidence, chosen), confidence)
     raise UnknownNameError.among("certificate", kind, KINDS)
+
+
+def require_possible(origins: Iterable[Origin], kind: str, options: Options) -> None:
+    """Make sure, before draws are paid for, that a certificate could use them.
+
+    Raises:
+        CertificateError: none could, however they come out.
+    """
+    if kind == "sampling-discarding" and not options.discard:
+        raise CertificateError(_NO_DISCARD)
+    if kind in ("scenario", "sampling-discarding") and any(origin != "iid" for origin in origins):
+        raise CertificateError(f"a {kind} bound takes independent draws alone, and there are others; say --kind audit.")
+    if kind == "convergence":
+        raise CertificateError("Proposition 1 is about tasks that GP-UCB chose: it has no use for an audit.")
 
 
 def _constant(sample: Sample, confidence: float, options: Options) -> float:

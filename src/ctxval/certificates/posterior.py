@@ -17,7 +17,7 @@ import numpy as np
 
 from ctxval.acquisition import UpperConfidenceBound, maximise
 from ctxval.arrays import Array, single_threaded
-from ctxval.certificates.base import Certificate, Sample, require_probability
+from ctxval.certificates.base import Certificate, Sample, at_most, require_probability
 from ctxval.certificates.diagnostics import RESOLUTION, diagnose
 from ctxval.errors import CertificateError, InputError
 from ctxval.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
@@ -29,6 +29,15 @@ FEWEST = 4
 
 STOCHASTIC = (1e-6, 1.0)
 """Bounds of the noise variance of a stochastic system, relative to the variance of the distance."""
+
+_ROUNDING = 1e-14
+"""Distances that differ by less, relative to their size, are one distance and rounding."""
+
+_EXTREME = 1e100
+"""Distances beyond it, or that differ by less than its inverse, have squares that no float holds."""
+
+_REPEATED = 1e-6
+"""Two executions of a task may differ by so much of all distances' spread where the system is deterministic."""
 
 _EXACTNESS = 3.0 * np.sqrt(EXACT)
 """How far a path may miss exact values, in standard deviations of the distance."""
@@ -89,6 +98,8 @@ def draw_maxima(
         CertificateError: an execution failed, or the trials are too few or all alike.
     """
     X, y = _required(sample)
+    if not stochastic:
+        _require_one_distance_each(X, y)
     rng = np.random.default_rng(seed)
     # Noise on the logarithms would bound the median: the expected distance is not the exponential of the expected one.
     # And what is noise and what is roughness only all trials together can tell.
@@ -120,7 +131,26 @@ def _required(sample: Sample) -> tuple[Array, Array]:
         raise CertificateError(f"a posterior bound needs at least {FEWEST} trials, got {len(sample)}.")
     if np.ptp(sample.distances) == 0:
         raise CertificateError(f"all {len(sample)} distances are {sample.distances[0]:g}: they say nothing of d*.")
+    spread, largest = float(np.ptp(sample.distances)), float(np.abs(sample.distances).max())
+    if spread < _ROUNDING * largest:
+        raise CertificateError(f"the distances differ from {largest:g} by rounding alone: they say nothing of d*.")
+    if spread < 1 / _EXTREME or largest > _EXTREME:
+        raise CertificateError(
+            f"the largest distance is {largest:g} and they differ by {spread:g}: a posterior bound needs numbers "
+            f"between {1 / _EXTREME:g} and {_EXTREME:g}; take other units."
+        )
     return sample.points, sample.distances
+
+
+def _require_one_distance_each(X: Array, y: Array) -> None:
+    _, tasks = np.unique(X, axis=0, return_inverse=True)
+    for row, task in enumerate(tasks.ravel()):
+        first = int(np.argmax(tasks.ravel() == task))
+        if abs(y[row] - y[first]) > _REPEATED * np.ptp(y):
+            raise CertificateError(
+                f"trials {first} and {row} executed one task, and their distances are {y[first]:g} and {y[row]:g}: the "
+                "system is not deterministic; say --stochastic to bound the largest expected distance."
+            )
 
 
 def certify_posterior(
@@ -151,9 +181,10 @@ def certify_posterior(
     upper, best = maxima_found.upper(confidence), float(sample.distances.max())
     diagnosis = diagnose(maxima_found.conditioned, sample.points, resolution=resolution)
     what = "the largest expected distance" if stochastic else "d*"
+    statement = f"With probability {confidence} under the prior, given the trials, {what} is at most {at_most(upper)}."
     return Certificate(
         kind="posterior",
-        statement=f"With probability {confidence:g} under the prior, given the trials, {what} is at most {upper:.4g}.",
+        statement=statement,
         upper_bound=upper,
         confidence=confidence,
         volume=0.0,

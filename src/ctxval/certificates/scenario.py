@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import bdtr, betaincinv
 
-from ctxval.certificates.base import Certificate, Sample, require_probability
+from ctxval.certificates.base import Certificate, Sample, at_most, require_probability
 from ctxval.errors import CertificateError
 
 _MOST_SAMPLES = 2**40
@@ -91,15 +91,15 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
     return Certificate(
         kind=_name(discarded),
         statement=(
-            f"With confidence {confidence:g}, at most {100 * volume:.3g} % of the task space "
-            f"has a distance above {h:.4g}."
+            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % of the task space "
+            f"has a distance above {at_most(h)}."
         ),
         upper_bound=h,
         confidence=confidence,
         volume=volume,
         trials=len(sample),
         assumptions=(
-            "the trials are independent and uniform over the task space",
+            "the trials are independent and uniform over the task space, and their number did not depend on distances",
             "the number discarded was chosen before the distances were known",
             "each task has one distance: the system is deterministic",
             "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
@@ -134,8 +134,8 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
     return Certificate(
         kind="audit",
         statement=(
-            f"With confidence {confidence:g}, at most {100 * volume:.3g} % of the task space "
-            f"has a distance above {h:.4g}, the largest one found."
+            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % of the task space "
+            f"has a distance above {at_most(h)}, the largest one found."
         ),
         upper_bound=h,
         confidence=confidence,
