@@ -27,7 +27,7 @@ numbers = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=60)
 
 
 def drawn(values: list[float]) -> Maxima:
-    return Maxima(np.sort(values), np.zeros((len(values), 1)), [])
+    return Maxima(np.sort(values), np.zeros((len(values), 1)), [], np.zeros(len(values), dtype=np.intp))
 
 
 def sample(n: int = 9, d: int = 1, origin: str = "acquisition", factor: float = 1.0) -> Sample:

@@ -44,9 +44,10 @@ def forecast(
 ) -> Forecast:
     """Return how many more executions of GP-UCB decide whether d* is at most the threshold.
 
-    Each future takes one draw of the hyperparameters, draws a true distance from the posterior on a set of candidate
-    tasks, and searches it; it is decided when a distance above the threshold is executed, or when the upper bound falls
-    to the threshold. The bound's width in standard deviations is the one that it has now.
+    Each future takes one draw of the hyperparameters, of those that stand in the way of a validation, draws a true
+    distance from the posterior on a set of candidate tasks, and searches it; it is decided when a distance above the
+    threshold is executed, or when the upper bound falls to the threshold. The bound's width in standard deviations is
+    the one that it has now.
 
     Args:
         sample: the trials.
@@ -62,8 +63,10 @@ def forecast(
     rng = np.random.default_rng(seed)
     lengths, kept = [], 0
     with single_threaded():
+        in_the_way = found.owners[found.draws > threshold]
+        owners = found.owners if not len(in_the_way) else in_the_way
         for k in range(futures):
-            conditioned = found.conditioned[k * len(found.conditioned) // futures]
+            conditioned = found.conditioned[owners[k * len(owners) // futures]]
             length, validated = _Future(sample, found, conditioned, confidence, rng).play(threshold)
             lengths.append(length)
             kept += validated

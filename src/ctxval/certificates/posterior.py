@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval.acquisition import UpperConfidenceBound, maximise
-from ctxval.arrays import Array, single_threaded
+from ctxval.arrays import Array, Rows, single_threaded
 from ctxval.certificates.base import Certificate, Sample, at_most, require_probability
 from ctxval.certificates.diagnostics import RESOLUTION, diagnose
 from ctxval.errors import CertificateError, InputError
@@ -51,11 +51,13 @@ class Maxima:
         draws: sorted, shape ``(S,)``.
         points: a maximiser of each, in the unit cube, shape ``(S, d)``.
         conditioned: the hyperparameters drawn.
+        owners: under which of them each was drawn, shape ``(S,)``.
     """
 
     draws: Array
     points: Array
     conditioned: list[Conditioned]
+    owners: Rows
 
     def upper(self, confidence: float) -> float:
         """Return the bound that holds with this probability.
@@ -118,7 +120,8 @@ def draw_maxima(
     if not stochastic:
         tops = np.maximum(tops, y.max())
     order = np.argsort(tops, kind="stable")
-    return Maxima(tops[order], np.concatenate([where for _, where in found])[order], conditioned)
+    owners = np.repeat(np.arange(len(conditioned)), paths)
+    return Maxima(tops[order], np.concatenate([where for _, where in found])[order], conditioned, owners[order])
 
 
 def _required(sample: Sample) -> tuple[Array, Array]:
