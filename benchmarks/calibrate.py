@@ -38,6 +38,9 @@ CHECKPOINTS = {1: (8, 12, 20), 2: (15, 30), 4: (25, 50)}
 _SHARE = {1: 1.0, 2: 0.4, 4: 0.1}
 """Of the campaigns asked for, by dimension: a campaign of four dimensions costs ten times one of one."""
 
+_SEEDS = 10
+"""Stored campaigns of each of the paper's systems."""
+
 Values = Callable[[Array], Array]
 
 
@@ -270,14 +273,19 @@ def stored(family: str, dimension: int) -> list[dict[str, Any]]:
 
 
 def missing(campaigns: int) -> Iterator[Run]:
-    """Yield the campaigns that are not stored, the systems first and then the families in turn."""
-    for name, system in SYSTEMS.items():
-        seeds = {result["seed"] for result in stored(name, system.dimension)}
-        yield from (Run(name, system.dimension, seed) for seed in range(10) if seed not in seeds)
-    done = {(f, d): {r["seed"] for r in stored(f, d)} for f, (_, ds) in FAMILIES.items() for d in ds}
+    """Yield the campaigns that are not stored: families of few dimensions, systems, families of more dimensions."""
+    families = [(family, d) for family, (_, dimensions) in FAMILIES.items() for d in dimensions]
+    yield from _in_turn([name for name in families if name[1] <= 2], campaigns)
+    yield from _in_turn([(name, system.dimension) for name, system in SYSTEMS.items()], campaigns)
+    yield from _in_turn([name for name in families if name[1] > 2], campaigns)
+
+
+def _in_turn(names: list[tuple[str, int]], campaigns: int) -> Iterator[Run]:
+    done = {name: {result["seed"] for result in stored(*name)} for name in names}
     for seed in range(campaigns):
-        for (family, d), seeds in done.items():
-            if seed not in seeds and seed < campaigns * _SHARE[d]:
+        for family, d in names:
+            most = _SEEDS if family in SYSTEMS else campaigns * _SHARE[d]
+            if seed < most and seed not in done[family, d]:
                 yield Run(family, d, seed)
 
 
