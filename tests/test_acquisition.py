@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
 
 from ctxval import gp
-from ctxval.acquisition import Uncertainty, UpperConfidenceBound, maximise
+from ctxval.acquisition import LogExpectedImprovement, Uncertainty, UpperConfidenceBound, log_improvement, maximise
 from ctxval.kernels import Linear, Matern, Sum
 
 
@@ -43,7 +45,14 @@ def test_the_uncertainty_is_the_posterior_variance() -> None:
 
 
 @pytest.mark.parametrize("prior", [False, True])
-@pytest.mark.parametrize("make", [lambda p: UpperConfidenceBound(p, 2.0), Uncertainty])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda p: UpperConfidenceBound(p, 2.0),
+        Uncertainty,
+        *(lambda p, best=best: LogExpectedImprovement(p, best) for best in (-1.0, 2.0, 10.0)),
+    ],
+)
 def test_gradients_agree_with_finite_differences(make: type, prior: bool) -> None:
     acquisition, h = make(process(prior=prior)), 1e-6
     X = np.random.default_rng(2).random((9, 2))
@@ -51,6 +60,40 @@ def test_gradients_agree_with_finite_differences(make: type, prior: bool) -> Non
     values, gradients = acquisition.with_gradient(X)
     np.testing.assert_allclose(gradients, numeric, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(values, acquisition(X), rtol=1e-9)
+
+
+@pytest.mark.parametrize("best", [-0.5, 0.9, 1.5])
+def test_the_expected_improvement_is_its_integral(best: float) -> None:
+    X = np.random.default_rng(1).random((4, 2))
+    mean, variance = process().predict(X)
+    integrals = [
+        quad(lambda f, m=m, s=s: (f - best) * norm.pdf(f, m, s), best, max(m, best) + 12 * s, epsabs=0)[0]
+        for m, s in zip(mean, np.sqrt(variance), strict=True)
+    ]
+    np.testing.assert_allclose(LogExpectedImprovement(process(), best)(X), np.log(integrals), rtol=1e-6)
+
+
+def test_the_logarithm_of_an_improvement_is_the_formula_where_floats_can_hold_it() -> None:
+    z = np.linspace(-5, 8, 53)
+    np.testing.assert_allclose(log_improvement(z), np.log(norm.pdf(z) + z * norm.cdf(z)), rtol=1e-9, atol=1e-12)
+
+
+def test_the_logarithm_of_an_improvement_is_smooth_from_series_to_formula() -> None:
+    # phi(z) / z^2 (1 - 3 / z^2 + 15 / z^4) is the leading part far below zero.
+    for z in (-30.0, -300.0, -999.0, -1001.0, -1e6, -1e12):
+        leading = norm.logpdf(z) - 2 * np.log(-z) + np.log1p(-3 / z**2 + 15 / z**4)
+        assert log_improvement(np.array(z)) == pytest.approx(leading, abs=1e-6, rel=1e-14)
+    for edge in (-1.0, -1000.0):
+        below, above = log_improvement(edge + np.array([-1e-9, 1e-9]))
+        assert 0 < above - below < 1e-5
+
+
+def test_an_improvement_that_cannot_be_told_from_none_still_has_a_slope() -> None:
+    certain = process(noise=1e-12)
+    value, gradient = LogExpectedImprovement(certain, 1e4).with_gradient(certain.X + 1e-3)
+    assert np.isfinite(value).all()
+    assert np.isfinite(gradient).all()
+    assert (np.abs(gradient).max(axis=1) > 0).all()
 
 
 def test_where_nothing_is_uncertain_the_gradient_is_that_of_the_mean() -> None:
@@ -107,3 +150,34 @@ def test_a_flat_acquisition_still_gives_a_new_point_of_the_cube() -> None:
     found = maximise(Flat(), 2, known, np.random.default_rng(1))
     assert ((found >= 0) & (found <= 1)).all()
     assert np.abs(found - known).max(axis=1).min() > 1e-6
+
+
+def test_the_maximiser_stays_in_its_box() -> None:
+    box = (np.array([0.0, 0.5]), np.array([0.5, 1.0]))
+    for corners in (False, True):
+        found = maximise(Hill((0.7, 0.8)), 2, np.empty((0, 2)), np.random.default_rng(0), box=box, corners=corners)
+        np.testing.assert_allclose(found, [0.5, 0.8], atol=1e-4)
+
+
+def test_pending_and_failed_points_are_kept_away_from() -> None:
+    away = np.array([[0.7, 0.8]])
+    found = maximise(Hill((0.7, 0.8)), 2, away, np.random.default_rng(0), away=away)
+    assert 0.02 * np.sqrt(2) < np.linalg.norm(found - away[0]) < 0.1
+
+
+def test_moves_of_single_coordinates_to_bounds_find_a_corner_that_climbs_miss() -> None:
+    @dataclass(frozen=True)
+    class Corners:
+        """Slopes away from the middle on every axis: each corner is a local maximum, and 1, 1, ... is the best."""
+
+        def __call__(self, X: np.ndarray) -> np.ndarray:
+            return (np.abs(X - 0.5) + 0.1 * X).sum(axis=1)
+
+        def with_gradient(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return self(X), np.sign(X - 0.5) + 0.1
+
+    rng = np.random.default_rng
+    plain = maximise(Corners(), 20, np.empty((0, 20)), rng(0))
+    polished = maximise(Corners(), 20, np.empty((0, 20)), rng(0), corners=True)
+    np.testing.assert_array_equal(polished, 1.0)
+    assert (plain < 0.5).any()

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ctxval import Task, Trajectory
-from ctxval.distances import Distance, FinalState, GoalError, MeanDeviation, WholeTrajectory
+from ctxval.distances import ComposedDistance, Distance, FinalState, GoalError, MeanDeviation, WholeTrajectory
 from ctxval.errors import InputError
 
 HORIZON, N = 4, 3
@@ -84,6 +84,16 @@ def test_the_distance_per_step_divides_by_the_horizon() -> None:
 def test_the_error_of_the_final_state_is_signed() -> None:
     M, S = pair()
     np.testing.assert_array_equal(FinalState().error(trajectory(M), trajectory(S), task()), S[-1] - M[-1])
+
+
+@pytest.mark.parametrize("distance", [FinalState(norm=1), FinalState(norm=2, components=(0,)), GoalError(norm=np.inf)])
+def test_a_composed_distance_is_composed_of_its_vector(distance: ComposedDistance) -> None:
+    assert isinstance(distance, ComposedDistance)
+    assert not isinstance(WholeTrajectory(), ComposedDistance)
+    M, S = (trajectory(states) for states in pair((6,)))
+    vector = distance.error(M, S, task())
+    np.testing.assert_array_equal(distance.compose(vector), distance(M, S, task()))  # type: ignore[operator]
+    np.testing.assert_array_equal(distance.compose(np.stack([vector] * 2)), [distance.compose(vector)] * 2)
 
 
 def test_defaults_are_those_of_the_paper() -> None:

@@ -150,6 +150,24 @@ def test_an_execution_left_out_is_predicted_from_the_others() -> None:
     assert prediction.left_out(np.array([3])).shape == (1,)
 
 
+def test_a_distance_composed_of_a_vector_has_a_second_prediction_from_the_vectors() -> None:
+    validation = linear.experiment(0, dim=2).validation
+    rng = np.random.default_rng(0)
+    prediction = predict_distance(validation, executed(validation, rng.random((12, 4))))
+    assert prediction is not None
+    assert prediction.otherwise is not None
+    second = prediction.otherwise()
+    assert second is not None
+    points = rng.random((50, 4))
+    values = validation.distances(validation.space.from_unit(points))
+    assert np.abs(second.expected(points)[0] - values).max() < 0.05 * values.max()
+    validation.distance = distances.WholeTrajectory()
+    first = predict_distance(validation, executed(validation, rng.random((2, 4))))
+    assert first is not None
+    assert first.otherwise is not None
+    assert first.otherwise() is None
+
+
 @pytest.mark.parametrize("batched", [True, False])
 def test_a_task_that_cannot_be_planned_has_no_prediction_and_costs_the_others_nothing(batched: bool) -> None:
     class Picky(controllers.LQR):

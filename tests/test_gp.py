@@ -98,6 +98,18 @@ def test_the_posterior_is_the_textbook_formula(name: str, mean: gp.Mean) -> None
     np.testing.assert_allclose(variance, np.diag(covariance), rtol=0, atol=1e-9)
 
 
+def test_an_observation_left_out_is_predicted_by_all_others() -> None:
+    X, y = data(8)
+    whole = gp.condition(KERNELS["sum"], THETA["sum"], X, y, noise=NOISE)
+    mean, variance = whole.left_out()
+    for i in range(8):
+        rest = np.arange(8) != i
+        others = gp.condition(KERNELS["sum"], THETA["sum"], X[rest], y[rest], noise=NOISE)
+        expected, uncertain = others.predict(X[i : i + 1])
+        assert mean[i] == pytest.approx(expected[0])
+        assert variance[i] == pytest.approx(uncertain[0] + NOISE)
+
+
 def test_without_noise_the_process_goes_through_its_observations() -> None:
     X, y = data(6)
     mean, variance = gp.condition(Matern(2.5), np.log([1.0, 0.2]), X, y, noise=1e-10).predict(X)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from ctxval import gp
 from ctxval.errors import InputError
 from ctxval.kernels import Linear, Matern
-from ctxval.surrogate import fit_surrogate
+from ctxval.surrogate import Learned, fit_surrogate, learn
 
 
 def data(n: int = 15, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -98,3 +98,71 @@ def test_fewer_than_two_known_values_are_refused(known: int) -> None:
 def test_a_prior_mean_without_one_finite_value_a_point_is_refused(prior: gp.Mean) -> None:
     with pytest.raises(InputError, match="one finite value for each point"):
         fit_surrogate(*data(), prior_mean=prior)
+
+
+# Learned once, conditioned often
+
+
+def many(d: int = 6, n: int = 40, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((n, d))
+
+
+def test_what_matters_gets_the_shorter_length_scales() -> None:
+    X = many()
+    learned = learn(X, np.sin(6 * X[:, 2]) + 0.01 * X[:, 4])
+    scales = learned.theta[1:7]
+    assert scales.argmin() == 2
+    assert scales[2] < np.delete(scales, 2).min() - 0.3
+
+
+def test_a_heavy_tail_is_a_process_of_the_logarithm_and_a_plain_function_is_not() -> None:
+    X = many(3)
+    steep = np.exp(6 * np.sin(2 * X).sum(axis=1))
+    assert np.isfinite(learn(X, steep).warp.offset)
+    assert np.isinf(learn(X, X.sum(axis=1)).warp.offset)
+    assert np.isinf(learn(X, steep - steep.max()).warp.offset)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_what_is_learned_does_not_depend_on_the_units(scale: float) -> None:
+    X = many(3)
+    y = 1 + np.sin(4 * X).sum(axis=1) ** 2
+    np.testing.assert_allclose(learn(X, scale * y).theta, learn(X, y).theta, atol=1e-3)
+
+
+def test_the_process_goes_through_known_values_and_believes_what_it_predicts_elsewhere() -> None:
+    X = many(2, 12)
+    y = np.sin(5 * X).sum(axis=1)
+    learned = learn(X[:8], y[:8])
+    values = np.where(np.arange(12) % 4 == 3, np.nan, y)
+    process = learned.condition(X, values)
+    np.testing.assert_allclose(process.predict(X)[0][::4], learned.standardised(y)[::4], atol=1e-3)
+    alone = learned.condition(X[np.isfinite(values)], values[np.isfinite(values)])
+    np.testing.assert_allclose(process.predict(where())[0], alone.predict(where())[0], atol=1e-5)
+    assert (process.predict(X)[1] < 1e-3).all()
+
+
+@pytest.mark.parametrize("values", [np.zeros(5), np.full(5, 3.0), np.array([0.0, 0.0, 0.0, 0.0, 1.0])])
+def test_values_that_say_nothing_are_learned_from_without_harm(values: np.ndarray) -> None:
+    learned = learn(many(2, 5), values)
+    assert isinstance(learned, Learned)
+    assert np.isfinite(learned.condition(many(2, 5), values).predict(where())[0]).all()
+
+
+def test_the_prior_of_the_hyperparameters_has_the_gradient_that_differences_show() -> None:
+    from ctxval.surrogate import _LogPrior
+
+    prior, at = _LogPrior(4), np.random.default_rng(0).normal(size=8)
+    numeric = [(prior(at + 1e-6 * e)[0] - prior(at - 1e-6 * e)[0]) / 2e-6 for e in np.eye(8)]
+    np.testing.assert_allclose(prior(at)[1], numeric, rtol=1e-6, atol=1e-6)
+
+
+def test_of_very_many_values_the_largest_and_a_spread_of_the_others_are_learned_from() -> None:
+    X = many(2, 700)
+    y = np.sin(4 * X).sum(axis=1)
+    learned = learn(X, y)
+    np.testing.assert_allclose(
+        learned.condition(X, y).predict(where())[0],
+        learned.standardised(np.sin(4 * where()).sum(axis=1)),
+        atol=0.05,
+    )

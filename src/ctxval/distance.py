@@ -21,6 +21,17 @@ class Distance(Protocol):
         """Return d >= 0, shape ``(...)`` over the batch."""
 
 
+@runtime_checkable
+class ComposedDistance(Protocol):
+    """A distance that is a plain function of a short vector; a search learns more from the vector than from d."""
+
+    def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        """Return the vector, shape ``(..., k)`` over the batch."""
+
+    def compose(self, error: Array) -> Array:
+        """Return the distance of vectors ``(..., k)``, shape ``(...)``."""
+
+
 @dataclass(frozen=True)
 class FinalState:
     """Norm of the difference between the final states (the paper's eq. 5, with ``norm=1``).
@@ -40,9 +51,13 @@ class FinalState:
         """Return the vector whose norm the distance is, shape ``(..., k)``."""
         return _chosen(system_trajectory.final_state - model_trajectory.final_state, self.components)
 
+    def compose(self, error: Array) -> Array:
+        """Return the norm of vectors ``(..., k)``, shape ``(...)``."""
+        return vector_norm(error, self.norm)
+
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         """Return the distance, shape ``(...)``."""
-        return vector_norm(self.error(model_trajectory, system_trajectory, task), self.norm)
+        return self.compose(self.error(model_trajectory, system_trajectory, task))
 
 
 @dataclass(frozen=True)
@@ -108,9 +123,17 @@ class GoalError:
     def __post_init__(self) -> None:
         as_norm_order(self.norm)
 
+    def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        """Return the vector whose norm the distance is, shape ``(..., k)``."""
+        return _chosen(system_trajectory.final_state - task.goal, self.components)
+
+    def compose(self, error: Array) -> Array:
+        """Return the norm of vectors ``(..., k)``, shape ``(...)``."""
+        return vector_norm(error, self.norm)
+
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         """Return the distance, shape ``(...)``."""
-        return vector_norm(_chosen(system_trajectory.final_state - task.goal, self.components), self.norm)
+        return self.compose(self.error(model_trajectory, system_trajectory, task))
 
 
 def _chosen(states: Array, components: Sequence[int] | None) -> Array:

@@ -1,5 +1,5 @@
 """Distances: ready-made ones."""
 
-from ctxval.distance import Distance, FinalState, GoalError, MeanDeviation, WholeTrajectory
+from ctxval.distance import ComposedDistance, Distance, FinalState, GoalError, MeanDeviation, WholeTrajectory
 
-__all__ = ["Distance", "FinalState", "GoalError", "MeanDeviation", "WholeTrajectory"]
+__all__ = ["ComposedDistance", "Distance", "FinalState", "GoalError", "MeanDeviation", "WholeTrajectory"]

@@ -18,9 +18,11 @@ from scipy.spatial.distance import cdist
 
 from ctxval import kernels
 from ctxval.arrays import Array, Rows, single_threaded
+from ctxval.distance import ComposedDistance
 from ctxval.model import Model
 from ctxval.rollout import rollout
 from ctxval.searches import Prediction
+from ctxval.searches.vector import predict_composed
 from ctxval.trajectory import Trajectory, Transitions
 from ctxval.validation import Validation
 
@@ -307,14 +309,37 @@ def learn_corrected(model: Model, transitions: Transitions, sources: Rows, centr
 def predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
     """Return what the executions so far, and the data that the model came with, let one expect of d at other points.
 
-    None where nothing was recorded, where M is not wrong in it, or where no task can be planned.
+    None where nothing was recorded, where M is not wrong in it, or where no task can be planned. Where the distance is
+    composed of a short vector, such as the error of the final state, the prediction names another to turn to, that of
+    the vectors as functions of p: what no function of state and input explains may still be one of p.
 
     Args:
         validation: the map p -> d(p).
         executed: points of the unit cube ``(d,)`` with the system's trajectories there.
     """
+    otherwise = functools.partial(_predict_vectors, validation, executed)
     with single_threaded():
-        return _predict_distance(validation, executed)
+        found = _predict_distance(validation, executed)
+        return otherwise() if found is None else replace(found, otherwise=otherwise)
+
+
+def _predict_vectors(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
+    """Return what the vectors that distances are composed of let one expect; None where they are not."""
+    distance = validation.distance
+    if not isinstance(distance, ComposedDistance) or len(executed) < 2:
+        return None
+    try:
+        errors = np.array([_vector(validation, distance, *pair) for pair in executed])
+    except Exception:  # the user's own parts; they work where S was executed, but a distance may still object
+        return None
+    if errors.ndim != 2 or not np.isfinite(errors).all():
+        return None
+    return predict_composed(np.array([point for point, _ in executed]), errors, distance.compose)
+
+
+def _vector(validation: Validation, distance: ComposedDistance, point: Array, trajectory: Trajectory) -> Array:
+    plan = validation.plan(validation.space.from_unit(point))
+    return distance.error(plan.model_trajectory, trajectory, plan.task)
 
 
 def _predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:

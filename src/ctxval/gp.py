@@ -78,6 +78,14 @@ class GaussianProcess:
         d_variance = self.kernel.diagonal_input_gradient(self.theta, X) - 2 * pull
         return self.mean(X) + k @ self.alpha, variance, d_mean, d_variance
 
+    def left_out(self) -> tuple[Array, Array]:
+        """Return mean and variance ``(n,)`` of each observation given all others.
+
+        Rasmussen and Williams 2006, eq. 5.12.
+        """
+        precision = np.diag(_inverse(self.L))
+        return self.y - self.alpha / precision, 1 / precision
+
     def log_marginal_likelihood(self) -> float:
         """Return log p(y | X, theta)."""
         return _log_likelihood(self.L, self.alpha, self.y - self.mean(self.X))

@@ -2,13 +2,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ctxval.arrays import Array, Rows
 from ctxval.errors import InputError, ShapeError
-from ctxval.searches import Auto, Climbs, Prediction, Random
+from ctxval.searches import Auto, Climbs, Prediction, Random, Scalar
 from ctxval.searches.base import Note
 from ctxval.testing import check_search
 
@@ -62,7 +63,7 @@ def test_without_a_prediction_the_scalar_search_goes_on_and_says_so() -> None:
     search.reset(2, 5)
     random.reset(2, 5)
     np.testing.assert_array_equal(search.ask(1), random.ask(1))
-    assert search.note() == {"engine": "scalar", "why": "there is no prediction"}
+    assert search.note() == {"engine": "scalar", "how": "initial", "why": "there is no prediction"}
     check_search(Climbs())
     check_search(Auto())
 
@@ -72,7 +73,7 @@ def test_a_prediction_of_nothing_is_none() -> None:
     search.reset(2, 0)
     search.use_prediction(predicting(lambda X: np.full(len(X), np.nan)))
     assert np.isfinite(search.ask(1)).all()
-    assert search.note() == {"engine": "scalar", "why": "nothing is predicted anywhere"}
+    assert search.note() == {"engine": "scalar", "how": "initial", "why": "nothing is predicted anywhere"}
 
 
 def test_doubt_draws_the_search_to_what_was_not_seen() -> None:
@@ -119,6 +120,38 @@ def test_a_batch_of_questions_spreads() -> None:
     assert min(gaps) > 0.05
 
 
+def test_without_any_prediction_it_goes_on_as_the_scalar_search_does() -> None:
+    search, scalar = Climbs(), Scalar(initial=1)
+    for each in (search, scalar):
+        each.reset(3, 4)
+        for _ in range(6):
+            point = each.ask(1)
+            each.tell(point, hill(point))
+    np.testing.assert_array_equal(search.points, scalar.points)
+
+
+def test_a_prediction_that_is_no_good_is_replaced_by_the_one_it_names() -> None:
+    asked: list[int] = []
+
+    def wrong(known: Array) -> Prediction:
+        def otherwise() -> Prediction:
+            asked.append(len(known))
+            return predicting(hill, known=known)
+
+        return replace(predicting(lambda X: 1.0 - 0.9 * hill(X), known=known), otherwise=otherwise)
+
+    search = Climbs()
+    search.reset(2, 0)
+    for _ in range(10):
+        search.use_prediction(wrong(search.points))
+        point = search.ask(1)
+        search.tell(point, hill(point))
+    assert asked
+    assert min(asked) >= 6  # it is not computed before it is needed
+    assert search.values.max() > 0.99
+    assert all(note is not None and note["engine"] == "climb" for note in search.notes)
+
+
 @pytest.mark.parametrize("told", [1, 3, 6])
 def test_told_its_history_with_its_notes_it_asks_for_the_same_point(told: int) -> None:
     whole = Climbs()
@@ -145,7 +178,7 @@ def test_a_reset_forgets_the_prediction() -> None:
     run(search, hill, hill, 2)
     search.reset(2, 0)
     search.ask(1)
-    assert search.note() == {"engine": "scalar", "why": "there is no prediction"}
+    assert search.note() == {"engine": "scalar", "how": "initial", "why": "there is no prediction"}
 
 
 @pytest.mark.parametrize(

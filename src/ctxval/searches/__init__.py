@@ -12,6 +12,7 @@ from ctxval.searches.climbs import Climbs
 from ctxval.searches.cma_es import CMAES
 from ctxval.searches.gp_ucb import GPUCB
 from ctxval.searches.random import Random, SamplingDiscarding
+from ctxval.searches.scalar import Scalar
 
 __all__ = [
     "CMAES",
@@ -24,6 +25,7 @@ __all__ = [
     "Prediction",
     "Random",
     "SamplingDiscarding",
+    "Scalar",
     "Search",
     "SequentialSearch",
     "by_name",
@@ -37,6 +39,7 @@ NAMES: dict[str, type[Any]] = {
     "gp-ucb": GPUCB,
     "random": Random,
     "sampling-discarding": SamplingDiscarding,
+    "scalar": Scalar,
 }
 """The searches that the command line and experiment files know."""
 

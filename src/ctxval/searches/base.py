@@ -27,11 +27,13 @@ class Prediction:
             there, ``(k,)``, had each not been evaluated.
         budget: how many points may be asked about in choosing one, the known ones not counted; each may cost a
             controller's design.
+        otherwise: finds what may be used where leaving points out shows that this one is no good.
     """
 
     expected: Callable[[Array], tuple[Array, Array]]
     left_out: Callable[[Rows], Array]
     budget: int
+    otherwise: Callable[[], Prediction | None] | None = None
 
 
 @runtime_checkable

@@ -19,7 +19,7 @@ from ctxval.errors import InputError
 from ctxval.kernels import Matern
 from ctxval.searches.ascent import Ascent
 from ctxval.searches.base import Note, Prediction, SequentialSearch
-from ctxval.searches.gp_ucb import GPUCB
+from ctxval.searches.scalar import Scalar
 from ctxval.surrogate import fit_surrogate
 
 _RIGHT = 0.1
@@ -65,7 +65,7 @@ class _Climb:
 
 
 class Climbs(SequentialSearch):
-    """Trust-region climbs with restarts on a prediction of the values; GP-UCB where there is none that is any good.
+    """Trust-region climbs with restarts on a prediction of the values; the scalar search where there is none any good.
 
     Args:
         optimism: kappa; by how much a value may exceed its prediction, as a share of it, where the doubt is 1. After
@@ -90,6 +90,8 @@ class Climbs(SequentialSearch):
         """Forget everything and start on the unit cube of this dimension."""
         super().reset(dimension, seed)
         self._prediction: Prediction | None = None
+        self._fallback = Scalar(initial=1)
+        self._fallback.reset(dimension, seed)
 
     def use_prediction(self, prediction: Prediction | None) -> None:
         """Take what is expected before the next question; None where nothing is."""
@@ -97,20 +99,21 @@ class Climbs(SequentialSearch):
 
     def propose(self, rng: np.random.Generator) -> Array:
         """Return the point that promises most."""
-        if self._prediction is None:
-            return self._scalar(rng, "there is no prediction")
-        with single_threaded():
-            doubtful = self._why_not(self._prediction)
-            point = self._climb(self._prediction, rng) if doubtful is None else None
-        return self._scalar(rng, doubtful or "nothing is predicted anywhere") if point is None else point
+        prediction, why = self._prediction, "there is no prediction"
+        while prediction is not None:
+            with single_threaded():
+                doubtful = self._why_not(prediction)
+                point = self._climb(prediction, rng) if doubtful is None else None
+            if point is not None:
+                return point
+            why = doubtful or "nothing is predicted anywhere"
+            prediction = None if prediction.otherwise is None else prediction.otherwise()
+        return self._scalar(rng, why)
 
     def _scalar(self, rng: np.random.Generator, why: str) -> Array:
-        engine = GPUCB(initial=1)
-        engine.reset(self.dimension, self._seed)
-        if len(self.points):
-            engine.tell(self.points, self.values)
-        self._thought = {"engine": "scalar", "why": why}
-        return engine.propose(rng)
+        point, thought = self._fallback.choose(self.points, self.values, rng)
+        self._thought = {**thought, "why": why}
+        return point
 
     # How good the prediction is
 
