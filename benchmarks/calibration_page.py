@@ -12,9 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import beta, binom
 
-from ctxval.certificates.diagnostics import LEVEL, RESOLUTION
-
 from calibrate import CONFIDENCES, DRAWS, FAMILIES, PATHS, RESULTS, ROOT, SYSTEMS, Run, stored
+from ctxval.certificates.diagnostics import LEVEL, RESOLUTION
 
 PAGE = ROOT / "docs" / "calibration.md"
 THRESHOLDS = (0.5, 0.8, 0.9, 0.95, 0.99)

@@ -237,7 +237,7 @@ def campaigns(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 KINDS = {
-    "posterior": (),
+    "posterior": ("--resolution", "1"),
     "scenario": (),
     "sampling-discarding": ("--discard", "2"),
     "convergence": ("--theorem", "0.5,1e-4,1,3,1"),
@@ -289,9 +289,11 @@ def test_what_was_executed_falsifies_without_any_certificate(invoke, campaigns: 
 
 
 def test_what_is_undecided_says_how_many_more_executions_would_decide(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
-    plain = json.loads(invoke("certify", str(campaigns["linear"]), "--json").stdout)
+    plain = json.loads(invoke("certify", str(campaigns["linear"]), "--resolution", "1", "--json").stdout)
     tau = 0.5 * (plain["details"]["best"] + plain["upper_bound"])
-    report = json.loads(invoke("certify", str(campaigns["linear"]), "--threshold", str(tau), "--json").stdout)
+    report = json.loads(
+        invoke("certify", str(campaigns["linear"]), "--resolution", "1", "--threshold", str(tau), "--json").stdout
+    )
     assert report["verdict"] == "undecided"
     assert set(report["expected"]) == {"executions", "validated", "falsified"}
     assert "verdict" not in plain

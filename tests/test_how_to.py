@@ -14,7 +14,7 @@ import pytest
 PAGES = sorted((Path(__file__).parents[1] / "docs" / "how-to").glob("*.md"))
 NEEDS = {"gymnasium": ["gymnasium", "mujoco"], "mujoco": ["mujoco"], "fmu": ["fmpy", "pythonfmu"], "mpc": ["casadi"]}
 NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-space": ["control"]}
-PROGRAMS = {"python": [], "ctxval": ["-c", "from ctxval.cli import main; main()"]}
+PROGRAMS: dict[str, list[str]] = {"python": [], "ctxval": ["-c", "from ctxval.cli import main; main()"]}
 
 
 def blocks(page: Path) -> list[tuple[str, str]]:
@@ -27,7 +27,7 @@ def run_console(lines: str) -> None:
         program, *arguments = shlex.split(line.removeprefix("$ "), comments=True)
         command = [sys.executable, *PROGRAMS[program], *arguments]
         done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "100"})
-        assert done.returncode == 0, done.stdout + done.stderr
+        assert done.returncode == 0, line + done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -35,6 +35,7 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytes
     for module in NEEDS.get(page.stem, []):
         pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     names: dict[str, object] = {"__name__": "page"}
     for language, content in blocks(page):
         first, _, rest = content.partition("\n")

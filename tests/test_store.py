@@ -74,7 +74,7 @@ def test_an_ended_trial_cannot_end_again() -> None:
     store = Store()
     store.open_trial(trial(), TRAJECTORY)
     store.close_trial(replace(trial(), state="failed", failure="x"), None)
-    with pytest.raises(InputError, match="not open"):
+    with pytest.raises(InputError, match="nothing more can be told"):
         store.close_trial(replace(trial(), state="completed", distance=1.0), TRAJECTORY)
     assert store.trials()[0].state == "failed"
 

@@ -1,50 +1,30 @@
-"""The campaign: search, validation and store together; the only object with a life."""
+"""The campaign: the only object with a life."""
 
 from __future__ import annotations
 
+import concurrent.futures as cf
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval.arrays import Array
-from ctxval.describe import describe
-from ctxval.dynamics import predict_distance
-from ctxval.errors import CtxvalError, DistanceError, ExecutionError, InputError
-from ctxval.searches import GPUCB, Prediction, Search
-from ctxval.store import Store
+from ctxval.certificates import RESOLUTION
+from ctxval.errors import CtxvalError, ExecutionError, InputError
+from ctxval.interrupts import Interrupts
+from ctxval.ledger import Ledger, OpenTrial, text_of
 from ctxval.surrogate import Surrogate, fit_surrogate
 from ctxval.trajectory import Trajectory
-from ctxval.trial import Origin, Trial
-from ctxval.validation import Plan, Validation, require_execution
+from ctxval.trial import Trial
+from ctxval.validation import require_execution
 from ctxval.verdict import CONFIDENCE, Verdict, judge
+from ctxval.workers import Crew, Ended, crew
 
-_AUDIT = 0x6175
-"""Marks the randomness of an audit's draws; searches mark streams of theirs with small numbers."""
-
-
-@dataclass(frozen=True, eq=False)
-class OpenTrial:
-    """A trial to be executed, with all that an operator needs for it.
-
-    Attributes:
-        trial: what is stored.
-        plan: its task, its controller and the model's trajectory.
-    """
-
-    trial: Trial
-    plan: Plan
-
-    @property
-    def number(self) -> int:
-        """The trial's number."""
-        return self.trial.number
+__all__ = ["Campaign", "OpenTrial"]
 
 
-class Campaign:
+class Campaign(Ledger):
     """A search for the worst task, with everything stored before and after each execution.
 
     The budget is a total: running again resumes, and a resumed campaign makes the choices that it would have made
@@ -62,68 +42,6 @@ class Campaign:
         StoreError: the store cannot be used, or was made by another experiment.
     """
 
-    def __init__(
-        self,
-        validation: Validation,
-        *,
-        search: Search | None = None,
-        store: Store | str | Path | None = None,
-        seed: int = 0,
-        name: str = "",
-    ) -> None:
-        if not isinstance(validation, Validation):
-            raise InputError(f"validation must be a Validation, got {validation!r}.")
-        if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
-            raise InputError(f"seed must be an integer >= 0, got {seed!r}.")
-        self.validation = validation
-        self.search: Search = GPUCB() if search is None else search
-        if not isinstance(self.search, Search):
-            raise InputError(f"search must have reset, ask and tell, got {search!r}.")
-        self.seed = int(seed)
-        self.name = name
-        self.store = store if isinstance(store, Store) else Store(store)
-        self.store.identify(
-            {
-                "name": name,
-                "seed": self.seed,
-                "search": describe(self.search),
-                "validation": validation.describe(),
-            }
-        )
-        self._replay()
-
-    def _replay(self) -> None:
-        """Bring the search to where the stored trials left it."""
-        self.search.reset(self.validation.space.dimension, self.seed)
-        self._trials = self.store.trials()
-        if self._trials:
-            points = np.array([trial.unit_point for trial in self._trials])
-            self.search.tell(points, [np.nan if t.distance is None else t.distance for t in self._trials])
-            if hasattr(self.search, "remember"):
-                self.search.remember([trial.note for trial in self._trials])
-
-    # What is known
-
-    @property
-    def trials(self) -> tuple[Trial, ...]:
-        """All trials in the order of asking."""
-        return tuple(self._trials)
-
-    @property
-    def completed(self) -> list[Trial]:
-        """The trials with a distance."""
-        return [trial for trial in self._trials if trial.state == "completed"]
-
-    @property
-    def failed(self) -> list[Trial]:
-        """The trials that failed."""
-        return [trial for trial in self._trials if trial.state == "failed"]
-
-    @property
-    def executions(self) -> int:
-        """How many executions of S have ended, well or badly."""
-        return sum(trial.executed for trial in self._trials)
-
     @property
     def worst(self) -> Trial | None:
         """The completed trial with the largest distance."""
@@ -136,7 +54,14 @@ class Campaign:
         ordered = sorted((_distance(trial) for trial in self.completed), reverse=True)
         return ordered[discard] if len(ordered) > discard else None
 
-    def verdict(self, threshold: float, confidence: float = CONFIDENCE, *, stochastic: bool = False) -> Verdict:
+    def verdict(
+        self,
+        threshold: float,
+        confidence: float = CONFIDENCE,
+        *,
+        stochastic: bool = False,
+        resolution: float = RESOLUTION,
+    ) -> Verdict:
         """Return whether M may be trusted up to a threshold tau, in the distance's units.
 
         Falsified by an executed counterexample, validated by the posterior bound with this confidence, undecided
@@ -146,8 +71,9 @@ class Campaign:
             threshold: tau.
             confidence: of a validation.
             stochastic: whether two executions of one task may differ.
+            resolution: how far from every trial a task may be, in diagonals of the task space, for a validation.
         """
-        return judge(self.trials, threshold, confidence, stochastic=stochastic)
+        return judge(self.trials, threshold, confidence, stochastic=stochastic, resolution=resolution)
 
     def surrogate(self) -> Surrogate:
         """Return the GP of the distance over the task space, whichever search chose the trials.
@@ -162,10 +88,6 @@ class Campaign:
         points = np.array([trial.unit_point for trial in self.completed])
         return fit_surrogate(points, np.array([_distance(trial) for trial in self.completed]))
 
-    def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
-        """Return the trajectories of the model and of the system in a trial; None where there is none."""
-        return self.store.trajectory(trial.number, "model"), self.store.trajectory(trial.number, "system")
-
     # Running
 
     def run(
@@ -174,217 +96,232 @@ class Campaign:
         on_trial: Callable[[Trial], None] | None = None,
         *,
         until: Callable[[Campaign], bool] | None = None,
+        workers: int | None = None,
+        executor: cf.Executor | None = None,
+        timeout: float | None = None,
+        retries: int = 2,
+        retry_failures: int = 0,
     ) -> Campaign:
         """Execute until ``budget`` executions have ended in all, earlier ones counted.
 
-        A failed execution is a failed trial and counts; the campaign goes on.
+        A failed execution is a failed trial and counts; the campaign goes on. With many workers a new task is chosen
+        as soon as one is free, while the search knows which are being executed; what it chooses then depends on which
+        of them ended first. Ctrl-C ends after the running executions, a second one at once; both can be resumed.
 
         Args:
             budget: total number of executions of S.
             on_trial: called with each trial that has ended.
             until: asked before each execution; the campaign stops early once it answers yes.
+            workers: processes of this computer, each with its own copy of the system; or how many executions the
+                executor is given at a time.
+            executor: of ``concurrent.futures``, in place of own processes.
+            timeout: seconds after which an execution has failed; it then runs in a process of its own.
+            retries: how often the execution of a trial is repeated whose worker was lost.
+            retry_failures: how often it is repeated where the system itself failed.
 
         Raises:
-            InputError: the budget is not a positive integer.
+            InputError: a value cannot be used, or the system cannot be sent to the workers.
             ModelError, DesignError, DistanceError: the task, the model or the distance cannot be used. What was
                 executed is stored; running again goes on behind the trial that failed.
+            CampaignError: the workers are gone.
         """
-        if not isinstance(budget, int | np.integer) or isinstance(budget, bool) or budget < 1:
-            raise InputError(f"budget must be a positive integer, got {budget!r}.")
-        with self.store.sole_writer():
-            for trial in self._interrupted():
-                if self.executions < budget:
-                    self._execute(self._reopen(trial), on_trial)
-            while self.executions < budget and not (until is not None and until(self)):
-                self._execute(self._open(None, attempts=1), on_trial)
-        return self
+        _require_count("budget must be a positive integer", budget)
 
-    def audit(self, draws: int, on_trial: Callable[[Trial], None] | None = None) -> Campaign:
+        def wanted(running: int) -> OpenTrial | None:
+            if self.executions + running >= budget:
+                return None
+            if self._again:
+                return self._reopen(self._again.popleft())
+            return None if until is not None and until(self) else self._open(None, attempts=1)
+
+        hands = self._crew(workers, executor, timeout)
+        return self._carry_out(wanted, hands, on_trial, _Patience(retries, retry_failures))
+
+    def audit(
+        self,
+        draws: int,
+        on_trial: Callable[[Trial], None] | None = None,
+        *,
+        workers: int | None = None,
+        executor: cf.Executor | None = None,
+        timeout: float | None = None,
+    ) -> Campaign:
         """Execute independent uniform draws of tasks, whatever the search, until there are so many among the trials.
 
         Args:
             draws: total number of independent draws.
             on_trial: called with each trial that has ended.
+            workers, executor, timeout: as in :meth:`run`.
 
         Raises:
             InputError: the number is not a positive integer.
             ModelError, DesignError, DistanceError: as :meth:`run` does.
         """
-        if not isinstance(draws, int | np.integer) or isinstance(draws, bool) or draws < 1:
-            raise InputError(f"an audit needs a positive number of draws, got {draws!r}.")
-        with self.store.sole_writer():
-            for trial in self._interrupted():
-                self._execute(self._reopen(trial), on_trial)
-            while sum(trial.origin == "iid" for trial in self._trials) < draws:
-                # Apart from the search's own randomness, which is that of [seed, number].
-                rng = np.random.default_rng(np.random.SeedSequence([self.seed, len(self._trials), _AUDIT]))
-                unit_point = rng.random(self.validation.space.dimension)
-                self._execute(self._open((unit_point, "iid"), attempts=1), on_trial)
+        _require_count("an audit needs a positive number of draws", draws)
+
+        def wanted(running: int) -> OpenTrial | None:
+            if self._again:
+                return self._reopen(self._again.popleft())
+            enough = sum(trial.origin == "iid" for trial in self._trials) >= draws
+            return None if enough else self._open((self._draw(), "iid"), attempts=1)
+
+        return self._carry_out(wanted, self._crew(workers, executor, timeout), on_trial, _Patience())
+
+    def _crew(self, workers: int | None, executor: cf.Executor | None, timeout: float | None) -> Crew | None:
+        system = self.validation.system
+        if getattr(system, "manual", False):
+            raise InputError(
+                "this system is executed by people, not by run or audit: take tasks with ask and say what happened "
+                "with tell, in Python or as `ctxval ask` and `ctxval tell`."
+            )
+        return crew(system, workers=workers, executor=executor, timeout=timeout)
+
+    def _carry_out(
+        self,
+        wanted: Callable[[int], OpenTrial | None],
+        hands: Crew | None,
+        on_trial: Callable[[Trial], None] | None,
+        patience: _Patience,
+    ) -> Campaign:
+        """Execute what is wanted, given how many executions are running, until nothing is."""
+        with self.store.sole_writer(), Interrupts() as interrupts:
+            self._refresh()
+            self._again = deque(trial for trial in self._trials if trial.state == "open" and trial.attempts)
+            if hands is None:
+                self._one_by_one(wanted, on_trial, interrupts)
+            else:
+                _Together(self, hands, on_trial, patience).carry_out(wanted, interrupts)
         return self
 
-    def _interrupted(self) -> list[Trial]:
-        return [trial for trial in self._trials if trial.state == "open" and trial.attempts]
-
-    def _reopen(self, trial: Trial) -> OpenTrial:
-        """Plan an interrupted trial again and count one more attempt."""
-        try:
-            plan = self._plan(trial)
-        except CtxvalError as error:
-            self._close(trial, failure=_text(error), executed=False)
-            raise
-        self.store.begin_attempt(trial.number)
-        self._trials[trial.number] = replace(trial, attempts=trial.attempts + 1)
-        return OpenTrial(self._trials[trial.number], plan)
+    def _one_by_one(
+        self,
+        wanted: Callable[[int], OpenTrial | None],
+        on_trial: Callable[[Trial], None] | None,
+        interrupts: Interrupts,
+    ) -> None:
+        while (opened := wanted(0)) is not None:
+            with interrupts.shielded():
+                self._execute(opened, on_trial)
+            interrupts.raise_if_asked()
 
     def _execute(self, opened: OpenTrial, on_trial: Callable[[Trial], None] | None) -> None:
         started = time.perf_counter()
         try:
             trajectory = self.validation.execute(opened.plan)
         except ExecutionError as error:
-            ended = self._close(opened.trial, failure=_text(error), seconds=time.perf_counter() - started)
+            ended = self._close(opened.trial, failure=text_of(error), seconds=time.perf_counter() - started)
         else:
             ended = self._measure(opened, trajectory, time.perf_counter() - started)
         if on_trial is not None:
             on_trial(ended)
 
-    # By hand
 
-    def ask(self, parameters: Mapping[str, Any] | None = None) -> OpenTrial:
-        """Open the next trial: the search's choice, or the task with these parameters.
+@dataclass(frozen=True)
+class _Patience:
+    """How often an execution is repeated: where the worker was lost, and where the system failed."""
 
-        Raises:
-            InputError: the parameters are not of the task space.
-            ModelError, DesignError: no controller could be designed and run on the model; the trial is stored as
-                failed and costs no execution.
-        """
-        if parameters is None:
-            return self._open(None, attempts=0)
-        space = self.validation.space
-        return self._open((space.to_unit(space.point(parameters)), "manual"), attempts=0)
+    losses: int = 2
+    failures: int = 0
 
-    def _open(self, given: tuple[Array, Origin] | None, attempts: int) -> OpenTrial:
-        """Store a new trial ahead of its execution; one that is about to be executed counts as its first attempt."""
+    def __post_init__(self) -> None:
+        for name, value in (("retries", self.losses), ("retry_failures", self.failures)):
+            if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+                raise InputError(f"{name} must be an integer >= 0, got {value!r}.")
+
+
+class _Together:
+    """Many executions at a time, of one campaign."""
+
+    def __init__(
+        self, campaign: Campaign, hands: Crew, on_trial: Callable[[Trial], None] | None, patience: _Patience
+    ) -> None:
+        self.campaign, self.hands, self.on_trial, self.patience = campaign, hands, on_trial, patience
+        self.running: dict[int, OpenTrial] = {}
+        self.losses: Counter[int] = Counter()
+        self.failures: Counter[int] = Counter()
+        self.stopped: BaseException | None = None
+
+    def carry_out(self, wanted: Callable[[int], OpenTrial | None], interrupts: Interrupts) -> None:
+        """Keep the workers busy; whatever stops that, first wait for the executions that are running."""
         try:
-            return self._store_next(given, attempts)
-        except BaseException:
-            # Whatever stopped it, the search must know the stored trials and no other.
-            self._replay()
-            raise
+            while True:
+                self._start_wanted(wanted, interrupts)
+                if not self.running:
+                    break
+                with interrupts.shielded():
+                    self._take(self.hands.wait())
+        finally:
+            self.hands.close()
+        if self.stopped is not None:
+            raise self.stopped
+        interrupts.raise_if_asked()
 
-    def _store_next(self, given: tuple[Array, Origin] | None, attempts: int) -> OpenTrial:
-        note = None
-        if given is None:
-            unit_point, origin = self._suggestion(), self._origin()
-            note = self.search.note() if hasattr(self.search, "note") else None
-        else:
-            unit_point, origin = given
-            self.search.tell(unit_point[None], [np.nan])
-        names = self.validation.space.describe_point(self.validation.space.from_unit(unit_point))
-        trial = Trial(len(self._trials), origin, "open", unit_point, names, attempts, note=note)
+    def _start_wanted(self, wanted: Callable[[int], OpenTrial | None], interrupts: Interrupts) -> None:
+        while self.stopped is None and not interrupts.asked and len(self.running) < self.hands.size:
+            try:
+                opened = wanted(len(self.running))
+                if opened is None:
+                    return
+                self._start(opened)
+            except (CtxvalError, KeyboardInterrupt) as error:
+                self.stopped = error
+                if self.running and isinstance(error, KeyboardInterrupt):
+                    interrupts.announce()
+
+    def _start(self, opened: OpenTrial) -> None:
+        self.hands.start(opened.number, opened.plan)
+        self.running[opened.number] = opened
+
+    def _take(self, ended: Ended) -> None:
+        opened = self.running.pop(ended.number)
         try:
-            plan = self._plan(trial)
+            closed = self._closed(opened, ended)
         except CtxvalError as error:
-            self.store.record_failed_plan(replace(trial, state="failed", failure=_text(error), attempts=0))
-            raise
-        self.store.open_trial(trial, plan.model_trajectory)
-        self._trials.append(trial)
-        return OpenTrial(trial, plan)
+            self.stopped = self.stopped or error
+            return
+        if closed is not None and self.on_trial is not None:
+            self.on_trial(closed)
 
-    def tell(
-        self, opened: OpenTrial | int, trajectory: Trajectory | None = None, *, failed: str | None = None
-    ) -> Trial:
-        """Record how an open trial, or the one of this number, ended: its trajectory, or why it failed.
+    def _closed(self, opened: OpenTrial, ended: Ended) -> Trial | None:
+        """Store how an execution ended; None where it is repeated."""
+        number, campaign = ended.number, self.campaign
+        if ended.lost is not None:
+            self.losses[number] += 1
+            if self.losses[number] <= self.patience.losses:
+                self._repeat(opened)
+                return None
+            reason = f"the worker was lost {self.losses[number]} times, at last: {ended.lost}"
+            return campaign._close(opened.trial, failure=text_of(reason))
+        failure = ended.failure or _failure(opened, ended.trajectory)
+        if failure is not None:
+            self.failures[number] += 1
+            if self.failures[number] <= self.patience.failures:
+                self._repeat(opened)
+                return None
+            return campaign._close(opened.trial, failure=text_of(failure), seconds=ended.seconds)
+        assert ended.trajectory is not None
+        return campaign._measure(opened, ended.trajectory, ended.seconds)
 
-        Raises:
-            InputError: neither or both are given, or the trial is not open.
-            ExecutionError: the trajectory is not a whole execution of the trial's task; the trial stays open.
-        """
-        trial = self._open_trial(opened.number if isinstance(opened, OpenTrial) else int(opened))
-        if isinstance(opened, OpenTrial) and not np.array_equal(opened.trial.unit_point, trial.unit_point):
-            raise InputError(f"this open trial {opened.number} is of another campaign.")
-        if (trajectory is None) == (failed is None):
-            raise InputError("tell needs either a trajectory or the reason of a failure.")
-        if trajectory is None:
-            return self._close(trial, failure=_text(failed))
-        plan = opened.plan if isinstance(opened, OpenTrial) else self._plan(trial)
-        require_execution(plan, trajectory)
-        return self._measure(OpenTrial(trial, plan), trajectory, None)
+    def _repeat(self, opened: OpenTrial) -> None:
+        if self.stopped is None:
+            begun = self.campaign._begin_again(opened.trial)
+            self._start(OpenTrial(begun, opened.plan))
 
-    def _open_trial(self, number: int) -> Trial:
-        if not 0 <= number < len(self._trials):
-            raise InputError(f"there is no trial {number}; the campaign has {len(self._trials)}.")
-        if self._trials[number].state != "open":
-            raise InputError(f"trial {number} is {self._trials[number].state}, so nothing more can be told of it.")
-        return self._trials[number]
 
-    # What running and telling share
+def _failure(opened: OpenTrial, trajectory: Trajectory | None) -> str | None:
+    """Return why what a worker returned is no execution."""
+    try:
+        require_execution(opened.plan, trajectory)
+    except ExecutionError as error:
+        return str(error)
+    return None
 
-    def _plan(self, trial: Trial) -> Plan:
-        return self.validation.plan(self.validation.space.from_unit(trial.unit_point))
 
-    def _suggestion(self) -> Array:
-        if hasattr(self.search, "use_prediction"):
-            self.search.use_prediction(self._prediction())
-        point: Array = np.asarray(self.search.ask(1), dtype=np.float64)
-        if point.shape != (1, self.validation.space.dimension) or not ((point >= 0) & (point <= 1)).all():
-            raise InputError(
-                f"a search must return points of the unit cube, shape (1, {self.validation.space.dimension}), "
-                f"got {point.tolist()}."
-            )
-        return np.asarray(point[0])
-
-    def _prediction(self) -> Prediction | None:
-        """Return the distance that the trajectories executed so far predict."""
-        executed = [
-            (trial.unit_point, trajectory)
-            for trial in self.completed
-            if (trajectory := self.store.trajectory(trial.number, "system")) is not None
-        ]
-        return predict_distance(self.validation, executed)
-
-    def _origin(self) -> Origin:
-        if getattr(self.search, "iid", False):
-            return "iid"
-        return "initial" if len(self._trials) < getattr(self.search, "initial", 0) else "acquisition"
-
-    def _measure(self, opened: OpenTrial, trajectory: Trajectory, seconds: float | None) -> Trial:
-        try:
-            distance = self.validation.measure(opened.plan, trajectory)
-        except DistanceError as error:
-            self._close(opened.trial, trajectory, failure=_text(error), seconds=seconds)
-            raise
-        return self._close(opened.trial, trajectory, distance=distance, seconds=seconds)
-
-    def _close(
-        self,
-        trial: Trial,
-        trajectory: Trajectory | None = None,
-        *,
-        distance: float | None = None,
-        failure: str | None = None,
-        seconds: float | None = None,
-        executed: bool = True,
-    ) -> Trial:
-        ended = replace(
-            trial,
-            state="completed" if failure is None else "failed",
-            executed=executed,
-            distance=distance,
-            failure=failure,
-            seconds=seconds,
-        )
-        self.store.close_trial(ended, trajectory)
-        self._trials[trial.number] = ended
-        if distance is not None:
-            self.search.tell(trial.unit_point[None], [distance])
-        return ended
+def _require_count(sentence: str, count: object) -> None:
+    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
+        raise InputError(f"{sentence}, got {count!r}.")
 
 
 def _distance(trial: Trial) -> float:
     assert trial.distance is not None  # completed trials have one
     return trial.distance
-
-
-def _text(reason: object) -> str:
-    """Return a reason as text that every file can hold; a serial line may have put anything into it."""
-    return str(reason).encode("utf-8", "backslashreplace").decode()

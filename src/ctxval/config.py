@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import importlib
-import os
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic_core import PydanticCustomError
 
 from ctxval import cases
+from ctxval.campaign import Campaign
+from ctxval.certificates import KINDS, RESOLUTION
 from ctxval.errors import CtxvalError, InputError
 from ctxval.experiment import Experiment
+from ctxval.parts import argument, part, reference, require_types, space_of, task_function
+from ctxval.searches import NAMES as SEARCHES
 from ctxval.searches import Search, by_name
 from ctxval.store import Store
 from ctxval.validation import Validation
@@ -36,27 +39,84 @@ class SearchTable(BaseModel):
             UnknownNameError: there is no such search.
             InputError: it does not take these options.
         """
-        return by_name(self.name, **(self.model_extra or {}))
+        options = {key: argument(value) for key, value in (self.model_extra or {}).items()}
+        if self.name in SEARCHES:
+            options = require_types(f"search {self.name!r}", SEARCHES[self.name], options)
+        return by_name(self.name, **options)
+
+
+class CertificateTable(BaseModel):
+    """The table ``[certificate]``: what a validation is to rest on, chosen before it is run.
+
+    Attributes:
+        kind: which certificate.
+        stochastic: whether two executions of one task may differ.
+        volume: share of the task space that may exceed the threshold.
+        resolution: how far from every trial a task may be, in diagonals of the task space.
+        discard, constant: of some kinds.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    kind: str = "posterior"
+    stochastic: bool = False
+    volume: float = Field(default=0.0, ge=0, lt=1)
+    resolution: float = Field(default=RESOLUTION, gt=0)
+    discard: int | None = Field(default=None, ge=0)
+    constant: float | None = None
+
+    @field_validator("kind")
+    @classmethod
+    def _known(cls, kind: str) -> str:
+        if kind not in KINDS:
+            raise PydanticCustomError("kind", f"the kind must be one of {', '.join(KINDS)}")
+        return kind
+
+
+Part = str | dict[str, Any]
+"""``module:attr``, or a table with a type and its arguments."""
+
+_WHOLE = ("space", "task", "system", "model", "synthesizer")
 
 
 class Settings(BaseModel):
     """What to run: the content of an experiment file, with the command line's options over it.
 
+    It names an experiment that is made elsewhere, or describes the whole of it.
+
     Attributes:
         experiment: a case, or ``module:attr`` of an experiment or of a function of a seed that makes one.
         options: passed on to the case or function.
+        name: of an experiment that is described here, and so are
+        space: ``name = [low, high, "unit"]`` of each task parameter,
+        task: ``module:attr`` of a function, or a table of an initial state, a goal, a horizon and a time step,
+        system, model, synthesizer, distance: ``module:attr``, or a table with a type and its arguments,
+        states, inputs: names and units,
+        units: of the distance.
         budget, threshold, seed, store: None where the experiment decides.
         confidence: of a validation.
+        certificate: what a validation rests on.
         search: which search, and its options.
     """
 
     model_config = ConfigDict(extra="forbid")
 
-    experiment: str
+    experiment: str | None = None
     options: dict[str, Any] = Field(default_factory=dict)
+    name: str | None = None
+    space: dict[str, list[Any]] | None = None
+    task: Part | None = None
+    system: Part | None = None
+    model: Part | None = None
+    synthesizer: Part | None = None
+    distance: Part | None = None
+    states: dict[str, str] = Field(default_factory=dict)
+    inputs: dict[str, str] = Field(default_factory=dict)
+    units: str | None = None
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     confidence: float = Field(default=CONFIDENCE, gt=0, lt=1)
+    certificate: CertificateTable = Field(default_factory=CertificateTable)
     seed: int = Field(default=0, ge=0)
     store: Path | None = None
     search: SearchTable = Field(default_factory=SearchTable)
@@ -67,11 +127,56 @@ class Settings(BaseModel):
         Raises:
             InputError: it cannot be found or made.
         """
+        if self.experiment is None:
+            return self._described()
+        given = [name for name in (*_WHOLE, "distance", "name") if getattr(self, name) is not None]
+        if given:
+            raise InputError(
+                f"an experiment that is made elsewhere has its own {given[0]}; leave it out, or experiment."
+            )
         if "seed" in self.options:
             raise InputError("the seed stands beside [options], not in it.")
         if ":" in self.experiment:
             return _from_reference(self.experiment, self.seed, self.options)
-        return cases.by_name(self.experiment, self.seed, **self.options)
+        return _case(self.experiment, self.seed, self.options)
+
+    def _described(self) -> Experiment:
+        missing = [name for name in _WHOLE if getattr(self, name) is None]
+        if missing:
+            raise InputError(
+                "the file must name an experiment, as in experiment = 'pendulum', or describe one: "
+                f"it has no {', '.join(missing)}."
+            )
+        if self.options:
+            raise InputError("[options] are for an experiment that is made elsewhere; this file describes its own.")
+        space, system = space_of(self.space or {}), part("system", self.system or {})
+        validation = Validation(
+            space=space,
+            task=task_function(self.task or {}, space, system),
+            system=system,
+            model=part("model", self.model or {}),
+            synthesizer=part("synthesizer", self.synthesizer or {}),
+            distance=part("distance", self.distance or "FinalState"),
+        )
+        return Experiment(
+            self.name or "experiment",
+            validation,
+            units=self.units or "",
+            states=tuple(_label(*item) for item in self.states.items()),
+            inputs=tuple(_label(*item) for item in self.inputs.items()),
+        )
+
+    def campaign(self, experiment: Experiment, store: Store | Path) -> Campaign:
+        """Return the campaign of what :meth:`load` gave, into a store that then knows how it was made.
+
+        Raises:
+            StoreError: the store cannot be used, or was made by another experiment.
+            InputError: there is no such search.
+        """
+        search = self.search.build()
+        campaign = Campaign(experiment.validation, search=search, store=store, seed=self.seed, name=experiment.name)
+        campaign.store.keep_settings(self.model_dump(mode="json", exclude={"store"}))
+        return campaign
 
     def store_path(self, name: str) -> Path:
         """Return where the trials go: the given store, or a file under ``runs/`` named after what is run."""
@@ -92,6 +197,10 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
         InputError: the file cannot be read, or a value in it is not allowed; the message names it.
     """
     content = _read_toml(Path(target)) if target.endswith(".toml") else {"experiment": target}
+    if "experiment" not in content and not any(key in content for key in _WHOLE):
+        raise InputError(
+            f"{target} must say what to run: experiment = 'pendulum', or 'module:attr', or the whole of it."
+        )
     given = {key: value for key, value in overrides.items() if value is not None}
     options = {**_table(content, "options"), **given.pop("options", {})}
     search = _table(content, "search")
@@ -112,7 +221,9 @@ def stored_settings(store: Store) -> Settings:
     """
     kept = store.settings()
     if not kept:
-        raise InputError("the store does not say what was run into it; only one made by `ctxval run` can be audited.")
+        raise InputError(
+            "the store does not say what was run into it; only one made by a command can be gone on with by its name."
+        )
     try:
         return Settings.model_validate(kept)
     except ValidationError as error:
@@ -132,40 +243,42 @@ def _read_toml(path: Path) -> dict[str, Any]:
             return tomllib.load(file)
     except OSError as error:
         raise InputError(f"the experiment file {path} cannot be read: {error.strerror}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 
 def _sentence(target: str, error: ValidationError) -> str:
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
-    return f"{target}: {where}: {first['msg'].lower()}, got {first['input']!r}."
+    return f"{target}: {where}: {first['msg'].lower()}, got {str(first['input'])[:100]!r}."
 
 
-def _from_reference(reference: str, seed: int, options: dict[str, Any]) -> Experiment:
-    """Import ``module:attr``; this runs the module's code."""
-    module_name, _, attribute = reference.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    try:
-        found = getattr(importlib.import_module(module_name), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(f"{reference} cannot be loaded: {error}.") from error
-    except CtxvalError:
-        raise
-    except Exception as error:
-        raise InputError(f"{module_name} failed while it was loaded: {type(error).__name__}: {error}.") from error
+def _label(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name
+
+
+def _case(name: str, seed: int, options: dict[str, Any]) -> Experiment:
+    """Return a case; its options are plain values."""
+    if name in cases.NAMES and options:
+        build = importlib.import_module(f"ctxval.cases.{name}").experiment
+        options = require_types(f"case {name!r}", build, options)
+    return cases.by_name(name, seed, **options)
+
+
+def _from_reference(text: str, seed: int, options: dict[str, Any]) -> Experiment:
+    """Return what ``module:attr`` names or makes; this runs the module's code."""
+    found = reference(text)
     if callable(found) and not isinstance(found, Validation | Experiment):
         try:
             found = found(seed, **options)
         except TypeError as error:
-            raise InputError(f"{reference} must be callable with a seed and its options: {error}.") from error
+            raise InputError(f"{text} must be callable with a seed and its options: {error}.") from error
         except CtxvalError:
             raise
         except Exception as error:
-            raise InputError(f"{reference} failed: {type(error).__name__}: {error}.") from error
+            raise InputError(f"{text} failed: {type(error).__name__}: {error}.") from error
     if isinstance(found, Validation):
-        return Experiment(attribute, found)
+        return Experiment(text.partition(":")[2], found)
     if not isinstance(found, Experiment):
-        raise InputError(f"{reference} must be an Experiment or a Validation, got {type(found).__name__}.")
+        raise InputError(f"{text} must be an Experiment or a Validation, got {type(found).__name__}.")
     return found

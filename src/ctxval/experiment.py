@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from ctxval.truth import Truth
@@ -31,3 +31,30 @@ class Experiment:
     units: str = ""
     states: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
+
+    def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
+        """Return the names of n states and m inputs with their units, for files.
+
+        They are those of the experiment, or of its system; ``x0, x1, ...`` and ``u0, u1, ...`` where neither says.
+        """
+        system = self.validation.system
+        return (
+            _named(self.states, getattr(system, "states", None), "x", states),
+            _named(self.inputs, getattr(system, "inputs", None), "u", inputs),
+        )
+
+
+def _named(labels: tuple[str, ...], own: object, letter: str, count: int) -> dict[str, str]:
+    if len(labels) == count and len({_parted(label)[0] for label in labels}) == count:
+        return dict(_parted(label) for label in labels)
+    if isinstance(own, Mapping) and len(own) == count:
+        return {str(name): str(unit) for name, unit in own.items()}
+    if isinstance(own, list | tuple) and len(set(map(str, own))) == count:
+        return {str(name): "" for name in own}
+    return {f"{letter}{i}": "" for i in range(count)}
+
+
+def _parted(label: str) -> tuple[str, str]:
+    """Return the name and the unit of ``name [unit]``."""
+    name, _, unit = label.partition("[")
+    return name.strip(), unit.strip().removesuffix("]")

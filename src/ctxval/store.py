@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from ctxval.describe import first_difference
+from ctxval.disks import warn_of_network
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
+from ctxval.rows import COLUMNS, checksum_of, read_trajectory, read_trial, real, row_of
 from ctxval.trajectory import Trajectory
-from ctxval.trial import Origin, State, Trial
+from ctxval.trial import Trial
 
 Side = Literal["model", "system"]
 
@@ -51,7 +52,12 @@ _MIGRATIONS = (
     ),
     ("what the search thought when it chose a trial", "ALTER TABLE trials ADD COLUMN note TEXT"),
     ("what was run, for commands that go on", "CREATE TABLE settings (key TEXT PRIMARY KEY, value TEXT NOT NULL)"),
+    ("a checksum of each trial, as SQLite has none", "ALTER TABLE trials ADD COLUMN checksum INTEGER"),
+    ("a checksum of each trajectory with its place", "ALTER TABLE trajectories ADD COLUMN checksum INTEGER"),
 )
+
+_WAIT = 0.02
+"""Seconds between two attempts to become the sole writer."""
 
 
 class Store:
@@ -70,9 +76,11 @@ class Store:
     def __init__(self, path: str | Path | None = None) -> None:
         self.path = None if path is None else Path(path)
         self._name = "the store in memory" if self.path is None else str(self.path)
+        self._locked = False
         with self._translating():
             if self.path is not None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
+                warn_of_network(self.path)
             self._connection = sqlite3.connect(self.path or ":memory:", isolation_level=None, timeout=10.0)
             self._prepare()
 
@@ -83,8 +91,14 @@ class Store:
         Raises:
             StoreAccessError: there is no such file.
         """
-        if not Path(path).is_file():
-            raise StoreAccessError(f"there is no store at {path}.")
+        try:
+            with Path(path).open("rb") as file:
+                if not file.read(1):
+                    raise ForeignStoreError(f"{path} is an empty file, not a store.")
+        except FileNotFoundError:
+            raise StoreAccessError(f"there is no store at {path}.") from None
+        except OSError as error:
+            raise StoreAccessError(f"{path} cannot be read as a store: {error.strerror}.") from error
         return cls(path)
 
     def close(self) -> None:
@@ -92,24 +106,46 @@ class Store:
         self._connection.close()
 
     @contextmanager
-    def sole_writer(self) -> Iterator[None]:
+    def sole_writer(self, wait: float = 0.0) -> Iterator[None]:
         """Keep other processes from running this store; the lock goes with the process, however it ends.
+
+        Args:
+            wait: seconds to wait for another process that is about to end.
 
         Raises:
             StoreAccessError: another process is running it.
         """
-        if self.path is None:
+        if self.path is None or self._locked:
             yield
             return
-        lock = sqlite3.connect(f"{self.path}.lock", isolation_level=None, timeout=0)
+        lock = self._lock(wait)
+        self._locked = True
         try:
-            try:
-                lock.execute("BEGIN EXCLUSIVE")
-            except sqlite3.OperationalError as error:
-                raise StoreAccessError(f"{self._name} is being run by another process.") from error
             yield
         finally:
+            self._locked = False
             lock.close()
+
+    def _lock(self, wait: float) -> sqlite3.Connection:
+        until = time.monotonic() + wait
+        while True:
+            try:
+                return self._locked_at_once()
+            except sqlite3.DatabaseError as error:
+                if "locked" not in str(error):
+                    raise StoreAccessError(f"{self._name} cannot be locked by {self.path}.lock: {error}.") from error
+                if time.monotonic() >= until:
+                    raise StoreAccessError(f"{self._name} is being run by another process.") from error
+            time.sleep(_WAIT)
+
+    def _locked_at_once(self) -> sqlite3.Connection:
+        lock = sqlite3.connect(f"{self.path}.lock", isolation_level=None, timeout=0)
+        try:
+            lock.execute("BEGIN EXCLUSIVE")
+        except sqlite3.DatabaseError:
+            lock.close()
+            raise
+        return lock
 
     # The experiment
 
@@ -119,25 +155,28 @@ class Store:
         Raises:
             StoreMismatchError: the store was made by another experiment; the message names the first difference.
         """
-        stored = self.description()
-        if not stored:
-            with self._transaction():
-                for key, value in description.items():
-                    self._connection.execute("INSERT INTO experiment VALUES (?, ?)", (key, json.dumps(value)))
-            return
+        stored = self.description() or self._describe_first(description)
         # Through JSON, so that tuples and keys compare as they were stored.
         difference = first_difference(stored, json.loads(json.dumps(description)))
         if difference:
             raise StoreMismatchError(f"{self._name} was made by another experiment: {difference}.")
 
+    def _describe_first(self, description: dict[str, Any]) -> dict[str, Any]:
+        """Write the description unless another process was faster; return the stored one."""
+        with self._transaction():
+            if not self.description():
+                for key, value in description.items():
+                    self._connection.execute("INSERT INTO experiment VALUES (?, ?)", (key, json.dumps(value)))
+        return self.description()
+
     def description(self) -> dict[str, Any]:
         """Return the stored description of the experiment; empty in a new store."""
-        with self._translating():
-            rows = self._connection.execute("SELECT key, value FROM experiment ORDER BY rowid").fetchall()
-        return {key: json.loads(value) for key, value in rows}
+        return self._pairs("experiment")
 
     def keep_settings(self, settings: dict[str, Any]) -> None:
         """Write how to make the experiment again, for commands that are given the store alone."""
+        if self.settings() == json.loads(json.dumps(settings)):
+            return
         with self._transaction():
             self._connection.execute("DELETE FROM settings")
             for key, value in settings.items():
@@ -145,97 +184,137 @@ class Store:
 
     def settings(self) -> dict[str, Any]:
         """Return how to make the experiment again; empty where it was not made by a command."""
+        return self._pairs("settings")
+
+    def _pairs(self, table: str) -> dict[str, Any]:
         with self._translating():
-            rows = self._connection.execute("SELECT key, value FROM settings ORDER BY rowid").fetchall()
-        return {key: json.loads(value) for key, value in rows}
+            rows = self._connection.execute(f"SELECT key, value FROM {table} ORDER BY rowid").fetchall()
+        try:
+            return {key: json.loads(value) for key, value in rows}
+        except (ValueError, TypeError, RecursionError) as error:
+            raise self._damaged(f"the {table} in it cannot be read") from error
 
     # Trials
 
     def open_trial(self, trial: Trial, model_trajectory: Trajectory) -> None:
         """Store a new trial with its model trajectory, before its execution starts."""
         with self._transaction():
-            self._connection.execute(
-                "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, note, opened_at) "
-                "VALUES (?, ?, 'open', ?, ?, ?, ?, ?)",
-                (
-                    trial.number,
-                    trial.origin,
-                    json.dumps(trial.unit_point.tolist()),
-                    json.dumps(trial.parameters),
-                    trial.attempts,
-                    json.dumps(trial.note),
-                    _now(),
-                ),
-            )
+            self._insert(trial)
             self._write_trajectory(trial.number, "model", model_trajectory)
 
     def record_failed_plan(self, trial: Trial) -> None:
         """Store a new trial that failed before S was touched."""
         with self._transaction():
-            self._connection.execute(
-                "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, failure, note, "
-                "opened_at, closed_at) VALUES (?, ?, 'failed', ?, ?, 0, ?, ?, ?, ?)",
-                (
-                    trial.number,
-                    trial.origin,
-                    json.dumps(trial.unit_point.tolist()),
-                    json.dumps(trial.parameters),
-                    trial.failure,
-                    json.dumps(trial.note),
-                    _now(),
-                    _now(),
-                ),
-            )
+            self._insert(trial)
 
-    def begin_attempt(self, number: int) -> None:
-        """Count one more start of a trial's execution, before it starts."""
+    def record_known(self, trial: Trial, model_trajectory: Trajectory, system_trajectory: Trajectory | None) -> None:
+        """Store a new trial that has ended already, in one piece."""
         with self._transaction():
-            self._connection.execute("UPDATE trials SET attempts = attempts + 1 WHERE number = ?", (number,))
+            self._insert(trial)
+            self._write_trajectory(trial.number, "model", model_trajectory)
+            if system_trajectory is not None:
+                self._write_trajectory(trial.number, "system", system_trajectory)
+
+    def _insert(self, trial: Trial) -> None:
+        row = row_of(trial)
+        closed_at = None if trial.state == "open" else _now()
+        places = ", ".join("?" * (len(row) + 3))
+        self._connection.execute(
+            f"INSERT INTO trials ({COLUMNS}, checksum, opened_at, closed_at) VALUES ({places})",
+            (*row, checksum_of(row), _now(), closed_at),
+        )
+
+    def begin_attempt(self, trial: Trial) -> None:
+        """Count one more start of a trial's execution, before it starts; the trial is as it will be then.
+
+        Raises:
+            InputError: the trial is not open any more.
+        """
+        with self._transaction():
+            changed = self._connection.execute(
+                "UPDATE trials SET attempts = ?, checksum = ? WHERE number = ? AND state = 'open'",
+                (trial.attempts, checksum_of(row_of(trial)), trial.number),
+            ).rowcount
+            if changed != 1:
+                raise self._not_open(trial.number)
 
     def close_trial(self, trial: Trial, system_trajectory: Trajectory | None) -> None:
         """Store how an open trial ended.
 
         Raises:
-            InputError: the trial is not open.
+            InputError: the trial is not open; of two that tell, the first one wins.
         """
         with self._transaction():
             changed = self._connection.execute(
-                "UPDATE trials SET state = ?, distance = ?, failure = ?, executed = ?, seconds = ?, closed_at = ? "
-                "WHERE number = ? AND state = 'open'",
+                "UPDATE trials SET state = ?, distance = ?, failure = ?, executed = ?, seconds = ?, closed_at = ?, "
+                "checksum = ? WHERE number = ? AND state = 'open' AND attempts = ?",
                 (
-                    trial.state,
-                    trial.distance,
-                    trial.failure,
-                    trial.executed,
-                    trial.seconds,
-                    _now(),
-                    trial.number,
+                    *(trial.state, real(trial.distance), trial.failure, int(trial.executed), real(trial.seconds)),
+                    *(_now(), checksum_of(row_of(trial)), trial.number, trial.attempts),
                 ),
             ).rowcount
             if changed != 1:
-                raise InputError(f"trial {trial.number} is not open, so nothing can be told of it.")
+                raise self._not_open(trial.number)
             if system_trajectory is not None:
                 self._write_trajectory(trial.number, "system", system_trajectory)
 
+    def _not_open(self, number: int) -> InputError:
+        row = self._connection.execute("SELECT state FROM trials WHERE number = ?", (number,)).fetchone()
+        state = "not open" if row is None else "being executed by another process" if row[0] == "open" else row[0]
+        return InputError(f"trial {number} is {state}, so nothing more can be told of it.")
+
     def trials(self) -> list[Trial]:
-        """Return all trials in their order."""
+        """Return all trials in their order.
+
+        Raises:
+            ForeignStoreError: one of them is damaged.
+        """
         with self._translating():
-            rows = self._connection.execute(
-                "SELECT number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds, "
-                "note FROM trials ORDER BY number"
-            ).fetchall()
-        return [_trial(*row) for row in rows]
+            rows = self._connection.execute(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number").fetchall()
+        found = []
+        for place, (*row, checksum) in enumerate(rows):
+            trial = read_trial(tuple(row), checksum)
+            if trial is None or trial.number != place:
+                raise self._damaged(f"its trial {place} cannot be read")
+            found.append(trial)
+        return found
+
+    def signature(self) -> tuple[int, int]:
+        """Return how many trials there are and how many of them are open: what another process may have changed."""
+        with self._translating():
+            row = self._connection.execute("SELECT count(*), coalesce(sum(state = 'open'), 0) FROM trials").fetchone()
+        return int(row[0]), int(row[1])
+
+    def _damaged(self, what: str) -> ForeignStoreError:
+        return ForeignStoreError(f"{self._name} is damaged: {what}; `ctxval export` saves what is readable.")
 
     def trajectory(self, number: int, side: Side) -> Trajectory | None:
-        """Return a stored trajectory of a trial; None if there is none."""
+        """Return a stored trajectory of a trial; None if there is none.
+
+        Raises:
+            ForeignStoreError: it is damaged.
+        """
+        where = "FROM trajectories {} WHERE trial = ? AND side = ?"
         with self._translating():
-            row = self._connection.execute(
-                "SELECT npz FROM trajectories WHERE trial = ? AND side = ?", (number, side)
-            ).fetchone()
-        return None if row is None else Trajectory.from_npz(row[0])
+            row = self._connection.execute(f"SELECT npz, checksum {where.format('')}", (number, side)).fetchone()
+            # A damaged index may hide a row; without it, finding none takes longer.
+            hidden = (
+                row is None
+                and self._connection.execute(f"SELECT 1 {where.format('NOT INDEXED')}", (number, side)).fetchone()
+            )
+        if row is None and not hidden:
+            return None
+        found = None if row is None else read_trajectory(number, side, *row)
+        if found is None:
+            raise self._damaged(f"the {side}'s trajectory of its trial {number} cannot be read")
+        return found
 
     def _write_trajectory(self, number: int, side: Side, trajectory: Trajectory) -> None:
-        self._connection.execute("INSERT INTO trajectories VALUES (?, ?, ?)", (number, side, trajectory.to_npz()))
+        npz = trajectory.to_npz()
+        self._connection.execute(
+            "INSERT INTO trajectories (trial, side, npz, checksum) VALUES (?, ?, ?, ?)",
+            (number, side, npz, checksum_of((number, side, npz))),
+        )
 
     # The file
 
@@ -250,6 +329,11 @@ class Store:
                 f"{self._name} has schema version {version}, made by a newer ctxval; "
                 f"this one reads up to {len(_MIGRATIONS)}."
             )
+        if (
+            self.path is not None
+            and self.path.stat().st_size % self._connection.execute("PRAGMA page_size").fetchone()[0]
+        ):
+            raise self._damaged("its end is missing")
         self._connection.execute("PRAGMA synchronous = FULL")
         for number in range(version, len(_MIGRATIONS)):
             self._migrate(number)
@@ -257,6 +341,8 @@ class Store:
     def _migrate(self, number: int) -> None:
         title, script = _MIGRATIONS[number]
         with self._transaction():
+            if self._connection.execute("PRAGMA user_version").fetchone()[0] > number:
+                return  # another process was faster
             if number == 0:
                 self._connection.execute(f"PRAGMA application_id = {_APPLICATION}")
             for statement in script.split(";"):
@@ -285,19 +371,12 @@ class Store:
         except sqlite3.OperationalError as error:
             raise StoreAccessError(f"{self._name} cannot be used as a store: {error}.") from error
         except sqlite3.DatabaseError as error:
-            raise ForeignStoreError(f"{self._name} cannot be read as a store: {error}.") from error
-        except (OSError, ValueError) as error:
+            hint = "; `ctxval export` saves what is readable" if "malformed" in str(error) else ""
+            raise ForeignStoreError(f"{self._name} cannot be read as a store: {error}{hint}.") from error
+        except (OSError, ValueError, OverflowError) as error:
             if isinstance(error, InputError):
                 raise
             raise StoreAccessError(f"{self._name} cannot be used as a store: {error}.") from error
-
-
-def _trial(number: int, origin: Origin, state: State, point: str, names: str, *rest: Any) -> Trial:
-    attempts, executed, distance, failure, seconds, note = rest
-    return Trial(
-        *(number, origin, state, np.array(json.loads(point)), json.loads(names), attempts, bool(executed)),
-        *(distance, failure, seconds, json.loads(note or "null")),
-    )
 
 
 def _now() -> str:

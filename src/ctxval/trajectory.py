@@ -144,8 +144,9 @@ class Trajectory:
             InputError: it is not such a file.
         """
         try:
-            handle = io.BytesIO(source) if isinstance(source, bytes) else source
-            with np.load(handle, allow_pickle=False) as arrays:
+            # Read here, as numpy leaves a damaged file open.
+            content = source if isinstance(source, bytes) else Path(source).read_bytes()
+            with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
                 ended = str(arrays["ended"]) if "ended" in arrays else COMPLETE
                 return Trajectory(arrays["times"], arrays["states"], arrays["inputs"], ended)
         except _UNREADABLE as error:
@@ -156,63 +157,156 @@ class Trajectory:
                 f"{name} cannot be read as a trajectory: an NPZ with times, states and inputs is needed."
             ) from error
 
-    def to_csv(self, path: str | Path) -> None:
-        """Write one trajectory as CSV with the columns ``t, x0.., u0..``; the last row has no inputs.
+    def to_csv(
+        self, path: str | Path, *, states: Sequence[str] | None = None, inputs: Sequence[str] | None = None
+    ) -> None:
+        """Write one trajectory as CSV with the columns ``t, x0.., u0..``, or named ones; the last row has no inputs.
 
         Raises:
-            ShapeError: it is a batch.
+            ShapeError: it is a batch, or there are not as many names as columns.
         """
         if self.batch_shape:
             raise ShapeError(f"a CSV file holds one trajectory, got a batch of shape {self.batch_shape}.")
         n, m = self.states.shape[-1], self.inputs.shape[-1]
+        header = ["t", *_column_names("x", states, n), *_column_names("u", inputs, m)]
         with open(path, "w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(["t", *(f"x{i}" for i in range(n)), *(f"u{i}" for i in range(m))])
+            writer.writerow(header)
             for k, (time, state) in enumerate(zip(self.times.tolist(), self.states.tolist(), strict=True)):
-                inputs = self.inputs[k].tolist() if k < self.horizon else [""] * m
-                writer.writerow([time, *state, *inputs])
+                row = self.inputs[k].tolist() if k < self.horizon else [""] * m
+                writer.writerow([time, *state, *row])
 
     @staticmethod
-    def from_csv(path: str | Path) -> Trajectory:
-        """Read one trajectory from CSV with the columns ``t, x0.., u0..``.
+    def from_csv(
+        path: str | Path, *, states: Sequence[str] | None = None, inputs: Sequence[str] | None = None
+    ) -> Trajectory:
+        """Read one trajectory from CSV with the columns ``t, x0.., u0..``, or with named ones.
+
+        Units in brackets, as in ``angle [rad]``, do not matter, and neither do further columns nor the inputs in the
+        last row.
+
+        Args:
+            path: the file.
+            states, inputs: names of the columns; those that are numbered are taken where none of the names is there.
 
         Raises:
             InputError: the file cannot be read, or a column is missing, or a cell is no number.
         """
-        try:
-            with open(path, newline="", encoding="utf-8-sig") as file:
-                rows = list(csv.DictReader(file))
-        except (OSError, UnicodeDecodeError, csv.Error) as error:
-            raise InputError(f"{path} cannot be read as CSV: {error}.") from error
+        lines, rows = _read_csv(path)
         if len(rows) < 2:
             raise InputError(f"{path} must have a header and at least two rows.")
-        states, inputs = _numbered_columns(rows[0], "x"), _numbered_columns(rows[0], "u")
-        if "t" not in rows[0] or not states:
+        columns = {_bare(name): name for name in rows[0] if name and _bare(name)}
+        # Time stands in its own column; a state may be called "time" all the same.
+        time = columns.get("t") or columns.get("time")
+        x, u = _chosen(path, columns, "x", states), _chosen(path, columns, "u", inputs)
+        if time is None or not x:
             raise InputError(
-                f"{path} must have the columns t, x0, ..., u0, ...; it has {', '.join(map(str, rows[0]))}."
+                f"{path} must have the columns t, {', '.join(states or ('x0', '...'))}, "
+                f"{', '.join(inputs or ('u0', '...'))}; it has {', '.join(map(str, rows[0]))}."
             )
         return Trajectory(
-            _column_block(path, rows, ["t"])[:, 0],
-            _column_block(path, rows, states),
-            _column_block(path, rows[:-1], inputs),
+            _column_block(path, lines, rows, [time])[:, 0],
+            _column_block(path, lines, rows, x),
+            _column_block(path, lines, rows[:-1], u),
+        )
+
+    def resampled(self, times: Array) -> Trajectory:
+        """Return one recorded trajectory at other times after its first: states between, inputs as last applied.
+
+        Args:
+            times: shape ``(H + 1,)``, seconds, from 0 on.
+
+        Raises:
+            InputError: it is a batch, its own times do not increase, or it ends before the last of them.
+        """
+        own, wanted = self.times - self.times[0], as_floats("times", times)
+        if self.batch_shape or not (np.diff(own) > 0).all():
+            raise InputError("only one trajectory whose times increase can be resampled.")
+        if not own[-1] >= wanted[-1] - _TIMES * (wanted[1] - wanted[0]):
+            raise InputError(f"the recording ends after {own[-1]:g} s, and {wanted[-1]:g} s are needed.")
+        states = np.stack([np.interp(wanted, own, column) for column in self.states.T], axis=-1)
+        # A sample that was meant for a time may have been taken just after it.
+        slack = 1e-6 * (wanted[1] - wanted[0])
+        held = np.clip(np.searchsorted(own, wanted[:-1] + slack, side="right") - 1, 0, self.horizon - 1)
+        return Trajectory(wanted, states, self.inputs[held], self.ended)
+
+
+_TIMES = 0.01
+"""By how much the times of a recording may miss a task's, in steps."""
+
+
+def require_times(trajectory: Trajectory, times: Array) -> None:
+    """Check that a trajectory has these times ``(H + 1,)``, counted from its first.
+
+    Raises:
+        InputError: it has another number of them or another step; the message says which.
+    """
+    dt = times[1] - times[0]
+    if len(trajectory.times) != len(times):
+        raise InputError(
+            f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, "
+            f"got {len(trajectory.times)}."
+        )
+    own = trajectory.times - trajectory.times[0]
+    misses = np.abs(own - times)
+    if not (misses <= _TIMES * dt).all():
+        k = int(np.argmax(~(misses <= _TIMES * dt)))
+        raise InputError(
+            f"the trajectory must have steps of {dt:g} s: time {k} must be {times[k]:g} s after the first, "
+            f"got {own[k]:g} s."
         )
 
 
-def _numbered_columns(row: dict[str, str], letter: str) -> list[str]:
-    found = [name for name in row if name and name[0] == letter and name[1:].isdigit()]
+def _column_names(letter: str, names: Sequence[str] | None, count: int) -> list[str]:
+    if names is None:
+        return [f"{letter}{i}" for i in range(count)]
+    if len(names) != count:
+        raise ShapeError(f"there must be {count} names of columns, got {', '.join(names) or 'none'}.")
+    return list(names)
+
+
+def _read_csv(path: str | Path) -> tuple[list[int], list[dict[str, str]]]:
+    """Return the rows, and the line of the file at which each ends."""
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            numbered = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} cannot be read as CSV: {error}.") from error
+    return [line for line, _ in numbered], [row for _, row in numbered]
+
+
+def _bare(name: str) -> str:
+    """Return a column's name without its unit."""
+    return name.partition("[")[0].strip()
+
+
+def _chosen(path: str | Path, columns: dict[str, str], letter: str, names: Sequence[str] | None) -> list[str]:
+    """Return which columns are the states, or the inputs."""
+    named = [_bare(name) for name in names or ()]
+    if not any(name in columns for name in named):
+        return [columns[name] for name in _numbered_columns(columns, letter)]
+    missing = [name for name in named if name not in columns]
+    if missing:
+        raise InputError(f"{path} has no column {missing[0]}; there are {', '.join(columns)}.")
+    return [columns[name] for name in named]
+
+
+def _numbered_columns(columns: dict[str, str], letter: str) -> list[str]:
+    found = [name for name in columns if name[0] == letter and name[1:].isdigit()]
     names = [f"{letter}{i}" for i in range(len(found))]
-    missing = [name for name in names if name not in row]
+    missing = [name for name in names if name not in columns]
     if missing:
         raise InputError(f"the column {missing[0]} is missing; there are {', '.join(found)}.")
     return names
 
 
-def _column_block(path: str | Path, rows: list[dict[str, str]], names: list[str]) -> Array:
+def _column_block(path: str | Path, lines: list[int], rows: list[dict[str, str]], names: list[str]) -> Array:
     block = np.empty((len(rows), len(names)))
     for i, row in enumerate(rows):
         for j, name in enumerate(names):
             try:
                 block[i, j] = float(row[name])
             except (TypeError, ValueError):
-                raise InputError(f"{path}, line {i + 2}: {name} must be a number, got {row[name]!r}.") from None
+                raise InputError(f"{path}, line {lines[i]}: {name} must be a number, got {row[name]!r}.") from None
     return block

@@ -26,7 +26,10 @@ from ctxval.rollout import rollout
 from ctxval.space import Parameters, TaskSpace
 from ctxval.system import System
 from ctxval.task import Task
-from ctxval.trajectory import COMPLETE, Trajectory
+from ctxval.trajectory import COMPLETE, Trajectory, require_times
+
+START = 0.05
+"""By how much a recording may miss the start of its task, as a share of what the model's trajectory covers."""
 
 _CHUNK = 4096
 """Tasks in one batched call: enough to be fast, few enough for memory."""
@@ -140,7 +143,7 @@ class Validation:
         try:
             trajectory = self.system.execute(plan.controller, plan.task)
         except Exception as error:
-            raise ExecutionError(_reason(error)) from error
+            raise ExecutionError(reason_of(error)) from error
         require_execution(plan, trajectory)
         return trajectory
 
@@ -220,13 +223,13 @@ class Validation:
         except CtxvalError:
             raise
         except Exception as error:
-            raise DesignError(f"the synthesizer failed: {_reason(error)}.") from error
+            raise DesignError(f"the synthesizer failed: {reason_of(error)}.") from error
         try:
             trajectory = rollout(self.model.step, controller, task)
         except CtxvalError:
             raise
         except Exception as error:
-            raise ModelError(f"the closed loop on the model failed: {_reason(error)}.") from error
+            raise ModelError(f"the closed loop on the model failed: {reason_of(error)}.") from error
         return Plan(parameters, task, controller, trajectory)
 
     def _task(self, parameters: Parameters) -> Task:
@@ -235,7 +238,7 @@ class Validation:
         except CtxvalError:
             raise
         except Exception as error:
-            raise InputError(f"the task function failed: {_reason(error)}.") from error
+            raise InputError(f"the task function failed: {reason_of(error)}.") from error
         _require("the task function's result", task, isinstance(task, Task), "a Task")
         return task
 
@@ -244,14 +247,14 @@ class Validation:
             with np.errstate(all="ignore"):
                 return np.asarray(self.distance(plan.model_trajectory, trajectory, plan.task), dtype=np.float64)
         except Exception as error:
-            raise DistanceError(f"the distance failed: {_reason(error)}.") from error
+            raise DistanceError(f"the distance failed: {reason_of(error)}.") from error
 
     def _refuse_distance(self, value: Array, point: Array) -> NoReturn:
         where = self.space.describe_point(point)
         raise DistanceError(f"the distance must be one finite number >= 0, got {value} for the task {where}.")
 
 
-def require_execution(plan: Plan, trajectory: Trajectory) -> None:
+def require_execution(plan: Plan, trajectory: object) -> None:
     """Check that a trajectory is a whole and finite execution of the plan.
 
     Raises:
@@ -271,6 +274,37 @@ def require_execution(plan: Plan, trajectory: Trajectory) -> None:
         raise ExecutionError("the system's trajectory is not finite")
 
 
+def require_task(plan: Plan, trajectory: Trajectory, start_tolerance: float = START) -> None:
+    """Check that a trajectory recorded elsewhere is of the plan's task: its length, its times and where it starts.
+
+    Args:
+        plan: of the task.
+        trajectory: the recording.
+        start_tolerance: by how much each state may miss the task's initial state, as a share of that state's range in
+            the model's trajectory, or of its initial value where that is larger.
+
+    Raises:
+        InputError: it is of another task; the message says what does not fit.
+    """
+    expected = plan.model_trajectory
+    require_times(trajectory, plan.task.times)
+    if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:
+        raise ShapeError(
+            f"the trajectory must have {expected.states.shape[-1]} states and {expected.inputs.shape[-1]} inputs, "
+            f"got {trajectory.states.shape[-1]} and {trajectory.inputs.shape[-1]}."
+        )
+    start = plan.task.initial_state
+    ranges = np.ptp(expected.states, axis=0)
+    scale = np.maximum(np.maximum(ranges, np.abs(start)), max(0.05 * ranges.max(), 1e-6))
+    misses = np.abs(trajectory.states[0] - start)
+    if not (misses <= start_tolerance * scale).all():
+        i = int(np.argmax(~(misses <= start_tolerance * scale)))
+        raise InputError(
+            f"the trajectory starts elsewhere: state {i} must start at {start[i]:g} within "
+            f"{start_tolerance * scale[i]:.3g}, got {trajectory.states[0, i]:g}; is it of this trial?"
+        )
+
+
 def _executed(expected: Trajectory, batch: Trajectory) -> Mask:
     """Return which tasks of a batch have a whole and finite trajectory, shape ``(N,)``."""
     same = batch.states.shape == expected.states.shape and batch.inputs.shape == expected.inputs.shape
@@ -284,7 +318,8 @@ def _require(name: str, value: object, valid: bool, wanted: str) -> None:
         raise InputError(f"{name} must be {wanted}, got {value!r}.")
 
 
-def _reason(error: Exception) -> str:
+def reason_of(error: BaseException) -> str:
+    """Return what an exception says, and its type."""
     try:
         return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     except Exception:

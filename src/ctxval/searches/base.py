@@ -80,6 +80,7 @@ class SequentialSearch(ABC):
         self._points: list[Array] = []
         self._values: list[float] = []
         self._notes: list[Note | None] = []
+        self._slots: dict[bytes, list[int]] = {}
         self._thought: Note | None = None
 
     def ask(self, n: int = 1) -> Array:
@@ -134,6 +135,7 @@ class SequentialSearch(ABC):
         self._notes = list(notes)
 
     def _append(self, point: Array, value: float, note: Note | None) -> None:
+        self._slots.setdefault(_key(point), []).append(len(self._points))
         self._points.append(point)
         self._values.append(value)
         self._notes.append(note)
@@ -143,10 +145,7 @@ class SequentialSearch(ABC):
             raise InputError("reset(dimension, seed) must come before ask and tell.")
 
     def _waiting_slot(self, point: Array) -> int | None:
-        for slot, (known, value) in enumerate(zip(self._points, self._values, strict=True)):
-            if np.isnan(value) and np.array_equal(known, point):
-                return slot
-        return None
+        return next((slot for slot in self._slots.get(_key(point), []) if np.isnan(self._values[slot])), None)
 
     @abstractmethod
     def propose(self, rng: np.random.Generator) -> Array:
@@ -171,3 +170,8 @@ class SequentialSearch(ABC):
     def notes(self) -> tuple[Note | None, ...]:
         """What was thought when each was chosen; None where nothing was, or the point was told by hand."""
         return tuple(self._notes)
+
+
+def _key(point: Array) -> bytes:
+    """Return what equal points have in common."""
+    return (point + 0.0).tobytes()  # minus zero is zero

@@ -1,0 +1,5 @@
+"""``python -m ctxval.cli``."""
+
+from ctxval.cli import main
+
+main()

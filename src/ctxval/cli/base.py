@@ -1,0 +1,219 @@
+"""What all commands share: errors in one sentence, exit statuses, and how things are printed."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import io
+import json
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from ctxval.campaign import Campaign
+from ctxval.describe import describe
+from ctxval.disks import StoreWarning
+from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
+from ctxval.trial import Trial
+from ctxval.verdict import Verdict
+
+FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED = 1, 2, 3, 130
+_BAD = (InputError, StoreError, CertificateError)
+
+app = typer.Typer(
+    name="ctxval",
+    help="Decide whether a learned model of a robot can be trusted for the control tasks it is meant for.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+out = Console()
+err = Console(stderr=True)
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+
+
+def command(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Turn ctxval's errors into one sentence and an exit status; what a command returns is its JSON."""
+
+    @functools.wraps(function)
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        warnings.showwarning = _show_warning
+        try:
+            with _stdout_to_stderr() if kwargs.get("as_json") else _as_it_is() as stdout:
+                return _answered(function(*args, **kwargs), stdout if kwargs.get("as_json") else None)
+        except CtxvalError as error:
+            say_error(str(error))
+            raise typer.Exit(BAD_INPUT if isinstance(error, _BAD) else CANNOT_GO_ON) from None
+        except (typer.Exit, typer.Abort):
+            raise
+        except KeyboardInterrupt:
+            err.print("stopped; what was executed is stored, run the same command to go on.")
+            raise typer.Exit(INTERRUPTED) from None
+        except (Exception, SystemExit) as error:
+            # Python's own exit status here would be 1, which says that a model is falsified.
+            say_error(f"{type(error).__name__}: {error}")
+            raise typer.Exit(CANNOT_GO_ON) from None
+
+    return wrapped
+
+
+def _answered(answer: Any, stdout: Any) -> None:
+    """Print a command's JSON where that was asked for, and leave with its exit status."""
+    report, status = answer if isinstance(answer, tuple) else (answer, 0)
+    if stdout is not None:
+        print(json.dumps(describe(report), allow_nan=False), file=stdout, flush=True)
+    if status:
+        raise typer.Exit(status)
+
+
+@contextmanager
+def _as_it_is() -> Iterator[None]:
+    yield None
+
+
+@contextmanager
+def _stdout_to_stderr() -> Iterator[Any]:
+    """Send what users' code and programs print to stderr; yield what is the standard output for us."""
+    sys.stdout.flush()
+    try:
+        kept = os.dup(sys.stdout.fileno())
+    except (io.UnsupportedOperation, OSError, ValueError):  # no file of its own, as in a test
+        ours = sys.stdout
+        with redirect_stdout(sys.stderr):
+            yield ours
+        return
+    number = sys.stdout.fileno()
+    with os.fdopen(kept, "w", encoding=sys.stdout.encoding) as ours:
+        os.dup2(sys.stderr.fileno(), number)
+        try:
+            with redirect_stdout(sys.stderr):
+                yield ours
+        finally:
+            sys.stdout.flush()
+            os.dup2(ours.fileno(), number)
+
+
+Workers = Annotated[int | None, typer.Option(help="Executions at a time, each in a process of its own.")]
+Dask = Annotated[str | None, typer.Option(metavar="ADDRESS", help="Of a Dask scheduler whose workers execute.")]
+Timeout = Annotated[float | None, typer.Option(help="Seconds after which an execution has failed.")]
+
+
+@contextmanager
+def hands(workers: int | None, dask: str | None, timeout: float | None) -> Iterator[dict[str, Any]]:
+    """Yield what a campaign needs to know of those that execute.
+
+    Raises:
+        InputError: there is no such scheduler, or it has no workers.
+    """
+    if dask is None:
+        yield {"workers": workers, "timeout": timeout}
+        return
+    try:
+        distributed: Any = importlib.import_module("distributed")
+    except ImportError as error:
+        raise InputError("--dask needs dask.distributed: pip install 'ctxval[dask]'.") from error
+    try:
+        client = distributed.Client(dask, timeout=10)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"there is no Dask scheduler at {dask}: {type(error).__name__}: {error}.") from error
+    with client:
+        threads = sum(client.nthreads().values())
+        if not threads:
+            raise InputError(f"the Dask scheduler at {dask} has no workers.")
+        yield {"workers": workers or threads, "executor": client.get_executor(pure=False), "timeout": timeout}
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *place: Any, **_: Any) -> None:
+    if issubclass(category, StoreWarning):
+        err.print(f"[bold yellow]warning:[/] {escaped(str(message))}", highlight=False, soft_wrap=True)
+    else:
+        err.print(warnings.formatwarning(message, category, *place[:2]), markup=False, highlight=False, end="")
+
+
+def say_error(sentence: str) -> None:
+    """Print what is wrong."""
+    err.print(f"[bold red]error:[/] {escaped(sentence)}", highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def progress(campaign: Campaign, total: int, *, show: bool) -> Iterator[Callable[[Trial], None]]:
+    """Show how many executions have ended, of how many."""
+    columns = (
+        TextColumn("executions"),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        TextColumn("largest distance {task.fields[best]}  {task.fields[pace]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=err, disable=not show) as display:
+        line = display.add_task("", total=total, completed=campaign.executions, best="-", pace="")
+
+        def on_trial(trial: Trial) -> None:
+            best = "-" if campaign.worst is None else f"{campaign.worst.distance:.4g}"
+            display.update(line, completed=campaign.executions, best=best, pace=_pace(trial))
+
+        yield on_trial
+
+
+def _pace(trial: Trial) -> str:
+    return "" if trial.seconds is None else f"{trial.seconds:.2g} s/execution"
+
+
+def certificate_of(verdict: Verdict | None) -> dict[str, Any]:
+    """Return what stands behind a verdict, and what is expected of further executions."""
+    if verdict is None:
+        return {"certificate": None, "expected": None}
+    return {
+        "certificate": None if verdict.certificate is None else verdict.certificate.to_json(),
+        "expected": None if verdict.expected is None else asdict(verdict.expected),
+    }
+
+
+def worst_of(trial: Trial | None) -> dict[str, Any] | None:
+    """Return a trial's task and distance."""
+    return None if trial is None else {"task": trial.parameters, "distance": trial.distance}
+
+
+def print_table(rows: dict[str, Any], units: str = "") -> None:
+    """Print names and values."""
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for key, value in rows.items():
+        table.add_row(key.replace("_", " "), escaped(_text(value, units)))
+    out.print(table, highlight=False)
+
+
+def _text(value: Any, units: str) -> str:
+    match value:
+        case None:
+            return "-"
+        case float():
+            return f"{value:.4g}"
+        case list():
+            return ", ".join(_text(item, units) for item in value)
+        case {"task": dict() as task, "distance": distance, **rest}:
+            at = ", ".join(f"{name} = {_text(item, '')}" for name, item in task.items())
+            how = f" ({rest['method']})" if "method" in rest else ""
+            return f"{distance:.4g} {units} at {at}{how}"
+        case dict():
+            return ", ".join(f"{name} {_text(item, '')}" for name, item in value.items())
+        case _:
+            return str(value)
+
+
+def escaped(text: str) -> str:
+    """Return a text that rich prints as it is."""
+    return text.replace("[", r"\[")
+
+
+def print_verdict(verdict: Verdict) -> None:
+    """Print the answer and its reason."""
+    out.print(f"[bold]{verdict.answer}[/] against {verdict.threshold:g}: {escaped(verdict.reason)}", highlight=False)

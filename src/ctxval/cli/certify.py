@@ -1,0 +1,173 @@
+"""``ctxval certify``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ctxval.campaign import Campaign
+from ctxval.certificates import KINDS, Certificate, Options, Sample, TheoremConstants, certify
+from ctxval.cli.base import (
+    FALSIFIED,
+    AsJson,
+    app,
+    certificate_of,
+    command,
+    escaped,
+    out,
+    print_table,
+    print_verdict,
+    progress,
+)
+from ctxval.config import CertificateTable, Settings, stored_settings
+from ctxval.errors import CertificateError, InputError, UnknownNameError
+from ctxval.store import Store
+from ctxval.trial import Trial
+from ctxval.verdict import Verdict, counterexample, judge, judge_by, require_threshold
+
+
+@app.command("certify")
+@command
+def certify_store(
+    store: Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials.")],
+    threshold: Annotated[float | None, typer.Option(help="Largest distance that you can accept.")] = None,
+    confidence: Annotated[float | None, typer.Option(help="Of the certificate; 0.95 if nothing else was said.")] = None,
+    kind: Annotated[str | None, typer.Option(help=f"One of {', '.join(KINDS)}.")] = None,
+    audit: Annotated[
+        int | None, typer.Option(help="Execute independent draws of tasks first, until there are so many in all.")
+    ] = None,
+    volume: Annotated[float | None, typer.Option(help="Share of the task space that may exceed the threshold.")] = None,
+    discard: Annotated[int | None, typer.Option(help="sampling-discarding: how many; chosen beforehand.")] = None,
+    constant: Annotated[float | None, typer.Option(help="convergence: C, in the distance's units.")] = None,
+    theorem: Annotated[
+        str | None, typer.Option(help="convergence: SCALE,NOISE,A,B,GAIN that C is computed from (see the manual).")
+    ] = None,
+    stochastic: Annotated[
+        bool | None, typer.Option("--stochastic", help="posterior: executions of one task may differ.")
+    ] = None,
+    resolution: Annotated[
+        float | None,
+        typer.Option(help="posterior: how far from every trial a task may be, in diagonals of the task space."),
+    ] = None,
+    as_json: AsJson = False,
+) -> Any:
+    """Say what the trials of a store prove, and with what confidence; nothing is executed but for an audit.
+
+    What is not said here is as the experiment's file says it, where the store is of one.
+    """
+    opened = Store.existing(store)
+    planned = _planned(opened)
+    confidence = planned.confidence if confidence is None else confidence
+    table = planned.certificate
+    volume = table.volume if volume is None else volume
+    stochastic = table.stochastic if stochastic is None else stochastic
+    if kind is None and audit is None:
+        kind, discard, constant = table.kind, _first(discard, table.discard), _first(constant, table.constant)
+    limit = None if threshold is None else require_threshold(threshold)
+    chosen = kind or "audit"
+    resolution = table.resolution if resolution is None else resolution
+    options = Options(stochastic, discard, constant, _theorem(theorem), _search_of(opened), resolution)
+    # All of it before an audit is paid for.
+    _require_shares(confidence, volume)
+    if chosen not in KINDS:
+        raise UnknownNameError.among("certificate", chosen, KINDS)
+    if audit is not None:
+        _run_audit(opened, audit, show=not as_json)
+    trials = opened.trials()
+    found = None if limit is None else counterexample(trials, limit)
+    certificate, refusal = _certificate(trials, chosen, confidence, options, needed=found is None)
+    verdict = found if limit is None or certificate is None else judge_by(certificate, trials, limit, volume=volume)
+    if verdict is not None and verdict.answer == "undecided" and chosen == "posterior":
+        verdict = judge(trials, verdict.threshold, confidence, stochastic=stochastic, resolution=resolution)
+    answer = {} if verdict is None else {"verdict": verdict.answer, "reason": verdict.reason, "threshold": limit}
+    said = {"kind": chosen, "refused": refusal} if certificate is None else certificate.to_json()
+    report = {**answer, **said, "expected": certificate_of(verdict)["expected"], "store": str(store)}
+    if not as_json:
+        _print_certificate(certificate, verdict, refusal)
+    return report, FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
+
+
+def _planned(store: Store) -> Settings:
+    """Return what the experiment's file says; the defaults where the store is of no command."""
+    return stored_settings(store) if store.settings() else Settings()
+
+
+def _first(given: Any, planned: Any) -> Any:
+    return planned if given is None else given
+
+
+def _search_of(store: Store) -> str | None:
+    search = store.description().get("search")
+    return search.get("type") if isinstance(search, dict) else None
+
+
+def decide(campaign: Campaign, threshold: float, confidence: float, table: CertificateTable) -> Verdict:
+    """Return the verdict that an experiment's own certificate gives; undecided where its theory refuses the trials."""
+    trials = list(campaign.trials)
+    found = counterexample(trials, threshold)
+    if found is not None:
+        return found
+    if table.kind == "posterior":
+        return judge(trials, threshold, confidence, stochastic=table.stochastic, resolution=table.resolution)
+    search = _search_of(campaign.store)
+    options = Options(table.stochastic, table.discard, table.constant, None, search, table.resolution)
+    try:
+        certificate = certify(Sample.of(trials), table.kind, confidence, options)
+    except CertificateError as error:
+        return Verdict("undecided", threshold, str(error))
+    return judge_by(certificate, trials, threshold, volume=table.volume)
+
+
+def _require_shares(confidence: float, volume: float) -> None:
+    if not 0 < confidence < 1:
+        raise InputError(f"the confidence must be strictly between 0 and 1, got {confidence!r}.")
+    if not 0 <= volume < 1:
+        raise InputError(f"the volume must be a share of the task space, at least 0 and below 1, got {volume!r}.")
+
+
+def _certificate(
+    trials: list[Trial], kind: str, confidence: float, options: Options, *, needed: bool
+) -> tuple[Certificate | None, str | None]:
+    """Return the certificate; where a counterexample was executed, a refusal does not matter."""
+    try:
+        return certify(Sample.of(trials), kind, confidence, options), None
+    except CertificateError as error:
+        if needed:
+            raise
+        return None, str(error)
+
+
+def _run_audit(store: Store, draws: int, *, show: bool) -> None:
+    settings = stored_settings(store)
+    campaign = settings.campaign(settings.load(), store)
+    drawn = sum(trial.origin == "iid" for trial in campaign.trials)
+    with progress(campaign, campaign.executions + max(0, draws - drawn), show=show) as on_trial:
+        campaign.audit(draws, on_trial)
+
+
+def _theorem(text: str | None) -> TheoremConstants | None:
+    if text is None:
+        return None
+    try:
+        return TheoremConstants(*(float(part) for part in text.split(",")))
+    except CertificateError:
+        raise  # it names the number that is wrong
+    except (ValueError, TypeError) as error:
+        raise InputError(f"--theorem must be five numbers SCALE,NOISE,A,B,GAIN, got {text!r}.") from error
+
+
+def _print_certificate(certificate: Certificate | None, verdict: Verdict | None, refusal: str | None) -> None:
+    if verdict is not None:
+        print_verdict(verdict)
+    if certificate is None:
+        out.print(f"no certificate: {escaped(str(refusal))}", highlight=False)
+        return
+    out.print(f"{certificate.kind}: {escaped(certificate.statement)}", highlight=False)
+    if certificate.doubt is not None:
+        out.print(f"[bold red]withdrawn[/]: {escaped(certificate.doubt)}.", highlight=False)
+    out.print("It assumes that", highlight=False)
+    for assumption in certificate.assumptions:
+        out.print(f"- {escaped(assumption)};", highlight=False)
+    print_table({**certificate.details, "trials": certificate.trials, "version": certificate.version})

@@ -1,0 +1,210 @@
+"""``ctxval ask``, ``ctxval tell`` and ``ctxval import``: systems that people operate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ctxval.campaign import Campaign, OpenTrial
+from ctxval.cli.base import AsJson, app, command, escaped, out
+from ctxval.config import Settings, read_settings, stored_settings
+from ctxval.errors import InputError
+from ctxval.experiment import Experiment
+from ctxval.hand import parameters_from, read_recording, read_runs, write_files
+from ctxval.store import Store
+from ctxval.trial import Trial
+from ctxval.validation import START
+
+_WAIT = 60.0
+"""Seconds to wait for other terminals: each of them holds the store while it chooses a task."""
+
+Resample = Annotated[
+    bool, typer.Option("--resample", help="Bring a recording with other time steps to those of the task.")
+]
+StartTolerance = Annotated[
+    float, typer.Option(help="By how much a recording may start elsewhere, as a share of what the model covers.")
+]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="A task parameter; once for each.")]
+StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials.")]
+
+
+@app.command()
+@command
+def ask(
+    target: Annotated[
+        str,
+        typer.Argument(metavar="STORE|CASE|FILE.toml|module:attr", help="A store, or what a new one is to be of."),
+    ],
+    store: Annotated[Path | None, typer.Option(help="File of the trials, if the first argument is none.")] = None,
+    out_folder: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the trial's files; one beside the store by default.")
+    ] = None,
+    parameters: Set = None,
+    draw: Annotated[bool, typer.Option("--draw", help="An independent draw, for an audit by hand.")] = False,
+    trial: Annotated[int | None, typer.Option(help="Write the files of this open trial again.")] = None,
+    search: Annotated[str | None, typer.Option(help="How tasks are chosen, for a new store.")] = None,
+    seed: Annotated[int | None, typer.Option(help="For a new store.")] = None,
+    as_json: AsJson = False,
+) -> Any:
+    """Open the next trial and write its task and its controller, for a rig that people operate."""
+    if sum((bool(parameters), draw, trial is not None)) > 1:
+        raise InputError("of --set, --draw and --trial only one can be given.")
+    opened = _opened(target, {"store": store, "search": search, "seed": seed})
+    if trial is not None:
+        found = opened.campaign.reopen(trial)
+    else:
+        chosen = parameters_from(parameters) if parameters else None
+        found = opened.campaign.ask(chosen, draw=draw, wait=_WAIT)
+    folder = opened.path.with_suffix(".trials") / str(found.number) if out_folder is None else out_folder
+    report = {
+        "trial": found.number,
+        "task": found.trial.parameters,
+        "origin": found.trial.origin,
+        "store": str(opened.path),
+        "folder": str(folder),
+        "files": write_files(folder, opened.experiment, found),
+    }
+    if not as_json:
+        _print_asked(report, found)
+    return report
+
+
+@app.command()
+@command
+def tell(
+    store: StoreArgument,
+    trial: Annotated[int, typer.Argument(metavar="TRIAL", help="The number that `ctxval ask` said.")],
+    trajectory: Annotated[Path | None, typer.Option(help="CSV of what happened, with named columns.")] = None,
+    npz: Annotated[Path | None, typer.Option(help="NPZ of what happened: times, states, inputs.")] = None,
+    distance: Annotated[float | None, typer.Option(help="The distance alone, where nothing was recorded.")] = None,
+    failed: Annotated[str | None, typer.Option(help="Why there is no result.")] = None,
+    resample: Resample = False,
+    start_tolerance: StartTolerance = START,
+    as_json: AsJson = False,
+) -> Any:
+    """Say how an open trial ended."""
+    given = {"--trajectory": trajectory, "--npz": npz, "--distance": distance, "--failed": failed}
+    if sum(value is not None for value in given.values()) != 1:
+        raise InputError(f"exactly one of {', '.join(given)} must be given.")
+    opened = _of_store(store)
+    recording = None
+    path = trajectory or npz
+    if path is not None:
+        plan = opened.campaign.reopen(trial).plan
+        recording = read_recording(path, opened.experiment, plan, npz=npz is not None, resample=resample)
+    ended = opened.campaign.tell(trial, recording, distance=distance, failed=failed, start_tolerance=start_tolerance)
+    report = _ended(ended, opened)
+    if not as_json:
+        out.print(_sentence(ended, opened.experiment), highlight=False)
+    return report
+
+
+@app.command("import")
+@command
+def import_runs(
+    store: StoreArgument,
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="Tables of known runs: CSV with the task parameters and trajectory, distance or failed; "
+            "with --set, one trajectory.",
+        ),
+    ],
+    parameters: Set = None,
+    resample: Resample = False,
+    start_tolerance: StartTolerance = START,
+    as_json: AsJson = False,
+) -> Any:
+    """Take in executions that were made before; each counts as one, and none is taken in twice."""
+    opened = _of_store(store)
+    runs = read_runs(files, parameters_from(parameters) if parameters else None, opened.experiment.validation.space)
+    checked = []
+    for run in runs:
+        # All of it before any is stored.
+        try:
+            checked.append((run, run.checked(opened.campaign, opened.experiment, resample, start_tolerance)))
+        except InputError as error:
+            raise InputError(f"{run.where}: {error}") from error
+    ended = [
+        opened.campaign.add(
+            run.parameters,
+            recording,
+            distance=run.distance,
+            failed=run.failed,
+            start_tolerance=start_tolerance,
+            wait=_WAIT,
+        )
+        for run, recording in checked
+    ]
+    new = [trial for trial in ended if trial is not None]
+    report = {
+        "imported": [_ended(trial, opened) for trial in new],
+        "known": len(ended) - len(new),
+        "store": str(store),
+    }
+    if not as_json:
+        for trial in new:
+            out.print(_sentence(trial, opened.experiment), highlight=False)
+        out.print(f"{len(new)} imported, {len(ended) - len(new)} were there already.", highlight=False)
+    return report
+
+
+@dataclass(frozen=True, eq=False)
+class _Opened:
+    """A store with what was run into it."""
+
+    settings: Settings
+    experiment: Experiment
+    campaign: Campaign
+    path: Path
+
+
+def _opened(target: str, overrides: dict[str, Any]) -> _Opened:
+    path = Path(target)
+    if path.suffix != ".toml" and path.is_file():
+        if any(value is not None for value in overrides.values()):
+            raise InputError(f"{target} is a store, which knows its search and its seed; give no other.")
+        return _of_store(path)
+    settings = read_settings(target, overrides)
+    experiment = settings.load()
+    where = settings.store_path(experiment.name)
+    return _Opened(settings, experiment, settings.campaign(experiment, where), where)
+
+
+def _of_store(path: Path) -> _Opened:
+    store = Store.existing(path)
+    settings = stored_settings(store)
+    experiment = settings.load()
+    return _Opened(settings, experiment, settings.campaign(experiment, store), path)
+
+
+def _ended(trial: Trial, opened: _Opened) -> dict[str, Any]:
+    return {
+        "trial": trial.number,
+        "task": trial.parameters,
+        "state": trial.state,
+        "distance": trial.distance,
+        "failure": trial.failure,
+        "executions": opened.campaign.executions,
+        "store": str(opened.path),
+    }
+
+
+def _sentence(trial: Trial, experiment: Experiment) -> str:
+    if trial.distance is None:
+        return f"trial {trial.number} failed: {escaped(str(trial.failure))}"
+    return f"trial {trial.number} has the distance {trial.distance:.4g} {escaped(experiment.units)}".rstrip()
+
+
+def _print_asked(report: dict[str, Any], opened: OpenTrial) -> None:
+    task = ", ".join(f"{name} = {value}" for name, value in report["task"].items())
+    out.print(f"trial {opened.number}: {escaped(task)}", highlight=False, soft_wrap=True)
+    out.print(f"{', '.join(report['files'])} in {escaped(report['folder'])}", highlight=False, soft_wrap=True)
+    if "controller.json" not in report["files"]:
+        out.print("its controller cannot be written to a file: only affine feedback, of LQR and iLQR, can.")
+    told = f"ctxval tell {report['store']} {opened.number} --trajectory run.csv"
+    out.print(f"afterwards: {escaped(told)}", highlight=False, soft_wrap=True)

@@ -1,0 +1,169 @@
+"""``ctxval run``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ctxval import plot
+from ctxval.campaign import Campaign
+from ctxval.cli.base import (
+    FALSIFIED,
+    AsJson,
+    Dask,
+    Timeout,
+    Workers,
+    app,
+    certificate_of,
+    command,
+    err,
+    escaped,
+    hands,
+    print_table,
+    print_verdict,
+    progress,
+    worst_of,
+)
+from ctxval.cli.certify import decide
+from ctxval.config import Settings, read_settings
+from ctxval.errors import InputError
+from ctxval.experiment import Experiment
+from ctxval.truth import Truth
+from ctxval.verdict import Verdict, is_decided, require_threshold
+
+
+@app.command()
+@command
+def run(
+    target: Annotated[str, typer.Argument(metavar="CASE|FILE.toml|module:attr", help="What to validate.")],
+    budget: Annotated[int | None, typer.Option(help="Executions of the system in all, earlier ones counted.")] = None,
+    search: Annotated[str | None, typer.Option(help="How tasks are chosen: gp-ucb, random, ...")] = None,
+    threshold: Annotated[float | None, typer.Option(help="Largest distance that you can accept.")] = None,
+    confidence: Annotated[float | None, typer.Option(help="Of a validation; 0.95 if not given.")] = None,
+    until_decided: Annotated[
+        bool, typer.Option("--until-decided", help="Stop as soon as the verdict is reached; the budget is the most.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(help="Of the data, the model and the search.")] = None,
+    store: Annotated[Path | None, typer.Option(help="File of the trials; it is resumed if it exists.")] = None,
+    truth: Annotated[bool, typer.Option("--truth", help="Find the true maximum too, of a simulated system.")] = False,
+    workers: Workers = None,
+    dask: Dask = None,
+    timeout: Timeout = None,
+    as_json: AsJson = False,
+    variant: Annotated[str | None, typer.Option(help="Variant of a case.")] = None,
+    model: Annotated[str | None, typer.Option(help="Which learned model of a case.")] = None,
+    dim: Annotated[int | None, typer.Option(help="Number of states of a case.")] = None,
+) -> Any:
+    """Search for the task at which the system differs most from its model."""
+    options = {k: v for k, v in {"variant": variant, "model": model, "dim": dim}.items() if v is not None}
+    given = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence, "seed": seed}
+    settings = read_settings(target, {**given, "store": store, "options": options})
+    experiment = settings.load()
+    chosen = experiment.threshold if settings.threshold is None else settings.threshold
+    limit = None if chosen is None else require_threshold(chosen)
+    path = settings.store_path(experiment.name)
+    campaign = settings.campaign(experiment, path)
+    total = experiment.budget if settings.budget is None else settings.budget
+    until = _decided(limit, settings) if until_decided else None
+    with hands(workers, dask, timeout) as given_hands, progress(campaign, total, show=not as_json) as on_trial:
+        campaign.run(total, on_trial, until=until, **given_hands)
+    known = _truth(experiment) if truth else None
+    verdict = None if limit is None else decide(campaign, limit, settings.confidence, settings.certificate)
+    report = _report(campaign, experiment, settings, total, path, verdict, known)
+    report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path)]
+    if not as_json:
+        _print_report(report, verdict)
+    return report, FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
+
+
+def _decided(threshold: float | None, settings: Settings) -> Callable[[Campaign], bool]:
+    if threshold is None:
+        raise InputError("--until-decided needs a threshold to decide about; say --threshold.")
+    if settings.certificate.kind != "posterior":
+        raise InputError(f"--until-decided needs the posterior bound, got {settings.certificate.kind!r}.")
+    stochastic = settings.certificate.stochastic
+    return lambda campaign: is_decided(campaign.trials, threshold, settings.confidence, stochastic=stochastic)
+
+
+def _truth(experiment: Experiment) -> Truth:
+    if experiment.truth is None:
+        raise InputError(f"the truth of {experiment.name!r} is not known: its system is not simulated here.")
+    return experiment.truth()
+
+
+def _report(
+    campaign: Campaign,
+    experiment: Experiment,
+    settings: Settings,
+    budget: int,
+    path: Path,
+    verdict: Verdict | None,
+    truth: Truth | None,
+) -> dict[str, Any]:
+    report: dict[str, Any] = {
+        "case": experiment.name,
+        **({"options": settings.options} if settings.options else {}),
+        "search": settings.search.name,
+        "seed": settings.seed,
+        "budget": budget,
+        "executions": campaign.executions,
+        "failed": len(campaign.failed),
+        "worst": worst_of(campaign.worst),
+        "estimate": campaign.estimate,
+        "units": experiment.units,
+        "verdict": None if verdict is None else verdict.answer,
+        "reason": None if verdict is None else verdict.reason,
+        "threshold": None if verdict is None else verdict.threshold,
+        **certificate_of(verdict),
+        "store": str(path),
+    }
+    if truth is not None:
+        task = campaign.validation.space.describe_point(truth.parameters.points)
+        report["truth"] = {"distance": truth.distance, "task": task, "method": truth.method}
+        estimate = campaign.estimate
+        report["error_percent"] = None if estimate is None else 100 * (truth.distance - estimate) / truth.distance
+    return report
+
+
+def _save_pictures(campaign: Campaign, experiment: Experiment, path: Path) -> list[Path]:
+    try:
+        return _draw_pictures(campaign, experiment, path)
+    except Exception as error:
+        # A picture must not hide the verdict that was paid for.
+        err.print(f"no pictures: {escaped(f'{type(error).__name__}: {error}')}", highlight=False)
+        return []
+
+
+def _draw_pictures(campaign: Campaign, experiment: Experiment, path: Path) -> list[Path]:
+    if campaign.worst is None:
+        return []
+    drawn = [
+        plot.save(
+            plot.worst_trajectories(campaign, states=experiment.states, inputs=experiment.inputs),
+            path.with_suffix(".worst.png"),
+        )
+    ]
+    if len(campaign.completed) >= 2:
+        figure = plot.surrogate(campaign, truth=_true_curve(experiment), units=experiment.units)
+        drawn.append(plot.save(figure, path.with_suffix(".surrogate.png")))
+    return drawn
+
+
+def _true_curve(experiment: Experiment) -> plot.Curve | None:
+    """Return the distance on a grid, where that is cheap: a simulated system over one parameter."""
+    space = experiment.validation.space
+    if experiment.truth is None or space.dimension > 1:
+        return None
+    points = space.grid(401)
+    return plot.Curve(points[:, 0], experiment.validation.distances(points))
+
+
+def _print_report(report: dict[str, Any], verdict: Verdict | None) -> None:
+    apart = ("verdict", "reason", "threshold", "units", "certificate", "expected")
+    shown = {key: value for key, value in report.items() if key not in apart}
+    print_table(shown, units=report["units"])
+    if verdict is not None:
+        print_verdict(verdict)

@@ -1,0 +1,63 @@
+"""``ctxval status`` and ``ctxval export``: what a store holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ctxval.cli.base import AsJson, app, command, escaped, out, print_table, worst_of
+from ctxval.salvage import export, salvage
+from ctxval.store import Store
+
+
+@app.command()
+@command
+def status(
+    store: Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials.")],
+    as_json: AsJson = False,
+) -> Any:
+    """Say what a store holds; nothing is executed."""
+    opened = Store.existing(store)
+    description, trials = opened.description(), opened.trials()
+    report = {
+        "case": description.get("name"),
+        "search": description.get("search", {}).get("type"),
+        "seed": description.get("seed"),
+        "executions": sum(trial.executed for trial in trials),
+        "failed": sum(trial.state == "failed" for trial in trials),
+        "open": [trial.number for trial in trials if trial.state == "open"],
+        "worst": worst_of(
+            max((t for t in trials if t.distance is not None), key=lambda t: t.distance or 0, default=None)
+        ),
+        "store": str(store),
+    }
+    if not as_json:
+        print_table(report)
+    return report
+
+
+@app.command("export")
+@command
+def export_store(
+    store: Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials, whole or damaged.")],
+    folder: Annotated[Path | None, typer.Option("--out", help="Folder to write to; one beside the store.")] = None,
+    as_json: AsJson = False,
+) -> Any:
+    """Write what is readable of a store as CSV and JSON."""
+    found = salvage(store)
+    target = store.with_suffix(".export") if folder is None else folder
+    export(found, target)
+    report = {
+        "trials": len(found.trials),
+        "trajectories": len(found.trajectories),
+        "damaged": found.damaged,
+        "folder": str(target),
+    }
+    if not as_json:
+        for sentence in found.damaged:
+            out.print(f"[yellow]not readable[/]: {escaped(sentence)}", highlight=False, soft_wrap=True)
+        what = f"{len(found.trials)} trials and {len(found.trajectories)} trajectories in {target}"
+        out.print(escaped(what), highlight=False, soft_wrap=True)
+    return report

@@ -1,0 +1,37 @@
+"""Which disks a store is safe on."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+
+class StoreWarning(UserWarning):
+    """A store may not survive where it is."""
+
+
+_NETWORKS = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "afs", "ncpfs", "fuse.sshfs", "fuse.rclone")
+"""File systems of other machines, on which locks and flushes cannot be relied on."""
+
+
+def file_system(path: Path, mounts: str) -> str:
+    """Return the type of the file system that a path is on, of a table of mounts as /proc/mounts is."""
+    lines = [line.split() for line in mounts.splitlines()]
+    places = [(Path(line[1].replace("\\040", " ")), line[2]) for line in lines if len(line) > 2]
+    holding = [(len(place.parts), kind) for place, kind in places if path.is_relative_to(place)]
+    return max(holding, default=(0, ""))[1]
+
+
+def warn_of_network(path: Path) -> None:
+    """Warn of a store on a file system of another machine."""
+    try:
+        kind = file_system(path.absolute(), Path("/proc/mounts").read_text())
+    except (OSError, ValueError):
+        return
+    if kind in _NETWORKS:
+        warnings.warn(
+            f"{path} is on a network file system ({kind}), whose locks and flushes cannot be relied on: keep the store "
+            "on a disk of this computer.",
+            StoreWarning,
+            stacklevel=4,
+        )

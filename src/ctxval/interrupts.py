@@ -1,0 +1,65 @@
+"""Ctrl-C in two steps: the first ends after what is running, the second at once."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+class Interrupts:
+    """Within it, SIGINT waits for the end of what is shielded, and a second one does not.
+
+    It takes effect in the main thread, where nobody else handles the signal; elsewhere everything stays as it is.
+
+    Attributes:
+        asked: whether the running executions are the last ones.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._shielded = False
+        self._installed = False
+
+    def __enter__(self) -> Interrupts:
+        in_main = threading.current_thread() is threading.main_thread()
+        if in_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, self._handle)
+            self._installed = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._installed:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _handle(self, _signal: int, _frame: FrameType | None) -> None:
+        if self.asked or not self._shielded:
+            self.asked = True
+            raise KeyboardInterrupt
+        self.asked = True
+        self.announce()
+
+    def announce(self) -> None:
+        """Say that the running executions are waited for."""
+        sys.stderr.write("\nending after what is running; once more to stop at once\n")
+
+    @contextmanager
+    def shielded(self) -> Iterator[None]:
+        """Let what is inside come to its end at the first SIGINT."""
+        before, self._shielded = self._shielded, True
+        try:
+            yield
+        finally:
+            self._shielded = before
+
+    def raise_if_asked(self) -> None:
+        """End here if that was asked for meanwhile.
+
+        Raises:
+            KeyboardInterrupt: it was.
+        """
+        if self.asked:
+            raise KeyboardInterrupt
