@@ -15,6 +15,7 @@ from conftest import make_validation
 from ctxval import Campaign
 from ctxval.certificates import Maxima, Sample, draw_maxima
 from ctxval.cli import app
+from ctxval.searches import CMAES
 
 EXPERIMENT = """
 import sys
@@ -334,6 +335,10 @@ def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: 
         (["--audit", "0"], "positive number of draws"),
         (["--audit", "5", "--kind", "scenaro"], "did you mean 'scenario'"),
         (["--audit", "5", "--confidence", "95"], "strictly between 0 and 1"),
+        (["--audit", "5", "--kind", "scenario"], "there are others; say --kind audit"),
+        (["--audit", "5", "--kind", "sampling-discarding"], "how many to discard"),
+        (["--audit", "5", "--kind", "convergence", "--constant", "1"], "no use for an audit"),
+        (["--confidence", "1e-300"], "the confidence must be strictly between 0 and 1"),
     ],
 )
 def test_what_cannot_be_certified_is_one_sentence_and_costs_no_execution(  # type: ignore[no-untyped-def]
@@ -346,6 +351,18 @@ def test_what_cannot_be_certified_is_one_sentence_and_costs_no_execution(  # typ
     assert "Traceback" not in result.stderr
     assert result.stdout == ""
     assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 12
+
+
+def test_proposition_1_is_refused_where_another_search_chose_the_tasks(invoke) -> None:  # type: ignore[no-untyped-def]
+    Campaign(make_validation(), search=CMAES(), store="own.sqlite").run(6)
+    result = invoke("certify", "own.sqlite", "--kind", "convergence", "--constant", "1")
+    assert result.exit_code == 2
+    assert "CMAES chose these" in result.stderr
+
+
+def test_a_run_on_a_stochastic_system_says_so(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:experiment", "--threshold", "50", "--stochastic", "--json")
+    assert "independent normal noise" in json.loads(result.stdout)["certificate"]["assumptions"][2]
 
 
 def test_a_store_that_no_command_made_cannot_be_audited_but_certified(invoke) -> None:  # type: ignore[no-untyped-def]

@@ -178,6 +178,18 @@ class Settings(BaseModel):
         campaign.store.keep_settings(self.model_dump(mode="json", exclude={"store"}))
         return campaign
 
+    def certified_as(self, stated: dict[str, Any]) -> Settings:
+        """Return these settings with what the command line states of the certificate over what the file says.
+
+        Raises:
+            InputError: a value is not allowed.
+        """
+        try:
+            table = CertificateTable.model_validate({**self.certificate.model_dump(), **stated})
+        except ValidationError as error:
+            raise InputError(_sentence("certificate", error)) from error
+        return self.model_copy(update={"certificate": table})
+
     def store_path(self, name: str) -> Path:
         """Return where the trials go: the given store, or a file under ``runs/`` named after what is run."""
         if self.store is not None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from ctxval.campaign import Campaign
-from ctxval.certificates import KINDS, Certificate, Options, Sample, TheoremConstants, certify
+from ctxval.certificates import KINDS, Certificate, Options, Sample, TheoremConstants, certify, require_possible
 from ctxval.cli.base import (
     FALSIFIED,
     AsJson,
@@ -74,13 +74,19 @@ def certify_store(
     if chosen not in KINDS:
         raise UnknownNameError.among("certificate", chosen, KINDS)
     if audit is not None:
+        require_possible([trial.origin for trial in opened.trials()], chosen, options)
         _run_audit(opened, audit, show=not as_json)
     trials = opened.trials()
     found = None if limit is None else counterexample(trials, limit)
-    certificate, refusal = _certificate(trials, chosen, confidence, options, needed=found is None)
-    verdict = found if limit is None or certificate is None else judge_by(certificate, trials, limit, volume=volume)
-    if verdict is not None and verdict.answer == "undecided" and chosen == "posterior":
-        verdict = judge(trials, verdict.threshold, confidence, stochastic=stochastic, resolution=resolution)
+    verdict: Verdict | None
+    if chosen == "posterior" and limit is not None and found is None:
+        verdict, refusal = judge(trials, limit, confidence, stochastic=stochastic, resolution=resolution), None
+        certificate = verdict.certificate
+        if certificate is None:
+            raise CertificateError(verdict.reason)
+    else:
+        certificate, refusal = _certificate(trials, chosen, confidence, options, needed=found is None)
+        verdict = found if limit is None or certificate is None else judge_by(certificate, trials, limit, volume=volume)
     answer = {} if verdict is None else {"verdict": verdict.answer, "reason": verdict.reason, "threshold": limit}
     said = {"kind": chosen, "refused": refusal} if certificate is None else certificate.to_json()
     report = {**answer, **said, "expected": certificate_of(verdict)["expected"], "store": str(store)}
@@ -121,7 +127,7 @@ def decide(campaign: Campaign, threshold: float, confidence: float, table: Certi
 
 
 def _require_shares(confidence: float, volume: float) -> None:
-    if not 0 < confidence < 1:
+    if not 0 < 1 - confidence < 1:
         raise InputError(f"the confidence must be strictly between 0 and 1, got {confidence!r}.")
     if not 0 <= volume < 1:
         raise InputError(f"the volume must be a share of the task space, at least 0 and below 1, got {volume!r}.")

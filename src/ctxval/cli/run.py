@@ -46,6 +46,14 @@ def run(
     until_decided: Annotated[
         bool, typer.Option("--until-decided", help="Stop as soon as the verdict is reached; the budget is the most.")
     ] = False,
+    stochastic: Annotated[
+        bool | None,
+        typer.Option("--stochastic", help="Executions of one task may differ; what is judged is the expected one."),
+    ] = None,
+    resolution: Annotated[
+        float | None,
+        typer.Option(help="How far from every trial a task may be, in diagonals of the task space, for a validation."),
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Of the data, the model and the search.")] = None,
     store: Annotated[Path | None, typer.Option(help="File of the trials; it is resumed if it exists.")] = None,
     truth: Annotated[bool, typer.Option("--truth", help="Find the true maximum too, of a simulated system.")] = False,
@@ -61,6 +69,8 @@ def run(
     options = {k: v for k, v in {"variant": variant, "model": model, "dim": dim}.items() if v is not None}
     given = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence, "seed": seed}
     settings = read_settings(target, {**given, "store": store, "options": options})
+    said = {"stochastic": stochastic, "resolution": resolution}
+    settings = settings.certified_as({key: value for key, value in said.items() if value is not None})
     experiment = settings.load()
     chosen = experiment.threshold if settings.threshold is None else settings.threshold
     limit = None if chosen is None else require_threshold(chosen)
@@ -84,8 +94,10 @@ def _decided(threshold: float | None, settings: Settings) -> Callable[[Campaign]
         raise InputError("--until-decided needs a threshold to decide about; say --threshold.")
     if settings.certificate.kind != "posterior":
         raise InputError(f"--until-decided needs the posterior bound, got {settings.certificate.kind!r}.")
-    stochastic = settings.certificate.stochastic
-    return lambda campaign: is_decided(campaign.trials, threshold, settings.confidence, stochastic=stochastic)
+    table = settings.certificate
+    return lambda campaign: is_decided(
+        campaign.trials, threshold, settings.confidence, stochastic=table.stochastic, resolution=table.resolution
+    )
 
 
 def _truth(experiment: Experiment) -> Truth:
