@@ -208,7 +208,7 @@ def test_a_reason_does_not_round_its_comparison_away() -> None:
     falsified = counterexample([trial(0, 0, 0.50000001)], 0.5)
     assert falsified is not None
     assert "its distance 0.50000001 exceeds 0.5." in falsified.reason
-    assert "is 1.23456, at most 1.23457" in judge_by(certificate(1.234561), trials(), 1.234569).reason
+    assert "is 1.234561, at most 1.234569" in judge_by(certificate(1.234561), trials(), 1.234569).reason
     assert (
         "above 1.23456 was executed, but d* may be up to 1.235"
         in judge_by(certificate(1.23457), trials(), 1.23456).reason

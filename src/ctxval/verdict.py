@@ -19,7 +19,7 @@ from ctxval.certificates import (
     farthest_task,
     forecast,
 )
-from ctxval.certificates.base import require_probability
+from ctxval.certificates.base import at_most, require_probability
 from ctxval.errors import CertificateError, InputError
 from ctxval.trial import Trial
 
@@ -83,7 +83,7 @@ def counterexample(trials: Sequence[Trial], threshold: float) -> Verdict | None:
 def _told_apart(value: float, tau: float) -> tuple[str, str]:
     """Return two numbers as texts of as many digits as tell which one is larger."""
     for digits in range(4, 17):
-        texts = f"{value:.{digits}g}", f"{tau:.{max(digits, 6)}g}"
+        texts = at_most(value, digits) if value <= tau else f"{value:.{digits}g}", f"{tau:.{max(digits, 6)}g}"
         if np.sign(float(texts[0]) - float(texts[1])) == np.sign(value - tau):
             return texts
     return repr(value), repr(tau)
@@ -106,7 +106,7 @@ def judge_by(certificate: Certificate, trials: Sequence[Trial], threshold: float
     if found is not None:
         return Verdict("falsified", tau, found.reason, found.witness, certificate)
     if certificate.covers(tau, volume):
-        but = f", but for {100 * certificate.volume:.3g} % of the task space" if certificate.volume else ""
+        but = f", but for {at_most(100 * certificate.volume, 3)} % of the task space" if certificate.volume else ""
         upper, limit = _told_apart(certificate.upper_bound, tau)
         reason = (
             f"the {certificate.kind} bound of {certificate.trials} trials is {upper}, at most {limit}, with confidence "
@@ -123,7 +123,7 @@ def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
         upper, limit = _told_apart(certificate.upper_bound, tau)
         return f"no distance above {limit} was executed, but d* may be up to {upper}."
     return (
-        f"the {certificate.kind} bound leaves out {100 * certificate.volume:.3g} % of the task space, "
+        f"the {certificate.kind} bound leaves out {at_most(100 * certificate.volume, 3)} % of the task space, "
         f"more than the {100 * volume:.3g} % that are acceptable; it is no bound on d*."
     )
 
