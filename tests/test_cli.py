@@ -66,7 +66,8 @@ def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-
 
 
 def test_json_is_one_object_with_everything_asked_for(invoke) -> None:  # type: ignore[no-untyped-def]
-    result = invoke("run", "rig:experiment", "--budget", "8", "--seed", "3", "--truth", "--threshold", "9", "--json")
+    asked = ("--budget", "8", "--seed", "3", "--truth", "--threshold", "9", "--resolution", "1", "--json")
+    result = invoke("run", "rig:experiment", *asked)
     report = json.loads(result.stdout)
     assert result.exit_code == 0
     assert report["case"] == "short"

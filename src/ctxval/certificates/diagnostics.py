@@ -22,7 +22,7 @@ from ctxval.hyperposterior import Conditioned
 LEVEL = 0.01
 """How unlikely a surprise must be for the bound to be withdrawn."""
 
-RESOLUTION = 0.3
+RESOLUTION = 0.25
 """How far from every trial a task may be, in diagonals of the task space, unless the user states more; what lies
 farther away may be unlike anything that was seen (docs/calibration.md)."""
 
