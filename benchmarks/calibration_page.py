@@ -80,11 +80,11 @@ def coverage(missed: int, total: int, confidence: float) -> str:
     return f"**{text}**" if chance < SIGNIFICANT else text
 
 
-def interval(missed: int, total: int) -> str:
-    """Return the 95 % Clopper-Pearson interval of a coverage."""
+def interval(missed: int, total: int) -> tuple[float, float]:
+    """Return the 95 % Clopper-Pearson interval of a coverage in per cent."""
     low = beta.ppf(0.025, total - missed, missed + 1) if missed < total else 0.0
     high = beta.ppf(0.975, total - missed + 1, missed) if missed else 1.0
-    return f"{100 * low:.1f} to {100 * high:.1f} %"
+    return 100 * float(low), 100 * float(high)
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
@@ -100,7 +100,8 @@ def exact_table() -> str:
         levels = []
         for level, confidence in enumerate(CONFIDENCES):
             missed = cell.missed(level)
-            levels.append(f"{coverage(missed, len(cell.results), confidence)}, {interval(missed, len(cell.results))}")
+            low, high = interval(missed, len(cell.results))
+            levels.append(f"{coverage(missed, len(cell.results), confidence)}, {low:.1f} to {high:.1f} %")
         rows.append([f"{cell.dimension}-D", str(cell.n), *levels])
     return table(["", "executions", *(f"stated {100 * c:g} %" for c in CONFIDENCES)], rows)
 
@@ -160,10 +161,8 @@ def draw_coverage() -> None:
             found = cells([(family, dimension)] if dimension in FAMILIES[family][1] else [])
             for shade, cell in zip((0.45, 0.7, 1.0), found, strict=False):
                 missed, total = cell.missed(1), len(cell.results)
-                low = beta.ppf(0.025, total - missed, missed + 1) if missed < total else 0.0
-                high = beta.ppf(0.975, total - missed + 1, missed) if missed else 1.0
                 x = at + offset + 0.06 * (shade - 0.7) / 0.3
-                axes.plot([x, x], [100 * low, 100 * high], color=colour, alpha=shade, linewidth=1)
+                axes.plot([x, x], interval(missed, total), color=colour, alpha=shade, linewidth=1)
                 axes.plot(x, 100 * (1 - missed / total), marker, color=colour, alpha=shade, markersize=5)
     for dimension, (colour, marker, _) in STYLES.items():
         axes.plot([], [], marker, color=colour, label=f"{dimension}-D")

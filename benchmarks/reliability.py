@@ -25,7 +25,7 @@ from ctxval import Campaign, Store, searches  # noqa: E402
 from ctxval.salvage import salvage  # noqa: E402
 from rig_workers import campaign as logged  # noqa: E402
 from test_faults import check_damaged, everything  # noqa: E402
-from test_kill import BUDGET, content, start  # noqa: E402
+from test_kill import BUDGET, content, killed_and_resumed, start  # noqa: E402
 from test_workers import start as start_workers  # noqa: E402
 from test_workers import until  # noqa: E402
 
@@ -52,13 +52,7 @@ def kills(count: int, folder: Path, seed: int) -> dict[str, int]:
     rng = np.random.default_rng(seed)
     for number in range(count):
         store = folder / f"kill{number}.sqlite"
-        process = start(store)
-        time.sleep(rng.uniform(0, duration))
-        process.kill()
-        process.wait()
-        before = [row for row in content(store) if row[2] == "completed"]
-        Campaign(make_validation(), store=store, seed=11, name="killed").run(BUDGET)
-        after = content(store)
+        before, after = killed_and_resumed(store, rng.uniform(0, duration))
         counts["inflicted"] += 1
         counts["midway"] += 0 < len(before) < BUDGET
         counts["lost"] += after[: len(before)] != before

@@ -22,6 +22,8 @@ from ctxval import Campaign, Experiment, Truth, Validation, cached_truth, cases,
 ROOT = Path(__file__).parents[1]
 WITHIN = (5.0, 2.0, 1.0)
 
+Result = dict[str, Any]
+
 # Options of the case, whether M brings the data that it was learned from, and the budget.
 CASES: dict[str, tuple[str, dict[str, Any], bool, int]] = {
     "pendulum": ("pendulum", {}, True, 6),
@@ -104,13 +106,26 @@ def row(case: str, search: str, results: list[dict[str, Any]]) -> str:
     return f"| {case} | {search} | " + " | ".join(cells) + f" | {seconds:.2f} |"
 
 
+def add_options(parser: argparse.ArgumentParser, name: str) -> None:
+    """Add the options that the studies have in common; results go to a folder of the study's name."""
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--folder", type=Path, default=ROOT / "benchmarks" / "results" / name)
+    parser.add_argument("--truths", type=Path, default=ROOT / "runs" / "truth")
+
+
+def print_rows(options: argparse.Namespace, run: Callable[..., Result], row: Callable[..., str]) -> None:
+    """Run what is missing, and print a row for each case and search as soon as it is there."""
+    for case in options.cases:
+        for search in options.search:
+            results = [run(case, seed, search, options.folder, options.truths) for seed in range(options.seeds)]
+            print(row(case, search, results), flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", default=list(CASES), help=f"of {', '.join(CASES)}")
     parser.add_argument("--search", nargs="+", default=["auto"])
-    parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--folder", type=Path, default=ROOT / "benchmarks" / "results" / "auto")
-    parser.add_argument("--truths", type=Path, default=ROOT / "runs" / "truth")
+    add_options(parser, "auto")
     options = parser.parse_args()
     print(
         "| case | search | "
@@ -118,10 +133,7 @@ def main() -> None:
         + " | least share of 2,000 random | CPU s a suggestion |"
     )
     print("|---" * (4 + len(WITHIN)) + "|")
-    for case in options.cases:
-        for search in options.search:
-            results = [run(case, seed, search, options.folder, options.truths) for seed in range(options.seeds)]
-            print(row(case, search, results), flush=True)
+    print_rows(options, run, row)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from ctxval import Validation, searches
 from ctxval.arrays import Array
 from ctxval.distances import ComposedDistance
 from ctxval.searches.vector import predict_composed
-from study_auto import ROOT, experiment, first_within, truth
+from study_auto import add_options, experiment, first_within, print_rows, truth
 
 BUDGETS = {"pendulum": 25, "dubins-basin": 100, "dubins-heavy-tail": 100}
 BUDGETS |= {f"arm-{model}": 40 for model in ("fnn", "gp", "linear")} | {f"linear-{n}": 50 for n in range(1, 11)}
@@ -100,17 +100,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="+", help=f"of {', '.join(BUDGETS)}")
     parser.add_argument("--search", nargs="+", default=["scalar", "gp-ucb", "random"], choices=SEARCHES)
-    parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--folder", type=Path, default=ROOT / "benchmarks" / "results" / "scalar")
-    parser.add_argument("--truths", type=Path, default=ROOT / "runs" / "truth")
+    add_options(parser, "scalar")
     options = parser.parse_args()
     within = " | ".join(f"{percent:g} %: median; seeds that got there" for percent in WITHIN)
     print(f"| case | search | budget | {within} | least share of d* | CPU s a suggestion |")
     print("|---" * (5 + len(WITHIN)) + "|")
-    for case in options.cases:
-        for search in options.search:
-            results = [run(case, seed, search, options.folder, options.truths) for seed in range(options.seeds)]
-            print(row(case, search, results), flush=True)
+    print_rows(options, run, row)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from ctxval.controller import Controller
 class Logging:
     """Writes who executes, takes its time, and does what another system does."""
 
-    def __init__(self, folder: str, seconds: float = 0.25) -> None:
+    def __init__(self, folder: str, seconds: float = 0.4) -> None:
         self.folder, self.seconds = folder, seconds
 
     def describe(self) -> dict[str, object]:
@@ -30,7 +30,7 @@ class Logging:
         return trajectory
 
 
-def campaign(store: str | None, folder: str, seconds: float = 0.25) -> Campaign:
+def campaign(store: str | None, folder: str, seconds: float = 0.4) -> Campaign:
     return Campaign(make_validation(system=Logging(folder, seconds)), store=store, seed=5, search=searches.Random())
 
 

@@ -39,6 +39,17 @@ def content(store: Path) -> list[tuple[object, ...]]:
     return rows
 
 
+def killed_and_resumed(store: Path, after: float) -> tuple[list[tuple[object, ...]], list[tuple[object, ...]]]:
+    """Kill a campaign after so many seconds; return what was completed then, and everything once it was resumed."""
+    process = start(store)
+    time.sleep(after)
+    process.kill()
+    process.wait()
+    before = [row for row in content(store) if row[2] == "completed"]
+    Campaign(make_validation(), store=store, seed=11, name="killed").run(BUDGET)
+    return before, content(store)
+
+
 def test_a_killed_campaign_resumes_bit_for_bit(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     kills = request.config.getoption("--kills")
     whole = tmp_path / "whole.sqlite"
@@ -50,15 +61,8 @@ def test_a_killed_campaign_resumes_bit_for_bit(tmp_path: Path, request: pytest.F
     rng = np.random.default_rng(2024)
     found_midway = 0
     for number in range(kills):
-        store = tmp_path / f"{number}.sqlite"
-        process = start(store)
-        time.sleep(rng.uniform(0, duration))
-        process.kill()
-        process.wait()
-        before = [row for row in content(store) if row[2] == "completed"]
+        before, after = killed_and_resumed(tmp_path / f"{number}.sqlite", rng.uniform(0, duration))
         found_midway += 0 < len(before) < BUDGET
-        Campaign(make_validation(), store=store, seed=11, name="killed").run(BUDGET)
-        after = content(store)
         assert after[: len(before)] == before, "a completed execution was lost or changed"
         assert after == expected
     # Where every kill came before or after the loop, nothing would have been shown.

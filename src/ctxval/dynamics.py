@@ -20,6 +20,7 @@ from ctxval import kernels
 from ctxval.arrays import Array, Rows, single_threaded
 from ctxval.distance import ComposedDistance
 from ctxval.model import Model
+from ctxval.models.scaling import spread, standardised_pairs
 from ctxval.rollout import rollout
 from ctxval.searches import Prediction
 from ctxval.searches.vector import predict_composed
@@ -111,11 +112,7 @@ class Residual:
 
     def inputs(self, x: Array, u: Array) -> Array:
         """Return standardised pairs ``(..., n + m)``."""
-        batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        n = x.shape[-1]
-        z = np.empty((*batch, n + u.shape[-1]))
-        z[..., :n], z[..., n:] = x, u
-        return (z - self.shift_in) / self.scale_in
+        return standardised_pairs(x, u, self.shift_in, self.scale_in)
 
     def __call__(self, x: Array, u: Array) -> Array:
         """Return r, shapes ``(..., n), (..., m) -> (..., n)``."""
@@ -187,12 +184,12 @@ def learn_residual(model: Model, transitions: Transitions, sources: Rows, centre
     usable = (np.abs(np.concatenate([pairs, residuals, steps], axis=1)) < _ABSURD).all(axis=1)
     if usable.sum() < 2:
         return None
-    pairs, residuals, sources, steps = pairs[usable], residuals[usable], sources[usable], _spread(steps[usable])
+    pairs, residuals, sources, steps = pairs[usable], residuals[usable], sources[usable], spread(steps[usable])
     sizes = np.sqrt((residuals**2).mean(axis=0))
     learned = sizes > _NEGLIGIBLE * steps
     if not learned.any():
         return None
-    shift, scale = pairs.mean(axis=0), _spread(pairs)
+    shift, scale = pairs.mean(axis=0), spread(pairs)
     Z, Y = (pairs - shift) / scale, residuals / np.where(learned, sizes, np.inf)
     with single_threaded():
         theta, noise = _most_likely(Z, Y[:, learned])
@@ -206,11 +203,6 @@ def learn_residual(model: Model, transitions: Transitions, sources: Rows, centre
         unit=float(np.sqrt(((sizes / steps)[learned] ** 2).mean())),
         spare=(Z[spare], Y[spare], sources[spare]),
     )
-
-
-def _spread(columns: Array) -> Array:
-    spread = columns.std(axis=0)
-    return np.where(spread > 1e-12 * np.maximum(1.0, np.abs(columns).max(axis=0)), spread, 1.0)
 
 
 def _most_likely(Z: Array, Y: Array) -> tuple[Array, float]:
@@ -393,7 +385,7 @@ def _nearest(data: Transitions, loops: Trajectory) -> Transitions:
     here = np.concatenate([data.x, data.u], axis=1)
     if not len(there):
         return data
-    scale = _spread(here)
+    scale = spread(here)
     kept = np.sort(np.argsort(cdist(here / scale, there / scale).min(axis=1), kind="stable")[:_DATA])
     return Transitions(data.x[kept], data.u[kept], data.x_next[kept])
 

@@ -35,7 +35,7 @@ class IncrementScaling:
         if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
             raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
         pairs, increments = np.concatenate([data.x, data.u], axis=1), data.x_next - data.x
-        return cls(pairs.mean(axis=0), _spread(pairs), increments.mean(axis=0), _spread(increments))
+        return cls(pairs.mean(axis=0), spread(pairs), increments.mean(axis=0), spread(increments))
 
     @property
     def mean_pair(self) -> tuple[Array, Array]:
@@ -45,11 +45,7 @@ class IncrementScaling:
 
     def inputs(self, x: Array, u: Array) -> Array:
         """Return what f takes, shape ``(..., n + m)``, of states ``(..., n)`` and inputs ``(..., m)``."""
-        batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        n = x.shape[-1]
-        z = np.empty((*batch, n + u.shape[-1]))
-        z[..., :n], z[..., n:] = x, u
-        return (z - self.shift_in) / self.scale_in
+        return standardised_pairs(x, u, self.shift_in, self.scale_in)
 
     def targets(self, data: Transitions) -> Array:
         """Return what f is to return for recorded transitions, shape ``(N, n)``."""
@@ -67,7 +63,16 @@ class IncrementScaling:
         return whole[..., :n], whole[..., n:]
 
 
-def _spread(columns: Array) -> Array:
+def standardised_pairs(x: Array, u: Array, shift: Array, scale: Array) -> Array:
+    """Return ``((x, u) - shift) / scale``, shape ``(..., n + m)``, of states ``(..., n)`` and inputs ``(..., m)``."""
+    batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+    n = x.shape[-1]
+    z = np.empty((*batch, n + u.shape[-1]))
+    z[..., :n], z[..., n:] = x, u
+    return (z - shift) / scale
+
+
+def spread(columns: Array) -> Array:
     """Return the standard deviations, and 1 for a column that does not vary."""
-    spread = columns.std(axis=0)
-    return np.where(spread > 1e-12 * np.maximum(1.0, np.abs(columns).max(axis=0)), spread, 1.0)
+    deviations = columns.std(axis=0)
+    return np.where(deviations > 1e-12 * np.maximum(1.0, np.abs(columns).max(axis=0)), deviations, 1.0)

@@ -172,6 +172,11 @@ class SequentialSearch(ABC):
         return tuple(self._notes)
 
 
+def best_first(points: Array, values: Array) -> Array:
+    """Return points ``(n, d)``, the largest value first, pending and failed ones last."""
+    return np.asarray(points[np.argsort(-np.nan_to_num(values, nan=-np.inf), kind="stable")])
+
+
 def _key(point: Array) -> bytes:
     """Return what equal points have in common."""
     return (point + 0.0).tobytes()  # minus zero is zero

@@ -11,14 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from ctxval import gp
 from ctxval.arrays import Array, Mask, single_threaded
 from ctxval.errors import InputError
 from ctxval.kernels import Matern
 from ctxval.searches.ascent import Ascent
-from ctxval.searches.base import Note, Prediction, SequentialSearch
+from ctxval.searches.base import Note, Prediction, SequentialSearch, best_first
 from ctxval.searches.scalar import Scalar
 from ctxval.surrogate import fit_surrogate
 
@@ -166,9 +165,8 @@ class Climbs(SequentialSearch):
         """Return the most promising point in the climb's box that is not known; None where nothing is predicted."""
         centre = np.full(self.dimension, 0.5) if climb.point is None else climb.point
         low, high = np.clip(centre - climb.radius, 0, 1), np.clip(centre + climb.radius, 0, 1)
-        order = np.argsort(-np.nan_to_num(self.values, nan=-np.inf), kind="stable")
         budget = min(budget, _LOOKS * self.dimension)
-        points, promised = Ascent(promise, low, high, budget).run(self.points[order[:8]], rng)
+        points, promised = Ascent(promise, low, high, budget).run(best_first(self.points, self.values)[:8], rng)
         new = self._is_new(points) & np.isfinite(promised)
         return points[np.argmax(new)] if new.any() else None
 
@@ -275,9 +273,6 @@ def _log_error(expected: Array, values: Array) -> float:
 
 
 def _left_out(points: Array, values: Array) -> Array:
-    """Return what the scalar surrogate expects at each point from all others (Rasmussen and Williams, eq. 5.12)."""
+    """Return what the scalar surrogate expects at each point from all others."""
     surrogate = fit_surrogate(points, values)
-    process = surrogate.process
-    inverse = solve_triangular(process.L, np.eye(len(values)), lower=True)
-    left_out = process.y - process.alpha / (inverse**2).sum(axis=0)
-    return np.asarray(surrogate.shift + surrogate.scale * left_out)
+    return np.asarray(surrogate.shift + surrogate.scale * surrogate.process.left_out()[0])

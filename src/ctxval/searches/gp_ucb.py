@@ -9,7 +9,7 @@ from ctxval.acquisition import Uncertainty, UpperConfidenceBound, maximise
 from ctxval.arrays import Array, single_threaded
 from ctxval.errors import InputError
 from ctxval.kernels import Kernel, Matern
-from ctxval.searches.base import SequentialSearch
+from ctxval.searches.base import SequentialSearch, best_first
 from ctxval.surrogate import Surrogate, fit_surrogate
 
 _NEGLIGIBLE = 1e-3
@@ -58,7 +58,7 @@ class GPUCB(SequentialSearch):
             return rng.random(self.dimension)
         with single_threaded():
             process = self.surrogate().process
-            known = self.points[np.argsort(-np.nan_to_num(values, nan=-np.inf), kind="stable")]
+            known = best_first(self.points, values)
             bound = UpperConfidenceBound(process, self.beta)
             point = maximise(bound, self.dimension, known, rng)
             if bound(point[None])[0] - process.y.max() <= _NEGLIGIBLE:

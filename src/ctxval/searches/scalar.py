@@ -17,7 +17,7 @@ from ctxval import gp
 from ctxval.acquisition import Acquisition, Box, LogExpectedImprovement, UpperConfidenceBound, maximise
 from ctxval.arrays import Array, single_threaded
 from ctxval.errors import InputError
-from ctxval.searches.base import Note, SequentialSearch
+from ctxval.searches.base import Note, SequentialSearch, best_first
 from ctxval.surrogate import Learned, learn
 
 _WORTH = 0.005
@@ -114,9 +114,9 @@ class Scalar(SequentialSearch):
         process = learned.condition(points, values)
         branch = None if len(values) % _EVERYWHERE == 0 else _branch(points[known], values[known])
         acquisition = self._acquisition(learned, process, values, branch)
-        order = np.argsort(-np.nan_to_num(values, nan=-np.inf), kind="stable")
         box = None if branch is None else branch.box(self.dimension)
-        point = maximise(acquisition, self.dimension, points[order], rng, box=box, corners=True, away=points[~known])
+        known_first, away = best_first(points, values), points[~known]
+        point = maximise(acquisition, self.dimension, known_first, rng, box=box, corners=True, away=away)
         return point, {
             "engine": "scalar",
             "how": "bound" if isinstance(acquisition, UpperConfidenceBound) else "improvement",
