@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.optimize import minimize
@@ -42,6 +42,7 @@ _SEEDS = 10
 """Stored campaigns of each of the paper's systems."""
 
 Values = Callable[[Array], Array]
+Asked = TypeVar("Asked")
 
 
 # Functions of the unit cube
@@ -254,14 +255,9 @@ def campaign(run: Run) -> dict[str, Any]:
 # The stored runs
 
 
-def path_of(family: str, dimension: int) -> Path:
-    """Return where the campaigns of a family are stored, one JSON object a line."""
-    return RESULTS / f"{family.replace(',', '').replace(' ', '-')}-{dimension}d.jsonl"
-
-
-def stored(family: str, dimension: int) -> list[dict[str, Any]]:
-    """Return what is stored; a line cut short by a kill is left out."""
-    path = path_of(family, dimension)
+def lines(name: str) -> list[dict[str, Any]]:
+    """Return what is stored under a name, one JSON object a line; a line cut short by a kill is left out."""
+    path = path_of(name)
     found = []
     for line in path.read_text().splitlines() if path.exists() else []:
         try:
@@ -269,6 +265,22 @@ def stored(family: str, dimension: int) -> list[dict[str, Any]]:
         except json.JSONDecodeError:
             continue
     return found
+
+
+def append(name: str, result: dict[str, Any]) -> None:
+    """Store one more campaign under a name."""
+    with path_of(name).open("a") as file:
+        file.write(json.dumps(result) + "\n")
+
+
+def path_of(name: str) -> Path:
+    """Return the file of a name."""
+    return RESULTS / f"{name.replace(',', '').replace(' ', '-')}.jsonl"
+
+
+def stored(family: str, dimension: int) -> list[dict[str, Any]]:
+    """Return the stored campaigns of a family."""
+    return lines(f"{family}-{dimension}d")
 
 
 def missing(campaigns: int) -> Iterator[Run]:
@@ -288,15 +300,14 @@ def _in_turn(names: list[tuple[str, int]], campaigns: int) -> Iterator[Run]:
                 yield Run(family, d, seed)
 
 
-def fill(campaigns: int, workers: int) -> None:
-    """Run what is missing, and store each campaign as it ends."""
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    runs = list(missing(campaigns))
+def all_of(
+    campaign: Callable[[Asked], dict[str, Any]], runs: list[Asked], workers: int
+) -> Iterator[tuple[Asked, dict[str, Any]]]:
+    """Yield campaigns with their results as they end, and say how many have."""
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for done, (run, result) in enumerate(zip(runs, pool.map(campaign, runs), strict=True), start=1):
-            with path_of(run.family, run.dimension).open("a") as file:
-                file.write(json.dumps(result) + "\n")
-            print(f"\r{done}/{len(runs)} {run.family} {run.dimension}-D", end="", flush=True)
+        for done, pair in enumerate(zip(runs, pool.map(campaign, runs), strict=True), start=1):
+            yield pair
+            print(f"\r{done}/{len(runs)}", end="", flush=True)
     print()
 
 
@@ -306,7 +317,9 @@ def main() -> None:
     parser.add_argument("--campaigns", type=int, default=200, help="for each family and dimension up to 2")
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    fill(arguments.campaigns, arguments.workers)
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    for run, result in all_of(campaign, list(missing(arguments.campaigns)), arguments.workers):
+        append(f"{run.family}-{run.dimension}d", result)
 
 
 if __name__ == "__main__":

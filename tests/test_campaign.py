@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ from scipy.stats import kstest
 
 from conftest import make_validation
 from ctxval import Campaign, TaskSpace, Validation, searches
+from ctxval.arrays import Array
+from ctxval.certificates import RESOLUTION, Maxima, Sample, draw_maxima, farthest_task
 from ctxval.errors import (
     CtxvalError,
     DistanceError,
@@ -19,6 +22,13 @@ from ctxval.errors import (
 )
 from ctxval.testing import FaultyRig
 from ctxval.trial import Trial
+
+
+class OneCorner(searches.SequentialSearch):
+    """Asks for points of the lowest tenth of the cube alone."""
+
+    def propose(self, rng: np.random.Generator) -> Array:
+        return 0.1 * rng.random(self.dimension)
 
 
 def facts(trials: tuple[Trial, ...]) -> list[tuple[object, ...]]:
@@ -377,6 +387,53 @@ def test_a_campaign_stops_before_the_execution_that_is_not_needed(validation: Va
     assert campaign.run(20, until=enough).executions == 7
     assert campaign.run(5, until=lambda _: False).executions == 7
     assert facts(campaign.trials) == facts(Campaign(validation, seed=1).run(7).trials)
+
+
+@pytest.fixture
+def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take few draws of d*: what is tested here does not depend on how many there are."""
+
+    def fewer(sample: Sample, *, draws: int = 12, **options: Any) -> Maxima:
+        return draw_maxima(sample, draws=min(draws, 12), **options)
+
+    for module in ("ctxval.verdict", "ctxval.certificates.posterior"):
+        monkeypatch.setattr(f"{module}.draw_maxima", fewer)
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_a_campaign_executes_what_nothing_came_near_to_before_it_validates(tmp_path: Path) -> None:
+    def campaign(name: str) -> Campaign:
+        return Campaign(make_validation(), search=OneCorner(), seed=1, store=tmp_path / name)
+
+    # The search alone would never leave its corner.
+    decided = campaign("a").run_until_decided(1e3, 20)
+    origins = [trial.origin for trial in decided.trials]
+    assert decided.verdict(1e3).answer == "validated"
+    assert 0 < origins.count("covering") < decided.executions < 20
+    points = np.array([trial.unit_point for trial in decided.trials])
+    assert farthest_task(points) <= RESOLUTION
+    # Interrupted, it goes on as if it had not been, and beyond the verdict nothing is executed.
+
+    def interrupt(trial: Trial) -> None:
+        raise KeyboardInterrupt
+
+    for _ in range(decided.executions):
+        with pytest.raises(KeyboardInterrupt):
+            campaign("b").run_until_decided(1e3, 20, on_trial=interrupt)
+    assert facts(campaign("b").run_until_decided(1e3, 20).trials) == facts(decided.trials)
+
+
+def test_a_campaign_ends_at_its_counterexample(validation: Validation) -> None:
+    falsified = Campaign(validation, seed=1).run_until_decided(1e-6, 9)
+    assert falsified.executions == 1
+    assert falsified.verdict(1e-6).answer == "falsified"
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_workers_decide_together(validation: Validation) -> None:
+    decided = Campaign(validation, search=OneCorner(), seed=1).run_until_decided(1e3, 20, workers=2)
+    assert decided.verdict(1e3).answer == "validated"
+    assert decided.executions < 20
 
 
 # What an attack on the campaign found, and must not find again

@@ -17,7 +17,7 @@ from ctxval.certificates import (
 )
 from ctxval.errors import CertificateError, InputError
 from ctxval.trial import Origin, State
-from ctxval.verdict import counterexample, is_decided, judge, judge_by, require_threshold
+from ctxval.verdict import counterexample, judge, judge_by, require_threshold, standing
 
 WORST = 1.0
 
@@ -75,7 +75,7 @@ def test_a_distance_at_the_threshold_is_no_counterexample_and_neither_is_a_failu
 def test_a_threshold_is_a_positive_number(threshold: object) -> None:
     with pytest.raises(InputError, match="positive number"):
         require_threshold(threshold)  # type: ignore[arg-type]
-    for function in (counterexample, judge, is_decided):
+    for function in (counterexample, judge, lambda known, tau: standing(known, tau, 0)):
         with pytest.raises(InputError, match="positive number"):
             function(trials(), threshold)  # type: ignore[operator]
 
@@ -142,7 +142,7 @@ def test_the_posterior_bound_validates_what_is_far_above_it() -> None:
 def test_a_counterexample_needs_no_certificate_and_no_model() -> None:
     known = [*trials(3), trial(3, 0.7, None), trial(4, 0.8, None, state="open")]
     assert judge(known, 0.5).answer == "falsified"
-    assert is_decided(known, 0.5)
+    assert standing(known, 0.5, 0).decided
 
 
 def test_undecided_says_what_more_would_take() -> None:
@@ -154,7 +154,7 @@ def test_undecided_says_what_more_would_take() -> None:
     assert verdict.expected is not None
     assert verdict.expected.executions is None or verdict.expected.executions >= 1
     assert "more executions are expected to decide" in verdict.reason
-    assert not is_decided(known, tau)
+    assert not standing(known, tau, 0).decided
 
 
 def test_a_bound_that_is_withdrawn_is_not_forecast() -> None:
@@ -163,7 +163,7 @@ def test_a_bound_that_is_withdrawn_is_not_forecast() -> None:
     assert verdict.answer == "undecided"
     assert "withdrawn" in verdict.reason
     assert verdict.expected is None
-    assert not is_decided(known, 1e6)
+    assert not standing(known, 1e6, 0).decided
 
 
 @pytest.mark.parametrize(
@@ -180,18 +180,18 @@ def test_where_nothing_can_be_certified_the_verdict_is_open_and_says_why(known: 
     verdict = judge(known, 5.0)
     assert verdict.answer == "undecided"
     assert sentence in verdict.reason
-    assert not is_decided(known, 5.0)
+    assert sentence == "are open" or not standing(known, 5.0, 0).decided
 
 
 def test_a_confidence_beyond_the_draws_is_undecided_and_one_that_is_none_is_refused() -> None:
     verdict = judge(trials(), 50.0, confidence=1 - 1e-9)
     assert verdict.answer == "undecided"
     assert "needs more than" in verdict.reason
-    for function in (judge, is_decided):
+    for tau, confidence in ((50.0, 1.5), (0.5, 0.0)):
         with pytest.raises(CertificateError, match="strictly between 0 and 1"):
-            function(trials(), 50.0, confidence=1.5)
+            judge(trials(), tau, confidence=confidence)
         with pytest.raises(CertificateError, match="strictly between 0 and 1"):
-            function(trials(), 0.5, confidence=0.0)
+            standing(trials(), tau, 0, confidence=confidence)
 
 
 @pytest.mark.parametrize("stochastic", [False, True])
@@ -201,7 +201,22 @@ def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> No
     best = max(t.distance or 0.0 for t in known)
     for threshold in (0.9 * best, 1.02 * upper, best + 0.2 * (upper - best)):
         verdict = judge(known, threshold, stochastic=stochastic)
-        assert is_decided(known, threshold, stochastic=stochastic) == (verdict.answer != "undecided")
+        assert standing(known, threshold, 0, stochastic=stochastic).decided == (verdict.answer != "undecided")
+
+
+def test_what_nothing_came_near_to_is_missing_where_the_bound_keeps_the_threshold() -> None:
+    known = [one for one in trials(9) if not 0.3 < one.unit_point[0] < 0.7]
+    now = standing(known, 50.0, left=1)
+    assert not now.decided
+    assert now.uncovered is not None
+    assert now.uncovered[0] == pytest.approx(0.5, abs=0.01)
+    assert "1 more executions would come near" in judge(known, 50.0).reason
+    # Being executed is as good as covered.
+    pending = [*known, trial(9, 0.5, None, state="open")]
+    assert standing(pending, 50.0, left=1).uncovered is None
+    # Neither where the budget does not suffice, nor where the bound is too high, is an execution spent on it.
+    assert standing(known, 50.0, left=0).uncovered is None
+    assert standing(known, max(t.distance or 0.0 for t in known) * 1.0001, left=1).uncovered is None
 
 
 def test_a_reason_does_not_round_its_comparison_away() -> None:

@@ -18,7 +18,7 @@ from ctxval.surrogate import Surrogate, fit_surrogate
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
 from ctxval.validation import require_execution
-from ctxval.verdict import CONFIDENCE, Verdict, judge
+from ctxval.verdict import CONFIDENCE, Verdict, judge, require_threshold, standing
 from ctxval.workers import Crew, Ended, crew
 
 __all__ = ["Campaign", "OpenTrial"]
@@ -125,17 +125,64 @@ class Campaign(Ledger):
                 executed is stored; running again goes on behind the trial that failed.
             CampaignError: the workers are gone.
         """
+
+        def chosen() -> OpenTrial | None:
+            return None if until is not None and until(self) else self._open(None, attempts=1)
+
+        hands = self._crew(workers, executor, timeout)
+        return self._carry_out(self._within(budget, chosen), hands, on_trial, _Patience(retries, retry_failures))
+
+    def run_until_decided(
+        self,
+        threshold: float,
+        budget: int,
+        on_trial: Callable[[Trial], None] | None = None,
+        *,
+        confidence: float = CONFIDENCE,
+        stochastic: bool = False,
+        resolution: float = RESOLUTION,
+        workers: int | None = None,
+        executor: cf.Executor | None = None,
+        timeout: float | None = None,
+    ) -> Campaign:
+        """Execute until the verdict on a threshold is reached, or the budget is spent.
+
+        Where the posterior bound keeps the threshold, and only tasks that nothing came near to stand in the way, those
+        are executed, as long as the budget suffices for all of them; otherwise what the search chooses.
+
+        Args:
+            threshold: tau, in the distance's units.
+            budget: total number of executions of S, at most.
+            on_trial: called with each trial that has ended.
+            confidence, stochastic, resolution: as in :meth:`verdict`.
+            workers, executor, timeout: as in :meth:`run`.
+
+        Raises:
+            InputError, ModelError, DesignError, DistanceError, CampaignError: as :meth:`run` does.
+            CertificateError: the confidence is not a probability.
+        """
+        tau = require_threshold(threshold)
+
+        def chosen() -> OpenTrial | None:
+            left = budget - self.executions
+            now = standing(self.trials, tau, left, confidence, stochastic=stochastic, resolution=resolution)
+            if now.decided:
+                return None
+            return self._open(None if now.uncovered is None else (now.uncovered, "covering"), attempts=1)
+
+        hands = self._crew(workers, executor, timeout)
+        return self._carry_out(self._within(budget, chosen), hands, on_trial, _Patience())
+
+    def _within(self, budget: int, chosen: Callable[[], OpenTrial | None]) -> Callable[[int], OpenTrial | None]:
+        """Return what is wanted, given how many executions are running: what was interrupted, then what is chosen."""
         _require_count("budget must be a positive integer", budget)
 
         def wanted(running: int) -> OpenTrial | None:
             if self.executions + running >= budget:
                 return None
-            if self._again:
-                return self._reopen(self._again.popleft())
-            return None if until is not None and until(self) else self._open(None, attempts=1)
+            return self._reopen(self._again.popleft()) if self._again else chosen()
 
-        hands = self._crew(workers, executor, timeout)
-        return self._carry_out(wanted, hands, on_trial, _Patience(retries, retry_failures))
+        return wanted
 
     def audit(
         self,

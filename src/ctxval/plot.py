@@ -85,10 +85,12 @@ def _draw_slice(axes: Axes, campaign: Campaign, fitted: Surrogate, worst: Trial,
 def _draw_samples(axes: Axes, campaign: Campaign, axis: int) -> None:
     space = campaign.validation.space
     styles = (
-        ("initial samples", [t for t in campaign.completed if t.origin != "acquisition"], "white"),
-        ("acquired samples", [t for t in campaign.completed if t.origin == "acquisition"], _BLACK),
+        ("initial samples", ("iid", "initial", "manual"), "white"),
+        ("covering samples", ("covering",), _GREY),
+        ("acquired samples", ("acquisition",), _BLACK),
     )
-    for label, trials, face in styles:
+    for label, origins, face in styles:
+        trials = [trial for trial in campaign.completed if trial.origin in origins]
         if trials:
             x = [space.from_unit(trial.unit_point)[axis] for trial in trials]
             y = [_known(trial) for trial in trials]

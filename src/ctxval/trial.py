@@ -8,7 +8,7 @@ from typing import Any, Literal
 from ctxval.arrays import Array
 from ctxval.space import Point
 
-Origin = Literal["iid", "initial", "acquisition", "manual"]
+Origin = Literal["iid", "initial", "acquisition", "covering", "manual"]
 """Why a trial was chosen. Only iid trials enter a scenario bound."""
 
 State = Literal["open", "completed", "failed"]
@@ -20,7 +20,7 @@ class Trial:
 
     Attributes:
         number: from 0, in the order of asking.
-        origin: why it was chosen: iid, initial, acquisition or manual.
+        origin: why it was chosen: iid, initial, acquisition, covering (nothing had come near to it) or manual.
         state: open, completed or failed.
         unit_point: p in the unit cube, shape ``(d,)``.
         parameters: p by name.

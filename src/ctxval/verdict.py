@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from ctxval.arrays import Array
 from ctxval.certificates import (
     RESOLUTION,
     Certificate,
@@ -15,9 +16,10 @@ from ctxval.certificates import (
     Maxima,
     Sample,
     certify_posterior,
+    covering,
     draw_maxima,
-    farthest_task,
     forecast,
+    instantaneous_bound,
 )
 from ctxval.certificates.base import at_most, require_probability
 from ctxval.errors import CertificateError, InputError
@@ -171,15 +173,36 @@ def _with_forecast(verdict: Verdict, sample: Sample, drawn: Maxima, confidence: 
     return Verdict("undecided", verdict.threshold, reason, certificate=verdict.certificate, expected=expected)
 
 
-def is_decided(
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """How far a campaign is from its verdict.
+
+    Attributes:
+        decided: whether it is reached, or will be if what is being executed shows nothing new.
+        uncovered: the point of the unit cube ``(d,)`` to execute where the bound keeps the threshold, and only tasks
+            that nothing came near to stand in the way.
+    """
+
+    decided: bool = False
+    uncovered: Array | None = None
+
+
+def standing(
     trials: Sequence[Trial],
     threshold: float,
+    left: int,
     confidence: float = CONFIDENCE,
     *,
     stochastic: bool = False,
     resolution: float = RESOLUTION,
-) -> bool:
-    """Return whether the verdict is reached, for less than it costs where it is far away.
+) -> Standing:
+    """Return whether the verdict is reached, for less than it costs where it is far away, and what else is missing.
+
+    Args:
+        trials: all of them; what is open is not waited for.
+        threshold: tau, in the distance's units.
+        left: how many more executions there can be.
+        confidence, stochastic, resolution: as of :func:`judge`.
 
     Raises:
         InputError: the threshold is not a positive number.
@@ -187,15 +210,24 @@ def is_decided(
     """
     require_probability("confidence", confidence)
     if counterexample(trials, threshold) is not None:
-        return True
+        return Standing(decided=True)
     try:
-        sample = Sample.of(trials)
-        if farthest_task(sample.points) > resolution:
-            return False
-        # A quarter of the draws already tell most of the times that the bound is too high.
-        coarse = draw_maxima(sample, draws=32, stochastic=stochastic)
-        if coarse.probability(threshold) < confidence - 0.05:
-            return False
-        return certify_posterior(sample, confidence, stochastic=stochastic, resolution=resolution).covers(threshold)
+        sample = Sample.of([trial for trial in trials if trial.state != "open"])
+        missing = covering(np.array([trial.unit_point for trial in trials]), resolution, left)
+        if missing is None or _surely_too_high(sample, threshold, confidence, stochastic):
+            return Standing()
+        if len(missing):
+            return Standing(uncovered=missing[0])
+        # The open trials count as near to their tasks, so coverage is no doubt here any more.
+        certificate = certify_posterior(sample, confidence, stochastic=stochastic, resolution=1.0)
+        return Standing(decided=certificate.covers(threshold))
     except CertificateError:
-        return False
+        return Standing()
+
+
+def _surely_too_high(sample: Sample, threshold: float, confidence: float, stochastic: bool) -> bool:
+    """Return whether the posterior bound is above the threshold, by what costs less and nearly always tells."""
+    instantaneous = None if stochastic else instantaneous_bound(sample)
+    if instantaneous is not None and instantaneous["max_ucb"] > threshold:
+        return True
+    return draw_maxima(sample, draws=32, stochastic=stochastic).probability(threshold) < confidence - 0.05

@@ -2,10 +2,11 @@
 
 from ctxval.certificates.base import Certificate, Sample
 from ctxval.certificates.convergence import TheoremConstants, certify_convergence, rate
-from ctxval.certificates.diagnostics import RESOLUTION, Diagnosis, diagnose, farthest_task
+from ctxval.certificates.covering import RESOLUTION, covering, farthest_task
+from ctxval.certificates.diagnostics import Diagnosis, diagnose
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.named import KINDS, Options, certify, require_possible
-from ctxval.certificates.posterior import Maxima, certify_posterior, draw_maxima
+from ctxval.certificates.posterior import Maxima, certify_posterior, draw_maxima, instantaneous_bound
 from ctxval.certificates.scenario import certify_audit, certify_scenario, samples_needed, tail, volume_bound
 
 __all__ = [
@@ -23,10 +24,12 @@ __all__ = [
     "certify_convergence",
     "certify_posterior",
     "certify_scenario",
+    "covering",
     "diagnose",
     "draw_maxima",
     "farthest_task",
     "forecast",
+    "instantaneous_bound",
     "rate",
     "require_possible",
     "samples_needed",

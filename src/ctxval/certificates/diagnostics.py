@@ -13,20 +13,17 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
-from scipy.spatial import KDTree
 from scipy.special import ndtri, stdtr
 
 from ctxval.arrays import Array
+from ctxval.certificates.covering import RESOLUTION, covering, farthest_task
 from ctxval.hyperposterior import Conditioned
 
 LEVEL = 0.01
 """How unlikely a surprise must be for the bound to be withdrawn."""
 
-RESOLUTION = 0.25
-"""How far from every trial a task may be, in diagonals of the task space, unless the user states more; what lies
-farther away may be unlike anything that was seen (docs/calibration.md)."""
-
-_PROBES = 8192
+_MOST = 100
+"""Executions up to which it is told how many would cover the tasks."""
 
 
 @dataclass(frozen=True)
@@ -74,21 +71,19 @@ def diagnose(
             "trials before it predict: the distance is not what the process takes it for, and the bound is withdrawn"
         )
     elif farthest > resolution:
-        doubt = (
-            f"some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the "
-            f"{resolution:g} within which the distance is taken to be like what was seen, and the bound is withdrawn; "
-            "execute tasks there, audit, or state a larger resolution"
-        )
+        doubt = _uncovered(X, farthest, resolution)
     return Diagnosis(surprise, worst + 2, left_out, farthest, doubt)
 
 
-def farthest_task(X: Array) -> float:
-    """Return how far a point of the cube is from ``(n, d)`` at most, in diagonals, by many random ones and corners."""
-    d = X.shape[1]
-    rng = np.random.default_rng(0)
-    corners = rng.integers(0, 2, (_PROBES, d)).astype(np.float64)
-    distances, _ = KDTree(X).query(np.concatenate([rng.random((_PROBES, d)), corners]))
-    return float(distances.max() / np.sqrt(d))
+def _uncovered(X: Array, farthest: float, resolution: float) -> str:
+    missing = covering(X, resolution, _MOST)
+    many = f"more than {_MOST}" if missing is None else f"{len(missing)}"
+    return (
+        f"some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the "
+        f"{resolution:g} within which the distance is taken to be like what was seen, and the bound is withdrawn; "
+        f"{many} more executions would come near to every task (--until-decided), or audit, or state a larger "
+        "resolution"
+    )
 
 
 def _exceedances(conditioned: Conditioned) -> Array:

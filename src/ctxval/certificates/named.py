@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ctxval.certificates.base import Certificate, Sample
 from ctxval.certificates.convergence import TheoremConstants, certify_convergence, require_iterations
-from ctxval.certificates.diagnostics import RESOLUTION
+from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.posterior import certify_posterior
 from ctxval.certificates.scenario import certify_audit, certify_scenario
 from ctxval.errors import CertificateError, UnknownNameError

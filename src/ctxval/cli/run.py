@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,7 +33,7 @@ from ctxval.config import Settings, read_settings
 from ctxval.errors import InputError
 from ctxval.experiment import Experiment
 from ctxval.truth import Truth
-from ctxval.verdict import Verdict, is_decided, require_threshold
+from ctxval.verdict import Verdict, require_threshold
 
 
 @app.command()
@@ -77,9 +78,9 @@ def run(
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path)
     total = experiment.budget if settings.budget is None else settings.budget
-    until = _decided(limit, settings) if until_decided else None
+    execute = _until_decided(campaign, limit, settings) if until_decided else campaign.run
     with hands(workers, dask, timeout) as given_hands, progress(campaign, total, show=not as_json) as on_trial:
-        campaign.run(total, on_trial, until=until, **given_hands)
+        execute(budget=total, on_trial=on_trial, **given_hands)
     known = _truth(experiment) if truth else None
     verdict = None if limit is None else decide(campaign, limit, settings.confidence, settings.certificate)
     report = _report(campaign, experiment, settings, total, path, verdict, known)
@@ -89,14 +90,18 @@ def run(
     return report, FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
 
-def _decided(threshold: float | None, settings: Settings) -> Callable[[Campaign], bool]:
+def _until_decided(campaign: Campaign, threshold: float | None, settings: Settings) -> Callable[..., Campaign]:
     if threshold is None:
         raise InputError("--until-decided needs a threshold to decide about; say --threshold.")
-    if settings.certificate.kind != "posterior":
-        raise InputError(f"--until-decided needs the posterior bound, got {settings.certificate.kind!r}.")
     table = settings.certificate
-    return lambda campaign: is_decided(
-        campaign.trials, threshold, settings.confidence, stochastic=table.stochastic, resolution=table.resolution
+    if table.kind != "posterior":
+        raise InputError(f"--until-decided needs the posterior bound, got {table.kind!r}.")
+    return functools.partial(
+        campaign.run_until_decided,
+        threshold,
+        confidence=settings.confidence,
+        stochastic=table.stochastic,
+        resolution=table.resolution,
     )
 
 
