@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -305,8 +305,9 @@ def all_of(
 ) -> Iterator[tuple[Asked, dict[str, Any]]]:
     """Yield campaigns with their results as they end, and say how many have."""
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for done, pair in enumerate(zip(runs, pool.map(campaign, runs), strict=True), start=1):
-            yield pair
+        asked = {pool.submit(campaign, run): run for run in runs}
+        for done, ended in enumerate(as_completed(asked), start=1):
+            yield asked[ended], ended.result()
             print(f"\r{done}/{len(runs)}", end="", flush=True)
     print()
 

@@ -22,7 +22,7 @@ from ctxval.store import Store
 from ctxval.validation import Validation
 from ctxval.verdict import CONFIDENCE
 
-DEFAULT_SEARCH = "gp-ucb"
+DEFAULT_SEARCH = "auto"
 
 
 class SearchTable(BaseModel):

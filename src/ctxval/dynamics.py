@@ -1,14 +1,12 @@
-"""Residual dynamics learned from executions, and the distance that they predict.
+"""Residual dynamics learned from executions.
 
 An execution shows a whole trajectory of transitions (x, u, x'). From them ``r(x, u) = x' - M(x, u)`` is learned, and
-``M_hat = M + r`` is a model again; wrapped as a simulated system it is a system again. So the predicted distance at p
-is the ordinary validation of M against M_hat, which designs the controller at every p and sees where that jumps.
+``M_hat = M + r`` is a model again.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,23 +16,14 @@ from scipy.spatial.distance import cdist
 
 from ctxval import kernels
 from ctxval.arrays import Array, Rows, single_threaded
-from ctxval.distance import ComposedDistance
 from ctxval.model import Model
 from ctxval.models.scaling import spread, standardised_pairs
-from ctxval.rollout import rollout
-from ctxval.searches import Prediction
-from ctxval.searches.vector import predict_composed
 from ctxval.trajectory import Trajectory, Transitions
-from ctxval.validation import Validation
 
-_CENTRES, _WORK = 450, 30_000
-"""Transitions that the residual is conditioned on at most, and their number times the horizon: the time of a loop."""
+_CENTRES = 450
+"""Transitions that the residual is conditioned on at most."""
 _LEARNED_FROM = 120
 """Transitions that its hyperparameters are learned from."""
-_POOL, _DATA = 3000, 600
-"""Transitions of executions that these are chosen from, and of the model's own data: those nearest to the tasks."""
-_LOOPS, _SLOW_LOOPS = 64, 3
-"""Closed loops on M that show which transitions the tasks need, and how often one is tried where batches fail."""
 _MUCH_BETTER = 0.7
 """What is learned without M must have this share of the error, at most, to be preferred."""
 _NEGLIGIBLE = 1e-7
@@ -43,8 +32,6 @@ _ABSURD = 1e100
 """What is larger has diverged, and squares of it would not be finite."""
 _REACH = 5.0
 """No residual is believed beyond this many times the largest one recorded."""
-_DESIGNS, _SLOW_DESIGNS = 2000, 150
-"""Designs for one suggestion, where the synthesizer takes batches and where not."""
 _LOOKS = 12
 """Moments of a predicted trajectory at which its familiarity is judged."""
 _NOISE = (1e-9, 0.1)
@@ -296,143 +283,3 @@ def learn_corrected(model: Model, transitions: Transitions, sources: Rows, centr
         if of_steps is not None and of_steps.typical_error() < _MUCH_BETTER * of_model.typical_error():
             return CorrectedModel(Staying(), of_steps)
     return CorrectedModel(model, of_model)
-
-
-def predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
-    """Return what the executions so far, and the data that the model came with, let one expect of d at other points.
-
-    None where nothing was recorded, where M is not wrong in it, or where no task can be planned. Where the distance is
-    composed of a short vector, such as the error of the final state, the prediction names another to turn to, that of
-    the vectors as functions of p: what no function of state and input explains may still be one of p.
-
-    Args:
-        validation: the map p -> d(p).
-        executed: points of the unit cube ``(d,)`` with the system's trajectories there.
-    """
-    otherwise = functools.partial(_predict_vectors, validation, executed)
-    with single_threaded():
-        found = _predict_distance(validation, executed)
-        return otherwise() if found is None else replace(found, otherwise=otherwise)
-
-
-def _predict_vectors(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
-    """Return what the vectors that distances are composed of let one expect; None where they are not."""
-    distance = validation.distance
-    if not isinstance(distance, ComposedDistance) or len(executed) < 2:
-        return None
-    try:
-        errors = np.array([_vector(validation, distance, *pair) for pair in executed])
-    except Exception:  # the user's own parts; they work where S was executed, but a distance may still object
-        return None
-    if errors.ndim != 2 or not np.isfinite(errors).all():
-        return None
-    return predict_composed(np.array([point for point, _ in executed]), errors, distance.compose)
-
-
-def _vector(validation: Validation, distance: ComposedDistance, point: Array, trajectory: Trajectory) -> Array:
-    plan = validation.plan(validation.space.from_unit(point))
-    return distance.error(plan.model_trajectory, trajectory, plan.task)
-
-
-def _predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
-    loops = _closed_loops_on_model(validation)
-    if loops is None:
-        return None
-    parts = [trajectory.transitions() for _, trajectory in executed]
-    sources = [np.full(len(part), k) for k, part in enumerate(parts)]
-    data = getattr(validation.model, "data", None)
-    if isinstance(data, Transitions) and len(data):
-        parts.append(_nearest(data, loops))
-        sources.append(np.full(len(parts[-1]), -1))
-    if not parts:
-        return None
-    together, of = Transitions.joined(parts), np.concatenate(sources)
-    if len(of) > _POOL:
-        kept = np.sort(np.random.default_rng(len(of)).permutation(len(of))[:_POOL])
-        together, of = Transitions(together.x[kept], together.u[kept], together.x_next[kept]), of[kept]
-    centres = int(np.clip(_WORK // loops.horizon, 100, _CENTRES))
-    corrected = learn_corrected(validation.model, together, of, centres)
-    if corrected is None:
-        return None
-    batched = bool(loops.batch_shape)
-    forecast = _Forecast(validation, corrected, batched, executed)
-    return Prediction(forecast, forecast.left_out, _DESIGNS if batched else _SLOW_DESIGNS)
-
-
-def _closed_loops_on_model(validation: Validation) -> Trajectory | None:
-    """Return what M promises for some tasks: a batch, or one task where there can be no batch; None for none at all."""
-    space = validation.space
-    points = space.from_unit(np.random.default_rng(0).random((_LOOPS, space.dimension)))
-    batches = [points] if getattr(validation.synthesizer, "batched", False) else []
-    for rows in [*batches, *points[:_SLOW_LOOPS]]:
-        try:
-            task = validation.task(space.parameters(rows))
-            loops = rollout(validation.model.step, validation.synthesizer.design(task, validation.model), task)
-        except Exception:  # the user's own parts, on tasks that nobody may ever ask for
-            continue
-        if loops.batch_shape == rows.shape[:-1]:
-            return loops
-    return None
-
-
-def _nearest(data: Transitions, loops: Trajectory) -> Transitions:
-    """Return the transitions that are nearest to where the tasks lead."""
-    if len(data) <= _DATA:
-        return data
-    needed = loops.transitions()
-    there = np.concatenate([needed.x, needed.u], axis=1)
-    there = there[np.isfinite(there).all(axis=1)][:: max(1, len(there) // _POOL)]
-    here = np.concatenate([data.x, data.u], axis=1)
-    if not len(there):
-        return data
-    scale = spread(here)
-    kept = np.sort(np.argsort(cdist(here / scale, there / scale).min(axis=1), kind="stable")[:_DATA])
-    return Transitions(data.x[kept], data.u[kept], data.x_next[kept])
-
-
-@dataclass(frozen=True, eq=False)
-class _Forecast:
-    """The validation of M against M_hat, in the unit cube."""
-
-    validation: Validation
-    corrected: CorrectedModel
-    batched: bool
-    executed: Sequence[tuple[Array, Trajectory]]
-
-    def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Return the predicted distances ``(m,)`` and how little of the predicted trajectories was seen, ``(m,)``."""
-        with single_threaded():
-            return self._looped(points, self.corrected)
-
-    def left_out(self, rows: Rows) -> Array:
-        """Return the distances predicted at executed points, each from all other executions, ``(k,)``."""
-        with single_threaded():
-            return np.array([self._looped(self.executed[k][0][None], self._without(k))[0][0] for k in rows.tolist()])
-
-    def _without(self, source: int) -> CorrectedModel:
-        return CorrectedModel(self.corrected.model, self.corrected.residual.without(source))
-
-    def _looped(self, points: Array, corrected: CorrectedModel) -> tuple[Array, Array]:
-        """Halve what fails, so that a task without a prediction, NaN, costs the others nothing."""
-        if self.batched or len(points) == 1:
-            try:
-                return self._closed_loops(points, corrected)
-            except Exception:  # a task, a synthesizer or a distance of the user's, on points that nobody may ever run
-                if len(points) == 1:
-                    return np.array([np.nan]), np.array([np.nan])
-        half = len(points) // 2
-        parts = [self._looped(part, corrected) for part in (points[:half], points[half:])]
-        return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-
-    def _closed_loops(self, points: Array, corrected: CorrectedModel) -> tuple[Array, Array]:
-        parts, space = self.validation, self.validation.space
-        rows = points if self.batched else points[0]
-        task = parts.task(space.parameters(space.from_unit(rows)))
-        controller = parts.synthesizer.design(task, parts.model)
-        promised = rollout(parts.model.step, controller, task)
-        predicted = rollout(corrected.step, controller, task)
-        with np.errstate(all="ignore"):
-            distance = np.reshape(parts.distance(promised, predicted, task), len(points))
-            doubt = np.reshape(corrected.residual.unfamiliarity(predicted), len(points))
-        finite = np.isfinite(distance) & np.isfinite(doubt)
-        return np.where(finite, distance, np.nan), np.where(finite, doubt, np.nan)

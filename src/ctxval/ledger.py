@@ -11,8 +11,8 @@ import numpy as np
 
 from ctxval.arrays import Array
 from ctxval.describe import describe
-from ctxval.dynamics import predict_distance
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError
+from ctxval.prediction import predict_distance
 from ctxval.recording import kept_beside, known_distance, require_one_result, require_recording, same_run
 from ctxval.searches import GPUCB, Prediction, Search
 from ctxval.store import Store

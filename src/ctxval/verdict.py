@@ -25,6 +25,9 @@ from ctxval.certificates.base import at_most, require_probability
 from ctxval.errors import CertificateError, InputError
 from ctxval.trial import Trial
 
+_GLANCES = ((8, 0.3), (32, 0.05))
+"""Draws of d* that tell whether all of them are worth their cost, and by how much their probability may be wrong."""
+
 Answer = Literal["validated", "falsified", "undecided"]
 
 CONFIDENCE = 0.95
@@ -230,4 +233,7 @@ def _surely_too_high(sample: Sample, threshold: float, confidence: float, stocha
     instantaneous = None if stochastic else instantaneous_bound(sample)
     if instantaneous is not None and instantaneous["max_ucb"] > threshold:
         return True
-    return draw_maxima(sample, draws=32, stochastic=stochastic).probability(threshold) < confidence - 0.05
+    return any(
+        draw_maxima(sample, draws=draws, stochastic=stochastic).probability(threshold) < confidence - margin
+        for draws, margin in _GLANCES
+    )
