@@ -49,10 +49,22 @@ class Campaign(Ledger):
 
     @property
     def estimate(self) -> float | None:
-        """The search's estimate of d*: the largest distance, after discarding where the search discards (SD)."""
+        """The search's estimate of d*: the largest distance, after discarding where the search discards (SD).
+
+        Where the search repeats its tasks, the largest mean distance of a task that was executed that often.
+        """
+        ordered = sorted(self._heights(), reverse=True)
         discard = getattr(self.search, "discard", 0)
-        ordered = sorted((_distance(trial) for trial in self.completed), reverse=True)
         return ordered[discard] if len(ordered) > discard else None
+
+    def _heights(self) -> list[float]:
+        times = getattr(self.search, "times", 1)
+        if times == 1:
+            return [_distance(trial) for trial in self.completed]
+        tasks: dict[bytes, list[float]] = {}
+        for trial in self.completed:
+            tasks.setdefault(trial.unit_point.tobytes(), []).append(_distance(trial))
+        return [float(np.mean(found)) for found in tasks.values() if len(found) >= times]
 
     def verdict(
         self,

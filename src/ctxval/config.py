@@ -26,11 +26,17 @@ DEFAULT_SEARCH = "auto"
 
 
 class SearchTable(BaseModel):
-    """The table ``[search]``: a name, and the options of that search."""
+    """The table ``[search]``: a name, and the options of that search.
+
+    Attributes:
+        name: of the search.
+        repeats: how often each task is executed, of a noisy system.
+    """
 
     model_config = ConfigDict(extra="allow")
 
     name: str = DEFAULT_SEARCH
+    repeats: int = Field(default=1, ge=1)
 
     def build(self) -> Search:
         """Return the search.
@@ -42,7 +48,7 @@ class SearchTable(BaseModel):
         options = {key: argument(value) for key, value in (self.model_extra or {}).items()}
         if self.name in SEARCHES:
             options = require_types(f"search {self.name!r}", SEARCHES[self.name], options)
-        return by_name(self.name, **options)
+        return by_name(self.name, repeats=self.repeats, **options)
 
 
 class CertificateTable(BaseModel):

@@ -7,6 +7,7 @@ An execution shows a whole trajectory of transitions (x, u, x'). From them ``r(x
 from __future__ import annotations
 
 import functools
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -133,12 +134,13 @@ class Residual:
         left_out = self._weights / (self._inverse_factor**2).sum(axis=0)[:, None]
         return self.unit * float(np.median(np.sqrt((left_out**2).mean(axis=1))))
 
-    def without(self, source: int) -> Residual:
-        """Return the residual as it is without one execution."""
-        known = (self.centres, self.outputs, self.sources)
-        both = known if self.spare is None else [np.concatenate(pair) for pair in zip(known, self.spare, strict=True)]
-        kept = [part[both[2] != source] for part in both]
-        return replace(self, centres=kept[0], outputs=kept[1], sources=kept[2], spare=None)
+    def without(self, sources: Collection[int]) -> Residual:
+        """Return the residual as it is without some executions."""
+        spare = () if self.spare is None else (self.spare,)
+        parts = zip((self.centres, self.outputs, self.sources), *spare, strict=True)
+        centres, outputs, of = (np.concatenate(part) for part in parts)
+        kept = ~np.isin(of, list(sources))
+        return replace(self, centres=centres[kept], outputs=outputs[kept], sources=of[kept], spare=None)
 
 
 def _parts(theta: Array) -> tuple[float, Array, float, float]:

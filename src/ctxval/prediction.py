@@ -158,12 +158,14 @@ class _Forecast:
             return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
     def left_out(self, rows: Rows) -> Array:
-        """Return the distances predicted at executed points, each from all other executions, ``(k,)``."""
+        """Return the distances predicted at executed points, each from the executions of other points, ``(k,)``."""
+        points = [self.executed[k][0] for k in rows.tolist()]
         with single_threaded():
-            return np.array([self._looped(self.executed[k][0][None], self._without(k))[0][0] for k in rows.tolist()])
+            return np.array([self._looped(point[None], self._without(point))[0][0] for point in points])
 
-    def _without(self, source: int) -> CorrectedModel:
-        return CorrectedModel(self.corrected.model, self.corrected.residual.without(source))
+    def _without(self, point: Array) -> CorrectedModel:
+        there = [source for source, (other, _) in enumerate(self.executed) if np.array_equal(other, point)]
+        return CorrectedModel(self.corrected.model, self.corrected.residual.without(there))
 
     def _looped(self, points: Array, corrected: CorrectedModel) -> tuple[Array, Array]:
         """Halve what fails, so that a task without a prediction, NaN, costs the others nothing."""

@@ -12,6 +12,7 @@ from ctxval.searches.climbs import Climbs
 from ctxval.searches.cma_es import CMAES
 from ctxval.searches.gp_ucb import GPUCB
 from ctxval.searches.random import Random, SamplingDiscarding
+from ctxval.searches.repeated import Repeated
 from ctxval.searches.scalar import Scalar
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "Note",
     "Prediction",
     "Random",
+    "Repeated",
     "SamplingDiscarding",
     "Scalar",
     "Search",
@@ -44,8 +46,13 @@ NAMES: dict[str, type[Any]] = {
 """The searches that the command line and experiment files know."""
 
 
-def by_name(name: str, **options: Any) -> Search:
+def by_name(name: str, *, repeats: int = 1, **options: Any) -> Search:
     """Return a new search from its name and its options.
+
+    Args:
+        name: of ``NAMES``.
+        repeats: how often each point is evaluated, of a noisy function.
+        options: of the search.
 
     Raises:
         UnknownNameError: there is no such search; the message has the nearest name.
@@ -57,4 +64,4 @@ def by_name(name: str, **options: Any) -> Search:
         search: Search = NAMES[name](**options)
     except TypeError as error:
         raise InputError(f"search {name!r}: {error}.") from error
-    return search
+    return search if repeats == 1 else Repeated(search, repeats)

@@ -1,0 +1,115 @@
+"""Noisy systems: every task is executed some times, and what is searched is the mean distance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ctxval.arrays import Array, Rows
+from ctxval.errors import InputError
+from ctxval.searches.base import Note, Prediction, Search, SequentialSearch
+
+
+@dataclass(frozen=True, eq=False)
+class _Means:
+    """The points of a history, each once, in the order of their first evaluation.
+
+    Attributes:
+        points: shape ``(k, d)``.
+        values: means of what is known there, ``(k,)``; NaN where nothing is.
+        counts: how many evaluations each has, pending and failed ones too, ``(k,)``.
+        first: row of the first evaluation in the history, ``(k,)``.
+        evaluated: row of the first known value among all known ones, ``(k,)``; meaningless where nothing is known.
+        last: which of them was evaluated last.
+    """
+
+    points: Array
+    values: Array
+    counts: Rows
+    first: Rows
+    evaluated: Rows
+    last: int
+
+    @classmethod
+    def of(cls, points: Array, values: Array) -> _Means:
+        rows: dict[bytes, list[int]] = {}
+        for row, point in enumerate(points):
+            rows.setdefault((point + 0.0).tobytes(), []).append(row)
+        groups = [np.array(group) for group in rows.values()]
+        known = np.isfinite(values)
+        order = np.cumsum(known) - 1
+        known_rows = [group[known[group]] for group in groups]
+        return cls(
+            points[[group[0] for group in groups]],
+            np.array([values[found].mean() if len(found) else np.nan for found in known_rows]),
+            np.array([len(group) for group in groups]),
+            np.array([group[0] for group in groups]),
+            np.array([order[found[0]] if len(found) else -1 for found in known_rows]),
+            next(k for k, group in enumerate(groups) if group[-1] == len(points) - 1),
+        )
+
+
+class Repeated(SequentialSearch):
+    """A search for the largest mean value of a noisy function: each point that it asks for is evaluated some times.
+
+    A point that somebody else chose is repeated as well, where it was evaluated last.
+
+    Args:
+        search: chooses the points; it is told the mean of what is known at each.
+        times: how often each is evaluated.
+
+    Raises:
+        InputError: the search is none, or the number is not positive.
+    """
+
+    def __init__(self, search: Search, times: int = 3) -> None:
+        if not isinstance(search, Search):
+            raise InputError(f"search must have reset, ask and tell, got {search!r}.")
+        if times < 1:
+            raise InputError(f"each point must be evaluated at least once, got times = {times}.")
+        self.search = search
+        self.times = times
+        self.initial = times * getattr(search, "initial", 0)
+        self.discard = getattr(search, "discard", 0)
+
+    def reset(self, dimension: int, seed: int) -> None:
+        """Forget everything and start on the unit cube of this dimension."""
+        super().reset(dimension, seed)
+        self._prediction: Prediction | None = None
+
+    def use_prediction(self, prediction: Prediction | None) -> None:
+        """Take what is expected before the next question, for the search that chooses the points."""
+        self._prediction = prediction
+
+    def propose(self, rng: np.random.Generator) -> Array:
+        """Return the last point as long as it was not evaluated often enough, then another."""
+        self.search.reset(self.dimension, self._seed)
+        if len(self.points):
+            means = _Means.of(self.points, self.values)
+            if means.counts[means.last] < self.times:
+                return np.asarray(means.points[means.last])
+            self._tell(means)
+        point = np.asarray(self.search.ask(1)[0])
+        self._thought = self.search.note() if hasattr(self.search, "note") else None
+        return point
+
+    def _tell(self, means: _Means) -> None:
+        self.search.tell(means.points, means.values)
+        if hasattr(self.search, "remember"):
+            notes: list[Note | None] = [self.notes[row] for row in means.first.tolist()]
+            self.search.remember(notes)
+        if hasattr(self.search, "use_prediction"):
+            known = means.evaluated[np.isfinite(means.values)]
+            self.search.use_prediction(None if self._prediction is None else _by_point(self._prediction, known))
+
+
+def _by_point(prediction: Prediction, evaluated: Rows) -> Prediction:
+    """Return a prediction whose rows are those of points, each with one of its evaluations."""
+    otherwise = prediction.otherwise
+
+    def turn_to() -> Prediction | None:
+        found = None if otherwise is None else otherwise()
+        return None if found is None else _by_point(found, evaluated)
+
+    return replace(prediction, left_out=lambda rows: prediction.left_out(evaluated[rows]), otherwise=turn_to)
