@@ -1,6 +1,7 @@
 """How often each fault was inflicted, and what came of it. Writes docs/reliability.md, from the stored counts alone.
 
-``python benchmarks/reliability.py --kills 100 --worker-kills 50 --flips 2000 --cuts 200`` adds to the counts.
+``python benchmarks/reliability.py --kills 100 --worker-kills 50 --command-kills 50 --scheduler-kills 10 --flips 2000
+--cuts 200`` adds to the counts.
 """
 
 from __future__ import annotations
@@ -8,24 +9,30 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import multiprocessing
 import os
+import shutil
 import signal
 import sys
 import tempfile
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
+import rig_cluster  # noqa: E402
+import rig_command  # noqa: E402
 from conftest import make_validation  # noqa: E402
 from ctxval import Campaign, Store, searches  # noqa: E402
 from ctxval.salvage import salvage  # noqa: E402
 from rig_workers import campaign as logged  # noqa: E402
 from test_faults import check_damaged, everything  # noqa: E402
-from test_kill import BUDGET, content, killed_and_resumed, start  # noqa: E402
+from test_kill import BUDGET, content, resumed  # noqa: E402
 from test_workers import start as start_workers  # noqa: E402
 from test_workers import until  # noqa: E402
 
@@ -36,6 +43,8 @@ FAULTS = {
     "kill": "`kill -9` of the campaign, one worker, at a random instant",
     "kill workers": "`kill -9` of the campaign with three workers, at a random instant",
     "kill worker": "`kill -9` of one of three workers",
+    "kill scheduler": "`kill -9` of the Dask scheduler, resumed on another",
+    "kill command": "`kill -9` of the process of a `Subprocess` system, whose failures are repeated once",
     "flip": "1 to 3 bytes of the store changed",
     "cut": "the store cut at a random byte",
 }
@@ -43,22 +52,54 @@ COLUMNS = ("inflicted", "midway", "lost", "twice", "same end", "noticed", "harml
 
 
 def kills(count: int, folder: Path, seed: int) -> dict[str, int]:
-    """Kill a campaign of one worker; the resumed one must end bit for bit as the unbroken one."""
-    whole = folder / "whole.sqlite"
-    began = time.perf_counter()
-    assert start(whole).wait(timeout=300) == 0
-    duration, expected = time.perf_counter() - began, content(whole)
+    """Kill a campaign of one worker; the resumed one must end bit for bit as the unbroken one.
+
+    The campaign runs in a fork of this process, which has imported everything, and the instant is drawn over the time
+    that an unbroken one takes from then on: an interpreter that starts has nothing to lose yet.
+    """
+    durations = [_unbroken(folder / f"whole{number}.sqlite") for number in range(5)]
+    expected = content(folder / "whole0.sqlite")
     counts = dict.fromkeys(("inflicted", "midway", "lost", "same end"), 0)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([seed, 1])
     for number in range(count):
         store = folder / f"kill{number}.sqlite"
-        before, after = killed_and_resumed(store, rng.uniform(0, duration))
+        process = _forked(store)
+        time.sleep(rng.uniform(0, float(np.median(durations))))
+        process.kill()
+        process.join()
+        before, after = resumed(store)
         counts["inflicted"] += 1
         counts["midway"] += 0 < len(before) < BUDGET
         counts["lost"] += after[: len(before)] != before
         counts["same end"] += after == expected
         store.unlink()
     return counts
+
+
+def _unbroken(store: Path) -> float:
+    """Run a campaign to its end and return the seconds that it takes once it is ready."""
+    process = _forked(store)
+    began = time.perf_counter()
+    process.join()
+    assert process.exitcode == 0
+    return time.perf_counter() - began
+
+
+def _forked(store: Path) -> Any:
+    """Start a campaign in a process of its own, and wait until it is ready."""
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.get_context("fork").Process(target=_campaign, args=(store, theirs))
+    process.start()
+    theirs.close()
+    ours.recv_bytes()
+    ours.close()
+    return process
+
+
+def _campaign(store: Path, ready: Connection) -> None:
+    validation = make_validation()
+    ready.send_bytes(b"ready")
+    Campaign(validation, store=store, seed=11, name="killed").run(BUDGET)
 
 
 def worker_kills(count: int, folder: Path, seed: int, *, whole: bool) -> dict[str, int]:
@@ -85,6 +126,52 @@ def worker_kills(count: int, folder: Path, seed: int, *, whole: bool) -> dict[st
         counts["lost"] += any(trials[k].distance != d for k, d in before.items())
         counts["twice"] += len(trials) != 8
         counts["same end"] += {t.number: t.distance for t in trials} == expected
+    return counts
+
+
+def scheduler_kills(count: int, folder: Path, seed: int) -> dict[str, int]:
+    """Kill the Dask scheduler of a campaign, which is resumed on another scheduler."""
+    (folder / "plain").mkdir(exist_ok=True)
+    expected = {t.number: t.distance for t in logged(None, str(folder / "plain"), 0).run(12).trials}
+    counts = dict.fromkeys(("inflicted", "midway", "lost", "twice", "same end"), 0)
+    rng = np.random.default_rng([seed, 2])
+    for number in range(count):
+        place = folder / f"scheduler{number}"
+        place.mkdir()
+        status, stderr, before = rig_cluster.killed_and_resumed(place, int(rng.integers(1, 12)), rng.uniform(0, 0.2))
+        # One that has ended before its scheduler is killed has lost nothing.
+        assert status in (0, 3), stderr
+        assert "Traceback" not in stderr
+        trials = Store(place / "a.sqlite").trials()
+        counts["inflicted"] += 1
+        counts["midway"] += 0 < len(before) < 12
+        counts["lost"] += any(trials[k].distance != d for k, d in before.items())
+        counts["twice"] += len(trials) != 12
+        counts["same end"] += {t.number: t.distance for t in trials} == expected
+        shutil.rmtree(place)
+    return counts
+
+
+def command_kills(count: int, folder: Path, seed: int) -> dict[str, int]:
+    """Kill the process of a command in a campaign that repeats a failure once; it must end as the unbroken one."""
+    place = folder / "command"
+    place.mkdir()
+    expected = [trial.distance for trial in rig_command.campaign(place, seconds=0).run(8).trials]
+    counts = dict.fromkeys(("inflicted", "lost", "twice", "same end"), 0)
+    rng = np.random.default_rng([seed, 3])
+    while counts["inflicted"] < count:
+        shutil.rmtree(place)
+        place.mkdir()
+        campaign = rig_command.campaign(place, place / "a.sqlite", seconds=0.1)
+        thread = rig_command.killer(place, int(rng.integers(8)), rng.uniform(0, 0.12))
+        campaign.run(8, workers=2, retry_failures=1)
+        thread.join()
+        trials = Store(place / "a.sqlite").trials()
+        # A command that had ended already is no fault inflicted.
+        counts["inflicted"] += sum(trial.attempts for trial in trials) > 8
+        counts["lost"] += any(trial.state != "completed" for trial in trials)
+        counts["twice"] += len(trials) != 8
+        counts["same end"] += [trial.distance for trial in trials] == expected and any(t.attempts > 1 for t in trials)
     return counts
 
 
@@ -122,7 +209,8 @@ Faults inflicted on real processes and files, and what came of them. Written by 
 """
 
 TAIL = """
-- *midway*: some executions had been stored, and not all.
+- *midway*: some executions had been stored, and not all. The instants of the first row are drawn over the time that the
+  unbroken campaign takes, so that some fall before the first execution is stored, or after the last.
 - *lost*: a stored execution was gone or changed after the fault; *twice*: one was counted twice.
 - *same end*: the resumed campaign ended as the unbroken one did, bit for bit.
 - *noticed*: reading the store gave an error that says so; *harmless*: every trial and every trajectory was read as it
@@ -130,9 +218,9 @@ TAIL = """
 
 The tests inflict each of them too, fewer times, and besides: a store on a full disk and in a read-only folder, a clock
 that is set back, executions that hang, raise, return NaN, the wrong shape or a part of a trajectory, Ctrl-C once and
-twice, a Dask worker killed in a campaign, several terminals at once, random sequences of asking, telling, running and
-dying against a model of the store, and random bytes for every reader (`tests/test_faults.py`, `tests/test_workers.py`,
-`tests/test_hand.py`, `tests/test_kill.py`).
+twice, a Dask worker killed in a campaign, an FMU that crashes or hangs, several terminals at once, random sequences of
+asking, telling, running and dying against a model of the store, and random bytes for every reader
+(`tests/test_faults.py`, `tests/test_workers.py`, `tests/test_hand.py`, `tests/test_kill.py`, `tests/systems`).
 """
 
 
@@ -147,7 +235,7 @@ def page(results: dict[str, dict[str, int]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    for name in ("kills", "worker-kills", "flips", "cuts"):
+    for name in ("kills", "worker-kills", "scheduler-kills", "command-kills", "flips", "cuts"):
         parser.add_argument(f"--{name}", type=int, default=0)
     given = parser.parse_args()
     results: dict[str, dict[str, int]] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
@@ -159,6 +247,8 @@ def main() -> None:
             "cut": (given.cuts, lambda count: damage(count, folder, seed, cut=True)),
             "kill worker": (given.worker_kills, lambda count: worker_kills(count, folder, seed, whole=False)),
             "kill workers": (given.worker_kills, lambda count: worker_kills(count, folder, seed, whole=True)),
+            "kill scheduler": (given.scheduler_kills, lambda count: scheduler_kills(count, folder, seed)),
+            "kill command": (given.command_kills, lambda count: command_kills(count, folder, seed)),
             "kill": (given.kills, lambda count: kills(count, folder, seed)),
         }
         for fault, (count, inflict) in jobs.items():

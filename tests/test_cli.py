@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from conftest import make_validation
-from ctxval import Campaign
+from ctxval import Campaign, Store
 from ctxval.certificates import Maxima, Sample, draw_maxima
 from ctxval.cli import app
 from ctxval.searches import CMAES
@@ -60,9 +60,22 @@ def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-
     sys.modules.pop("rig", None)
 
     def run(*arguments: str) -> Result:
-        return CliRunner().invoke(app, list(arguments))
+        return CliRunner().invoke(app, quick(*arguments))
 
     return run
+
+
+def quick(*arguments: str) -> list[str]:
+    """Add the paper's search to what names none: what is tested here does not depend on it, and it costs least."""
+    named = arguments[:1] != ("run",) or "--search" in arguments or any(a.endswith(".toml") for a in arguments)
+    return [*arguments] if named else [*arguments, "--search", "gp-ucb"]
+
+
+def test_the_default_search_learns_from_trajectories(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = CliRunner().invoke(app, ["run", "rig:experiment", "--budget", "3", "--json"])
+    report = json.loads(result.stdout)
+    assert (report["search"], report["store"]) == ("auto", "runs/short-auto-seed0.sqlite")
+    assert Store(Path(report["store"])).trials()[-1].note["engine"] == "climb"  # type: ignore[index]
 
 
 def test_json_is_one_object_with_everything_asked_for(invoke) -> None:  # type: ignore[no-untyped-def]
@@ -218,7 +231,7 @@ def stored(folder: Path, *arguments: str) -> Path:
     before = Path.cwd()
     os.chdir(folder)
     try:
-        result = CliRunner().invoke(app, ["run", *arguments, "--json"])
+        result = CliRunner().invoke(app, quick("run", *arguments, "--json"))
         assert result.exit_code in (0, 1), result.stderr
         return folder / json.loads(result.stdout)["store"]
     finally:
@@ -255,8 +268,8 @@ def of_kind(campaigns: dict[str, Path], case: str, kind: str) -> list[str]:
 @pytest.mark.parametrize("case", ["pendulum", "linear"])
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_every_kind_certifies_stored_campaigns(invoke, campaigns: dict[str, Path], case: str, kind: str) -> None:  # type: ignore[no-untyped-def]
-    arguments = of_kind(campaigns, case, kind)
-    result = invoke(*arguments, "--threshold", "90", "--volume", "0.5", "--confidence", "0.9", "--json")
+    volume = () if kind in ("posterior", "convergence") else ("--volume", "0.5")
+    result = invoke(*of_kind(campaigns, case, kind), *volume, "--threshold", "90", "--confidence", "0.9", "--json")
     assert result.exit_code == 0, result.stderr
     report = json.loads(result.stdout)
     assert (report["kind"], report["confidence"], report["verdict"]) == (kind, 0.9, "validated")
@@ -339,6 +352,29 @@ def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: 
         (["--audit", "5", "--kind", "scenario"], "there are others; say --kind audit"),
         (["--audit", "5", "--kind", "sampling-discarding"], "how many to discard"),
         (["--audit", "5", "--kind", "convergence", "--constant", "1"], "no use for an audit"),
+        (
+            ["--kind", "scenario", "--constant", "3"],
+            "constant is for certificates of the kind convergence; the kind here is scenario",
+        ),
+        (
+            ["--discard", "2"],
+            "discard is for certificates of the kind sampling-discarding; the kind here is posterior",
+        ),
+        (
+            ["--kind", "audit", "--stochastic"],
+            "stochastic is for certificates of the kind posterior; the kind here is audit",
+        ),
+        (
+            ["--audit", "5", "--resolution", "1"],
+            "resolution is for certificates of the kind posterior; the kind here is audit",
+        ),
+        (["--kind", "scenario", "--theorem", "1,2,3,4,5"], "theorem is for certificates of the kind convergence"),
+        (
+            ["--volume", "0.1", "--threshold", "9"],
+            "volume is for certificates of the kind audit or scenario or sampling-discarding",
+        ),
+        (["--kind", "audit", "--volume", "0.1"], "may exceed a threshold; say --threshold too"),
+        (["--kind", "convergence", "--constant", "1", "--theorem", "1,2,3,4,5"], "only one can be given"),
         (["--confidence", "1e-300"], "the confidence must be strictly between 0 and 1"),
     ],
 )
@@ -351,6 +387,15 @@ def test_what_cannot_be_certified_is_one_sentence_and_costs_no_execution(  # typ
     assert sentence in result.stderr.replace("\n", " ")
     assert "Traceback" not in result.stderr
     assert result.stdout == ""
+    assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 12
+
+
+def test_an_audit_waits_for_what_people_are_executing(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
+    shutil.copy(campaigns["linear"], "a.sqlite")
+    assert invoke("ask", "a.sqlite").exit_code == 0
+    result = invoke("certify", "a.sqlite", "--audit", "3")
+    assert result.exit_code == 2
+    assert "trials are open: 12; tell how they ended before auditing" in result.stderr.replace("\n", " ")
     assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 12
 
 

@@ -59,7 +59,7 @@ def test_the_file_of_init_runs_as_it_is(invoke: Any) -> None:
     result = invoke("run", "experiment.toml", "--json")
     assert result.exit_code == 0, result.stderr
     report = json.loads(result.stdout)
-    assert (report["case"], report["executions"], report["units"]) == ("cart", 15, "m")
+    assert (report["case"], report["executions"], report["units"]) == ("cart", 25, "m")
     assert report["verdict"] == "validated"
     assert report["worst"]["distance"] > 0.01
     again = json.loads(invoke("run", "experiment.toml", "--json").stdout)
@@ -83,6 +83,7 @@ def test_init_overwrites_nothing(invoke: Any) -> None:
     before = Path("experiment.toml").read_bytes()
     assert "experiment.toml exists already" in sentence(invoke("init"))
     assert "must" not in invoke("init", "other.toml").stderr
+    assert "next: ctxval check 'my rig.toml'" in invoke("init", "my rig.toml").stdout
     assert "ends in .toml" in sentence(invoke("init", "other.ini"))
     assert "cannot be written" in sentence(invoke("init", "none/other.toml"))
     assert Path("experiment.toml").read_bytes() == before
@@ -147,6 +148,14 @@ def test_options_of_a_case_are_plain_values(invoke: Any, options: str) -> None:
     assert "case 'pendulum'" in sentence(invoke("run", "e.toml"))
     Path("e.toml").write_text('experiment = "linear"\n[options]\ndim = "three"')
     assert "dim" in sentence(invoke("run", "e.toml"))
+
+
+def test_what_the_certificate_of_the_file_would_ignore_is_refused(invoke: Any) -> None:
+    target = changed(('kind = "posterior"', 'kind = "scenario"'))
+    for option in (["--stochastic"], ["--resolution", "1"]):
+        said = sentence(invoke("run", target, *option))
+        assert f"{option[0]} is for certificates of the kind posterior; the kind here is scenario" in said
+    assert not Path("runs").exists()
 
 
 def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: Any) -> None:

@@ -178,7 +178,8 @@ def test_asking_by_command_chooses_what_a_campaign_chooses(invoke: Any) -> None:
         (["a.sqlite", "--set", "goal=1", "--draw"], "only one can be given"),
         (["a.sqlite", "--trial", "9"], "there is no trial 9"),
         (["a.sqlite", "--seed", "3"], "is a store, which knows its search and its seed"),
-        (["none.sqlite"], "no case is called 'none.sqlite'"),
+        (["none.sqlite"], "there is no store at none.sqlite; `ctxval ask FILE.toml --store none.sqlite` makes one"),
+        (["none"], "no case is called 'none'"),
     ],
 )
 def test_what_cannot_be_asked_opens_no_trial(invoke: Any, arguments: list[str], sentence: str) -> None:
@@ -259,7 +260,7 @@ def with_cell(line: int, column: int, text: str) -> Any:
     ("change", "sentence"),
     [
         (without(2), "run.csv has no column speed; there are t, position, force"),
-        (without(3), "must have 2 states and 1 inputs, got 2 and 0"),
+        (without(3), "must have the columns of the inputs, force"),
         (without(0), "must have the columns t, position, speed, force"),
         (lambda rows: rows[:15], "must have 21 times, 20 steps of 0.1 s, got 14"),
         (lambda rows: rows[:1], "must have a header and at least two rows"),
@@ -314,12 +315,21 @@ def test_a_recording_at_other_times_is_resampled_on_request(invoke: Any) -> None
         (["0", "--failed", "x", "--distance", "1"], "exactly one of"),
         (["0", "--distance", "-1"], "finite number >= 0, got -1.0"),
         (["0", "--distance", "nan"], "finite number >= 0, got nan"),
-        (["0", "--trajectory", "none.csv"], "none.csv cannot be read as CSV"),
+        (["0", "--trajectory", "none.csv"], "there is no file none.csv"),
+        (["0", "--npz", "none.npz"], "there is no file none.npz"),
+        (["0", "--trajectory", "."], ". cannot be read: it is a folder"),
+        (["0", "--trajectory", "no_inputs.csv"], "no_inputs.csv must have the columns of the inputs, force"),
+        (["0", "--failed", " "], "--failed needs a reason"),
+        (["0", "--distance", "1", "--resample"], "--resample and --start-tolerance are for a recording"),
+        (["0", "--failed", "x", "--start-tolerance", "0.1"], "are for a recording, and there is none"),
+        (["0", "--trajectory", "no_inputs.csv", "--start-tolerance", "nan"], "a finite number >= 0, got nan"),
+        (["0", "--trajectory", "no_inputs.csv", "--start-tolerance", "-1"], "a finite number >= 0, got -1.0"),
         (["0", "--npz", "my_rig.py"], "my_rig.py cannot be read as a trajectory"),
     ],
 )
 def test_what_cannot_be_told_is_one_sentence(invoke: Any, arguments: list[str], sentence: str) -> None:
     new(invoke)
+    Path("no_inputs.csv").write_text("t,position,speed\n" + "".join(f"{t / 10},0,0\n" for t in range(21)))
     assert sentence in refused(invoke("tell", "a.sqlite", *arguments))
     assert Store("a.sqlite").trials()[0].state == "open"
 
@@ -372,7 +382,9 @@ def test_known_runs_come_in_once_with_their_origin(invoke: Any) -> None:
             "gaol,distance\n1,0.5\n",
             "the columns goal and one of trajectory, distance, failed; it has gaol",
         ),
-        ("goal,trajectory\n1,none.csv\n", "line 2: none.csv cannot be read as CSV"),
+        ("goal,trajectory\n1,none.csv\n", "line 2: there is no file none.csv"),
+        ("goal,distance\n", "runs.csv has no run below its header"),
+        ("goal,distance,goal\n1,2,3\n", "runs.csv must have columns of different names, got goal, distance, goal"),
         ("", "it has none"),
         ("\x00\x01", "runs.csv"),
     ],
@@ -382,6 +394,12 @@ def test_a_table_with_one_wrong_row_brings_nothing_in(invoke: Any, table: str, s
     Path("runs.csv").write_text(table)
     assert sentence in refused(invoke("import", "a.sqlite", "runs.csv"))
     assert len(Store("a.sqlite").trials()) == 1
+
+
+def test_what_is_imported_must_be_there(invoke: Any) -> None:
+    new(invoke)
+    assert "there is no file none.csv" in refused(invoke("import", "a.sqlite", "none.csv"))
+    assert "finite number >= 0" in refused(invoke("import", "a.sqlite", "none.csv", "--start-tolerance", "inf"))
 
 
 def test_the_search_knows_what_was_imported(invoke: Any) -> None:

@@ -13,7 +13,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Store
 
-BUDGET = 20
+BUDGET = 12
 SCRIPT = Path(__file__).with_name("kill_me.py")
 
 
@@ -39,12 +39,8 @@ def content(store: Path) -> list[tuple[object, ...]]:
     return rows
 
 
-def killed_and_resumed(store: Path, after: float) -> tuple[list[tuple[object, ...]], list[tuple[object, ...]]]:
-    """Kill a campaign after so many seconds; return what was completed then, and everything once it was resumed."""
-    process = start(store)
-    time.sleep(after)
-    process.kill()
-    process.wait()
+def resumed(store: Path) -> tuple[list[tuple[object, ...]], list[tuple[object, ...]]]:
+    """Resume a campaign that was killed; return what was completed before, and everything afterwards."""
     before = [row for row in content(store) if row[2] == "completed"]
     Campaign(make_validation(), store=store, seed=11, name="killed").run(BUDGET)
     return before, content(store)
@@ -61,7 +57,12 @@ def test_a_killed_campaign_resumes_bit_for_bit(tmp_path: Path, request: pytest.F
     rng = np.random.default_rng(2024)
     found_midway = 0
     for number in range(kills):
-        before, after = killed_and_resumed(tmp_path / f"{number}.sqlite", rng.uniform(0, duration))
+        store = tmp_path / f"{number}.sqlite"
+        process = start(store)
+        time.sleep(rng.uniform(0, duration))
+        process.kill()
+        process.wait()
+        before, after = resumed(store)
         found_midway += 0 < len(before) < BUDGET
         assert after[: len(before)] == before, "a completed execution was lost or changed"
         assert after == expected

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import rig_cluster
 from conftest import make_validation
 from ctxval import Campaign, Store, Task, Trajectory, Trial, controllers, searches
 from ctxval.errors import CampaignError, InputError, ModelError
@@ -295,6 +296,20 @@ def test_a_campaign_on_dask_survives_the_death_of_a_worker(tmp_path: Path) -> No
     trials = Store(tmp_path / "a.sqlite").trials()
     assert [trial.state for trial in trials] == ["completed"] * 16
     alone = logged(None, str(tmp_path / "marks"), 0).run(16)
+    assert [trial.distance for trial in trials] == [trial.distance for trial in alone.trials]
+
+
+@pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs dask.distributed")
+def test_a_campaign_whose_dask_scheduler_is_killed_goes_on_with_another(tmp_path: Path) -> None:
+    status, stderr, before = rig_cluster.killed_and_resumed(tmp_path, after=4, wait=0.1)
+    assert status == 3
+    assert "error: the executor takes no more work" in stderr
+    assert "Traceback" not in stderr
+    assert 1 <= len(before) < 12
+    trials = Store(tmp_path / "a.sqlite").trials()
+    assert [trial.state for trial in trials] == ["completed"] * 12
+    assert all(trials[number].distance == distance for number, distance in before.items())
+    alone = logged(None, str(tmp_path / "marks"), 0).run(12)
     assert [trial.distance for trial in trials] == [trial.distance for trial in alone.trials]
 
 

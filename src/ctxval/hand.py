@@ -82,12 +82,21 @@ def read_recording(
     Raises:
         InputError: the file cannot be read or resampled; the message says what is missing.
     """
+    _require_file(path)
     if path.suffix == ".npz" if npz is None else npz:
         recording = Trajectory.from_npz(path)
     else:
         states, inputs = _names(experiment, plan)
         recording = Trajectory.from_csv(path, states=list(states), inputs=list(inputs))
+        if inputs and not recording.inputs.shape[-1]:
+            raise InputError(f"{path} must have the columns of the inputs, {', '.join(inputs)}.")
     return recording.resampled(plan.task.times) if resample else recording
+
+
+def _require_file(path: Path) -> None:
+    """Say what a reader of the content would say less clearly."""
+    if not path.is_file():
+        raise InputError(f"{path} cannot be read: it is a folder." if path.is_dir() else f"there is no file {path}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,19 +148,24 @@ def read_runs(files: Sequence[Path], parameters: Mapping[str, Any] | None, space
 
 
 def _table(path: Path, space: TaskSpace) -> list[KnownRun]:
+    _require_file(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             rows = [(reader.line_num, row) for row in reader]
+            header = [name for name in reader.fieldnames or () if name]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path} cannot be read as a table of runs: {error}.") from error
-    header = [name for name in (rows[0][1] if rows else {}) if name]
     missing = [name for name in space.names if name not in header]
     if missing or not any(name in header for name in _RESULTS):
         raise InputError(
             f"{path} must be a table with the columns {', '.join(space.names)} and one of {', '.join(_RESULTS)}; "
             f"it has {', '.join(header) or 'none'}. For one trajectory say --set NAME=VALUE."
         )
+    if len(set(header)) != len(header):
+        raise InputError(f"{path} must have columns of different names, got {', '.join(header)}.")
+    if not rows:
+        raise InputError(f"{path} has no run below its header.")
     return [_run(path, line, row, space) for line, row in rows]
 
 

@@ -272,7 +272,7 @@ class Executor(Crew):
             future = self.executor.submit(execute_task, self.system, plan.controller, plan.task)
         except Exception as error:
             if _is_loss(error) or isinstance(error, RuntimeError):
-                raise CampaignError(f"the executor takes no more work: {reason_of(error)}.") from error
+                raise CampaignError(f"the executor takes no more work: {reason_of(error).rstrip('.')}.") from error
             raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
         self._running[future] = number, time.monotonic()
 

@@ -5,23 +5,42 @@ from __future__ import annotations
 import builtins
 import concurrent.futures
 import contextlib
+import io
+import json
+import os
 import pickle
 import re
+import shutil
 import subprocess
 import sys
 import textwrap
+import time
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, searches, systems, testing
+from ctxval import (
+    Campaign,
+    Store,
+    Task,
+    TaskSpace,
+    Validation,
+    controllers,
+    distances,
+    models,
+    searches,
+    systems,
+    testing,
+)
 from ctxval.arrays import Array
+from ctxval.cli import app
 from ctxval.describe import describe, first_difference
 from ctxval.errors import InputError, ShapeError, UnknownNameError
-from ctxval.systems import FMU
+from ctxval.systems import FMU, fmu_process
 
 fmpy = pytest.importorskip("fmpy")
 
@@ -75,6 +94,7 @@ class Cart(Fmi3Slave):
         return True
 '''
 
+FAILING = "return False  # pythonfmu lets an exception corrupt the process that loaded it"
 NAMES: dict[str, Any] = {"states": ["position", "speed"], "inputs": ["force"]}
 TASK = Task([1.0, -0.5], horizon=25, dt=0.1)
 
@@ -145,36 +165,153 @@ def test_integer_parameters_are_set_as_integers(fmi2: Path) -> None:
     assert FMU(fmi2, **NAMES, parameters={"teeth": 7}).execute(feedback, TASK).finite
 
 
-def test_a_failure_in_the_middle_ends_the_trajectory_and_frees_the_instance(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    freed = counted_frees(monkeypatch)
-    trajectory = FMU(path, **NAMES).execute(lambda t, x: np.array([1e4 if t >= 2 else 0.0]), TASK)
+def test_a_failure_in_the_middle_ends_the_trajectory(path: Path) -> None:
+    system = FMU(path, **NAMES)
+    trajectory = system.execute(lambda t, x: np.array([1e4 if t >= 2 else 0.0]), TASK)
     assert re.fullmatch(r"the FMU failed \(fmi.DoStep failed with status 2 \(discard\)\.\) at step 4", trajectory.ended)
     assert np.isfinite(trajectory.states[:4]).all()
     assert np.isnan(trajectory.states[4:]).all()
-    assert len(freed) == 2  # one when it was opened
+    assert system.execute(feedback, TASK).ended == "complete"
 
 
-def test_the_instance_is_freed_when_the_controller_raises(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    freed = counted_frees(monkeypatch)
+def test_a_process_is_kept_until_something_goes_wrong(path: Path) -> None:
     system = FMU(path, **NAMES)
+    (first,) = processes(system)
+    system.execute(feedback, TASK)
+    assert processes(system) == [first]
     for _ in range(3):
         with contextlib.suppress(ZeroDivisionError):
             system.execute(lambda t, x: np.array([1 / 0]), TASK)
-    assert len(freed) == 4
+        assert not processes(system)
+    assert not alive(first)
+    system.execute(feedback, TASK)
+    (second,) = processes(system)
+    del system
+    assert not alive(second)
 
 
-def counted_frees(monkeypatch: pytest.MonkeyPatch) -> list[object]:
-    freed: list[object] = []
-    for kind in (fmpy.fmi2.FMU2Slave, fmpy.fmi3.FMU3Slave):
+def processes(system: FMU) -> list[int]:
+    """Return the processes that wait for an execution."""
+    return [process._process.pid for process in system._idle[os.getpid()]]
 
-        def free(self: Any, original: Any = kind.freeInstance) -> None:
-            freed.append(self)
-            original(self)
 
-        monkeypatch.setattr(kind, "freeInstance", free)
-    return freed
+def alive(pid: int) -> bool:
+    """Return whether a process runs; one that has ended and that nobody has collected does not."""
+    status = Path(f"/proc/{pid}/stat")
+    return status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+# An FMU that crashes
+
+
+@pytest.fixture(scope="module")
+def deadly(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return an FMU that kills its process beyond a speed, as a fault in machine code does."""
+    pytest.importorskip("pythonfmu")
+    crash = "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"
+    return built(tmp_path_factory.mktemp("deadly"), "pythonfmu", CART_2.replace(FAILING, crash))
+
+
+def test_a_crash_ends_the_trajectory_and_not_the_process(deadly: Path) -> None:
+    system = FMU(deadly, **NAMES)
+    trajectory = system.execute(lambda t, x: np.array([1e4 if t >= 2 else 0.0]), TASK)
+    assert trajectory.ended == "the FMU crashed its process (SIGSEGV) at step 4"
+    assert np.isfinite(trajectory.states[:4]).all()
+    np.testing.assert_array_equal(
+        system.execute(feedback, TASK).states, FMU(deadly, **NAMES).execute(feedback, TASK).states
+    )
+
+
+@pytest.mark.parametrize("options", [{}, {"workers": 2}])
+def test_a_crash_is_a_failed_trial_of_a_campaign(deadly: Path, options: dict[str, int]) -> None:
+    validation = Validation(
+        space=TaskSpace(speed=(50.0, 150.0, "m/s")),
+        task=lambda p: Task([0.0, p.speed], horizon=5, dt=0.1),
+        system=FMU(deadly, **NAMES),
+        model=models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.05]]),
+        synthesizer=controllers.LQR([10.0, 1.0], [0.1], limits=1.0),
+        distance=distances.FinalState(),
+    )
+    campaign = Campaign(validation, search=searches.Random(), seed=0).run(8, **options)  # type: ignore[arg-type]
+    for trial in campaign.trials:
+        crashed = trial.parameters["speed"] > 101
+        assert (trial.state == "failed") is crashed
+        assert not crashed or "the FMU crashed its process (SIGSEGV) at step 1" in str(trial.failure)
+    assert 0 < len(campaign.failed) < 8
+
+
+@pytest.mark.parametrize("how", ["raise RuntimeError('broken')", "import os; os._exit(7)"])
+def test_an_exception_in_a_step_of_pythonfmu_is_survived(tmp_path: Path, how: str) -> None:
+    pytest.importorskip("pythonfmu")
+    code = f"""
+from ctxval import Task
+from ctxval.systems import FMU
+system = FMU({str(built(tmp_path, "pythonfmu", CART_2.replace(FAILING, how)))!r}, states=["position", "speed"],
+             inputs=["force"])
+print(system.execute(lambda t, x: -x[:1], Task([1.0, 200.0], horizon=5, dt=0.1)).ended)
+print(system.execute(lambda t, x: -x[:1], Task([1.0, 0.0], horizon=5, dt=0.1)).ended)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.splitlines()
+    assert first.startswith("the FMU ")
+    assert first.endswith(" at step 1")
+    assert second == "complete"
+
+
+def test_an_fmu_that_crashes_at_the_start_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("pythonfmu")
+    crash = "    def exit_initialization_mode(self):\n        import os; os._exit(7)\n\n    def do_step"
+    source = CART_2.replace("    def do_step", crash)
+    with pytest.raises(InputError, match=r"pythonfmu\.fmu: the FMU crashed its process \(status 7\) when it was initi"):
+        FMU(built(tmp_path, "pythonfmu", source), **NAMES)
+
+
+def test_a_step_that_does_not_end_goes_with_its_execution(tmp_path: Path) -> None:
+    pytest.importorskip("pythonfmu")
+    mark = f"pathlib.Path({str(tmp_path / 'pid')!r}).write_text(str(os.getpid()))"
+    hang = f"import os, pathlib, time; {mark}; time.sleep(600)"
+    validation = Validation(
+        space=TaskSpace(speed=(150.0, 160.0, "m/s")),
+        task=lambda p: Task([0.0, p.speed], horizon=5, dt=0.1),
+        system=FMU(built(tmp_path, "pythonfmu", CART_2.replace(FAILING, hang)), **NAMES),
+        model=models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.05]]),
+        synthesizer=controllers.LQR([10.0, 1.0], [0.1]),
+        distance=distances.FinalState(),
+    )
+    campaign = Campaign(validation, search=searches.Random()).run(1, timeout=1.0)
+    assert [trial.failure for trial in campaign.trials] == ["the execution did not end within 1 s"]
+    assert not alive(int((tmp_path / "pid").read_text()))
+
+
+def test_a_step_that_does_not_end_goes_with_a_campaign_that_is_killed(tmp_path: Path) -> None:
+    pytest.importorskip("pythonfmu")
+    mark = tmp_path / "pid"
+    hang = f"import os, pathlib, time; pathlib.Path({str(mark)!r}).write_text(str(os.getpid())); time.sleep(600)"
+    code = f"""
+from ctxval import Task
+from ctxval.systems import FMU
+system = FMU({str(built(tmp_path, "pythonfmu", CART_2.replace(FAILING, hang)))!r}, states=["position", "speed"],
+             inputs=["force"])
+system.execute(lambda t, x: -x[:1], Task([1.0, 200.0], horizon=5, dt=0.1))
+"""
+    campaign = subprocess.Popen([sys.executable, "-c", code])
+    deadline = time.monotonic() + 30
+    while not (mark.exists() and mark.read_text()) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    campaign.kill()
+    campaign.wait()
+    pid = int(mark.read_text())
+    while alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not alive(pid)
+
+
+def test_what_an_fmu_prints_and_reads_does_not_disturb(tmp_path: Path) -> None:
+    pytest.importorskip("pythonfmu")
+    talking = "    def do_step(self, time, dt):\n        import os, sys; print('hello', flush=True); sys.stdin.read()\n"
+    system = FMU(built(tmp_path, "pythonfmu", CART_2.replace("    def do_step(self, time, dt):\n", talking)), **NAMES)
+    assert system.execute(feedback, TASK).ended == "complete"
 
 
 def test_many_executions_and_garbage_collections_leave_the_process_alive(path: Path) -> None:
@@ -239,13 +376,27 @@ def test_an_initial_state_that_is_not_taken_is_an_error(path: Path) -> None:
         system.execute(feedback, TASK)
 
 
-def test_start_values_that_are_refused_are_an_error(fmi2: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(self: Any, references: Any, values: Any) -> None:
-        raise RuntimeError("calculated")
+def test_start_values_that_are_refused_are_an_error(fmi2: Path) -> None:
+    # In this process, and with an FMU that refuses everything: those that are built here refuse no start value.
+    unit = fmu_process.Unit(str(unpacked(fmi2)), "a.fmu", [0, 1], [2], ["position", "speed"], {})
 
-    monkeypatch.setattr(fmpy.fmi2.FMU2Slave, "setReal", refuse)
-    with pytest.raises(InputError, match="does not let the start values of position, speed be set: calculated"):
-        FMU(fmi2, **NAMES).execute(feedback, TASK)
+    class Refusing:
+        def __getattr__(self, name: str) -> Any:
+            raise RuntimeError("calculated")
+
+    unit.fmu, unit._set = Refusing(), lambda references, values: Refusing().anything
+    with pytest.raises(fmu_process.Refused, match="start values of position, speed be set: calculated") as caught:
+        unit._set_start([1.0, 2.0])
+    assert caught.value.input_is_wrong
+    with pytest.raises(fmu_process.Refused, match=r"a\.fmu cannot be initialised: calculated"):
+        unit._initialise()
+
+
+def unpacked(path: Path) -> Path:
+    folder = path.with_suffix(".unpacked")
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(folder)
+    return folder
 
 
 def test_an_fmu_may_end_the_simulation(fmi3: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -253,8 +404,24 @@ def test_an_fmu_may_end_the_simulation(fmi3: Path, monkeypatch: pytest.MonkeyPat
         return False, time > 0.25, False, time
 
     monkeypatch.setattr(fmpy.fmi3.FMU3Slave, "doStep", step)
-    trajectory = FMU(fmi3, **NAMES).execute(feedback, TASK)
-    assert trajectory.ended == "the FMU terminated the simulation at step 4"
+    unit = fmu_process.Unit(str(unpacked(fmi3)), "a.fmu", [1, 2], [3], ["position", "speed"], {"mass": 3.0})
+    assert unit.begin([1.0, 2.0], 0.1, 1) == [1.0, 2.0]
+    answers = [unit.advance([0.0]) for _ in range(4)]
+    assert [reason for _, reason in answers] == ["", "", "", "the FMU terminated the simulation"]
+    assert answers[-1][0] is None
+    unit.free()
+
+
+def test_the_process_serves_line_by_line(fmi2: Path) -> None:
+    setup = {"folder": str(unpacked(fmi2)), "name": "a.fmu", "states": [0, 1], "inputs": [2]}
+    lines: list[Any] = [{**setup, "start": ["position", "speed"], "parameters": {"teeth": 4}}]
+    lines += [["begin", [1.0, 2.0], 0.1, 1], ["advance", [0.0]], ["free"], ["begin", [1.0], 0.1, 1], ["free"]]
+    answers = io.StringIO()
+    fmu_process.serve(io.StringIO("".join(json.dumps(line) + "\n" for line in lines)), answers)
+    values = [json.loads(line)["value"] for line in answers.getvalue().splitlines()]
+    assert values[0] == [1.0, 2.0]
+    assert values[1][0] == [1.2, pytest.approx(1.98)]
+    assert values[2:] == [None, [0.0, 0.0], None]
 
 
 def test_threads_do_not_disturb_each_other(path: Path) -> None:
@@ -319,3 +486,71 @@ def test_a_model_is_validated_on_an_fmu(path: Path) -> None:
     np.testing.assert_allclose(found, on(systems.Simulated(cart, vectorized=True)).distances(points), atol=1e-12)
     assert found.min() > 0
     assert not Campaign(on(FMU(path, **NAMES)), search=searches.Random()).run(3).failed
+
+
+WHOLE = """
+name = "cart"
+budget = 7
+threshold = 5.0
+store = "cart.sqlite"
+
+[space]
+goal = [0.5, 2.0, "m"]
+
+[task]
+initial_state = [0, 0]
+goal = ["goal", 0]
+horizon = 30
+dt = 0.1
+
+[system]
+type = "FMU"
+path = "unit.fmu"
+states = ["position", "speed"]
+inputs = ["force"]
+parameters = { mass = 2.0 }
+
+[model]
+type = "Linear"
+data = ["run1.csv", "run2.csv"]
+
+[synthesizer]
+type = "LQR"
+Q = [10, 1]
+R = [0.1]
+limits = 5.0
+
+[distance]
+type = "FinalState"
+
+[search]
+name = "gp-ucb"
+"""
+
+
+def test_an_experiment_file_validates_a_learned_model_on_an_fmu(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(path, "unit.fmu")
+    Path("experiment.toml").write_text(WHOLE)
+    rng = np.random.default_rng(0)
+    for name in ("run1.csv", "run2.csv"):
+        FMU("unit.fmu", **NAMES).execute(lambda t, x: rng.normal(size=1), TASK).to_csv(name)
+
+    def report(*arguments: str) -> dict[str, Any]:
+        result = CliRunner().invoke(app, [*arguments, "--json"])
+        assert result.exit_code == 0, result.stderr
+        found: dict[str, Any] = json.loads(result.stdout)
+        return found
+
+    assert report("check", "experiment.toml", "--execute")["ok"]
+    ran = report("run", "experiment.toml")
+    assert (ran["executions"], ran["failed"], ran["threshold"]) == (7, 0, 5.0)
+    assert ran["worst"]["distance"] > 0
+    assert report("status", "cart.sqlite")["executions"] == 7
+    again = report("run", "experiment.toml", "--budget", "8")
+    assert again["executions"] == 8
+    assert len(Store("cart.sqlite").trials()) == 8
+    status = CliRunner().invoke(app, ["run", "experiment.toml", "--budget", "8", "--threshold", "1e-9", "--json"])
+    assert (status.exit_code, json.loads(status.stdout)["verdict"]) == (1, "falsified")

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+import rig_command
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, searches, systems, testing
 from ctxval.arrays import Array
 from ctxval.controller import AffineFeedback
 from ctxval.errors import ExecutionError, InputError
-from ctxval.systems import Subprocess
+from ctxval.systems import Subprocess, guard
 from ctxval.systems import subprocess as adapter
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.05]])
@@ -182,6 +183,33 @@ child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(6
 """
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_command_ends_with_a_campaign_that_is_killed(workers: int, tmp_path: Path) -> None:
+    campaign = rig_command.start(tmp_path, seconds=60, workers=workers)
+    deadline = time.monotonic() + 30
+    while len(pids := rig_command.processes(tmp_path)) < workers and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert all(alive(pid) for pid in pids)
+    campaign.kill()
+    campaign.wait()
+    assert len(pids) == workers
+    assert all(gone(pid) for pid in pids)
+    resumed = rig_command.campaign(tmp_path, tmp_path / "a.sqlite", seconds=0)
+    assert [trial.state for trial in resumed.trials] == ["open"] * workers
+    whole = rig_command.campaign(tmp_path, seconds=0).run(6)
+    assert [trial.distance for trial in resumed.run(6).trials] == [trial.distance for trial in whole.trials]
+
+
+def test_a_guard_that_is_killed_is_replaced(tmp_path: Path) -> None:
+    system = python(tmp_path, RIG)
+    expected = system.execute(designed(), TASK).states
+    first = guard._guards[os.getpid()]
+    first.kill()
+    first.wait()
+    np.testing.assert_array_equal(system.execute(designed(), TASK).states, expected)
+    assert guard._guards[os.getpid()] is not first
+
+
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
 @pytest.mark.parametrize(
     ("end", "sentence"), [("time.sleep(60)", "did not end within 1 s and was killed"), ("sys.exit(3)", "status 3")]
@@ -242,3 +270,30 @@ def test_a_campaign_on_a_command_records_its_failures(tmp_path: Path) -> None:
     campaign = Campaign(validation, search=searches.Random()).run(6)
     assert 0 < len(campaign.failed) < 6
     assert all(str(trial.failure).endswith("over the edge") for trial in campaign.failed)
+
+
+@pytest.mark.parametrize("workers", [None, 2])
+def test_a_killed_command_costs_its_own_trial_and_nothing_else(tmp_path: Path, workers: int | None) -> None:
+    whole = rig_command.campaign(tmp_path, seconds=0).run(6)
+    shutil.rmtree(tmp_path / "marks")
+    campaign = rig_command.campaign(tmp_path, tmp_path / "a.sqlite", seconds=0.4)
+    thread = rig_command.killer(tmp_path, after=2, wait=0.1)
+    campaign.run(6, workers=workers)
+    thread.join()
+    (killed,) = campaign.failed
+    assert str(killed.failure).endswith("the command was ended by SIGKILL: nothing on stderr")
+    assert campaign.executions == 6
+    expected = [None if trial.number == killed.number else trial.distance for trial in whole.trials]
+    assert [trial.distance for trial in campaign.trials] == expected
+    assert len(list((tmp_path / "marks").iterdir())) == 6
+
+
+def test_a_killed_command_is_run_again_where_the_user_says_so(tmp_path: Path) -> None:
+    whole = rig_command.campaign(tmp_path, seconds=0).run(6)
+    shutil.rmtree(tmp_path / "marks")
+    campaign = rig_command.campaign(tmp_path, tmp_path / "a.sqlite", seconds=0.4)
+    thread = rig_command.killer(tmp_path, after=2, wait=0.1)
+    campaign.run(6, workers=2, retry_failures=1)
+    thread.join()
+    assert sorted(trial.attempts for trial in campaign.trials) == [1, 1, 1, 1, 1, 2]
+    assert [trial.distance for trial in campaign.trials] == [trial.distance for trial in whole.trials]

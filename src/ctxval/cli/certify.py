@@ -27,6 +27,16 @@ from ctxval.store import Store
 from ctxval.trial import Trial
 from ctxval.verdict import Verdict, counterexample, judge, judge_by, require_threshold
 
+_OF_KINDS = {
+    "discard": ("sampling-discarding",),
+    "constant": ("convergence",),
+    "theorem": ("convergence",),
+    "stochastic": ("posterior",),
+    "resolution": ("posterior",),
+    "volume": ("audit", "scenario", "sampling-discarding"),
+}
+"""Which kinds have a use for an option."""
+
 
 @app.command("certify")
 @command
@@ -57,6 +67,8 @@ def certify_store(
 
     What is not said here is as the experiment's file says it, where the store is of one.
     """
+    given = {"discard": discard, "constant": constant, "theorem": theorem, "volume": volume}
+    given |= {"stochastic": stochastic, "resolution": resolution}
     opened = Store.existing(store)
     planned = _planned(opened)
     confidence = planned.confidence if confidence is None else confidence
@@ -73,6 +85,8 @@ def certify_store(
     _require_shares(confidence, volume)
     if chosen not in KINDS:
         raise UnknownNameError.among("certificate", chosen, KINDS)
+    require_use(chosen, given)
+    _require_together(given, limit)
     if audit is not None:
         require_possible([trial.origin for trial in opened.trials()], chosen, options)
         _run_audit(opened, audit, show=not as_json)
@@ -126,6 +140,34 @@ def decide(campaign: Campaign, threshold: float, confidence: float, table: Certi
     return judge_by(certificate, trials, threshold, volume=table.volume)
 
 
+def require_use(kind: str, given: dict[str, Any]) -> None:
+    """Refuse options that a kind of certificate would ignore: somebody who gives one believes that it counts.
+
+    Raises:
+        InputError: one is given that is for others.
+    """
+    for name, value in given.items():
+        if value is not None and kind not in _OF_KINDS[name]:
+            kinds = " or ".join(_OF_KINDS[name])
+            raise InputError(f"--{name} is for certificates of the kind {kinds}; the kind here is {kind}.")
+
+
+def _require_together(given: dict[str, Any], threshold: float | None) -> None:
+    if given["volume"] is not None and threshold is None:
+        raise InputError("--volume is a share of the task space that may exceed a threshold; say --threshold too.")
+    if given["constant"] is not None and given["theorem"] is not None:
+        raise InputError("of --constant and --theorem only one can be given.")
+
+
+def _require_closed(campaign: Campaign) -> None:
+    """Refuse trials that people are executing; those that were interrupted are executed again by the audit itself."""
+    if getattr(campaign.validation.system, "manual", False):
+        return  # nothing can be executed at all, which the audit says
+    waiting = [str(trial.number) for trial in campaign.trials if trial.state == "open" and not trial.attempts]
+    if waiting:
+        raise CertificateError(f"trials are open: {', '.join(waiting)}; tell how they ended before auditing.")
+
+
 def _require_shares(confidence: float, volume: float) -> None:
     if not 0 < 1 - confidence < 1:
         raise InputError(f"the confidence must be strictly between 0 and 1, got {confidence!r}.")
@@ -148,6 +190,7 @@ def _certificate(
 def _run_audit(store: Store, draws: int, *, show: bool) -> None:
     settings = stored_settings(store)
     campaign = settings.campaign(settings.load(), store)
+    _require_closed(campaign)
     drawn = sum(trial.origin == "iid" for trial in campaign.trials)
     with progress(campaign, campaign.executions + max(0, draws - drawn), show=show) as on_trial:
         campaign.audit(draws, on_trial)

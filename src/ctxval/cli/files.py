@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +19,7 @@ _EXPERIMENT = """\
 #   ctxval check {name}      looks at it without executing the system
 #   ctxval run {name}        searches for the task at which system and model differ most
 name = "cart"
-budget = 15             # executions of the system, in all
+budget = 25             # executions of the system, in all; fewer with ctxval run --until-decided
 threshold = 0.5         # the largest distance that you can accept
 confidence = 0.95       # of a validation
 seed = 0                # of the search
@@ -119,8 +120,8 @@ def init(
     except OSError as error:
         raise InputError(f"{error.filename} cannot be written: {error.strerror}.") from error
     if not as_json:
-        names = " and ".join(str(path) for path in contents)
-        out.print(f"{escaped(names)}\nnext: ctxval check {escaped(str(file))}", highlight=False, soft_wrap=True)
+        told = f"{' and '.join(map(str, contents))}\nnext: ctxval check {shlex.quote(str(file))}"
+        out.print(escaped(told), highlight=False, soft_wrap=True)
     return {"files": [str(path) for path in contents]}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,11 +23,14 @@ from ctxval.validation import START
 _WAIT = 60.0
 """Seconds to wait for other terminals: each of them holds the store while it chooses a task."""
 
+_STORES = (".sqlite", ".sqlite3", ".db")
+"""How files of trials are mostly called."""
+
 Resample = Annotated[
     bool, typer.Option("--resample", help="Bring a recording with other time steps to those of the task.")
 ]
 StartTolerance = Annotated[
-    float, typer.Option(help="By how much a recording may start elsewhere, as a share of what the model covers.")
+    float | None, typer.Option(help="By how much a recording may start elsewhere, as a share of what the model covers.")
 ]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="A task parameter; once for each.")]
 StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials.")]
@@ -82,20 +87,25 @@ def tell(
     distance: Annotated[float | None, typer.Option(help="The distance alone, where nothing was recorded.")] = None,
     failed: Annotated[str | None, typer.Option(help="Why there is no result.")] = None,
     resample: Resample = False,
-    start_tolerance: StartTolerance = START,
+    start_tolerance: StartTolerance = None,
     as_json: AsJson = False,
 ) -> Any:
     """Say how an open trial ended."""
     given = {"--trajectory": trajectory, "--npz": npz, "--distance": distance, "--failed": failed}
     if sum(value is not None for value in given.values()) != 1:
         raise InputError(f"exactly one of {', '.join(given)} must be given.")
+    if failed is not None and not failed.strip():
+        raise InputError('--failed needs a reason, such as "the motor cut out".')
+    if trajectory is None and npz is None and (resample or start_tolerance is not None):
+        raise InputError("--resample and --start-tolerance are for a recording, and there is none.")
+    tolerance = _tolerance(start_tolerance)
     opened = _of_store(store)
     recording = None
     path = trajectory or npz
     if path is not None:
         plan = opened.campaign.reopen(trial).plan
         recording = read_recording(path, opened.experiment, plan, npz=npz is not None, resample=resample)
-    ended = opened.campaign.tell(trial, recording, distance=distance, failed=failed, start_tolerance=start_tolerance)
+    ended = opened.campaign.tell(trial, recording, distance=distance, failed=failed, start_tolerance=tolerance)
     report = _ended(ended, opened)
     if not as_json:
         out.print(_sentence(ended, opened.experiment), highlight=False)
@@ -116,17 +126,18 @@ def import_runs(
     ],
     parameters: Set = None,
     resample: Resample = False,
-    start_tolerance: StartTolerance = START,
+    start_tolerance: StartTolerance = None,
     as_json: AsJson = False,
 ) -> Any:
     """Take in executions that were made before; each counts as one, and none is taken in twice."""
+    tolerance = _tolerance(start_tolerance)
     opened = _of_store(store)
     runs = read_runs(files, parameters_from(parameters) if parameters else None, opened.experiment.validation.space)
     checked = []
     for run in runs:
         # All of it before any is stored.
         try:
-            checked.append((run, run.checked(opened.campaign, opened.experiment, resample, start_tolerance)))
+            checked.append((run, run.checked(opened.campaign, opened.experiment, resample, tolerance)))
         except InputError as error:
             raise InputError(f"{run.where}: {error}") from error
     ended = [
@@ -135,7 +146,7 @@ def import_runs(
             recording,
             distance=run.distance,
             failed=run.failed,
-            start_tolerance=start_tolerance,
+            start_tolerance=tolerance,
             wait=_WAIT,
         )
         for run, recording in checked
@@ -151,6 +162,12 @@ def import_runs(
             out.print(_sentence(trial, opened.experiment), highlight=False)
         out.print(f"{len(new)} imported, {len(ended) - len(new)} were there already.", highlight=False)
     return report
+
+
+def _tolerance(given: float | None) -> float:
+    if given is not None and not (0 <= given < math.inf):
+        raise InputError(f"--start-tolerance must be a share, a finite number >= 0, got {given!r}.")
+    return START if given is None else given
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +186,8 @@ def _opened(target: str, overrides: dict[str, Any]) -> _Opened:
         if any(value is not None for value in overrides.values()):
             raise InputError(f"{target} is a store, which knows its search and its seed; give no other.")
         return _of_store(path)
+    if path.suffix in _STORES:
+        raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` makes one.")
     settings = read_settings(target, overrides)
     experiment = settings.load()
     where = settings.store_path(experiment.name)
@@ -206,5 +225,5 @@ def _print_asked(report: dict[str, Any], opened: OpenTrial) -> None:
     out.print(f"{', '.join(report['files'])} in {escaped(report['folder'])}", highlight=False, soft_wrap=True)
     if "controller.json" not in report["files"]:
         out.print("its controller cannot be written to a file: only affine feedback, of LQR and iLQR, can.")
-    told = f"ctxval tell {report['store']} {opened.number} --trajectory run.csv"
+    told = f"ctxval tell {shlex.quote(report['store'])} {opened.number} --trajectory run.csv"
     out.print(f"afterwards: {escaped(told)}", highlight=False, soft_wrap=True)

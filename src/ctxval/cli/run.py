@@ -28,7 +28,7 @@ from ctxval.cli.base import (
     progress,
     worst_of,
 )
-from ctxval.cli.certify import decide
+from ctxval.cli.certify import decide, require_use
 from ctxval.config import Settings, read_settings
 from ctxval.errors import InputError
 from ctxval.experiment import Experiment
@@ -41,7 +41,7 @@ from ctxval.verdict import Verdict, require_threshold
 def run(
     target: Annotated[str, typer.Argument(metavar="CASE|FILE.toml|module:attr", help="What to validate.")],
     budget: Annotated[int | None, typer.Option(help="Executions of the system in all, earlier ones counted.")] = None,
-    search: Annotated[str | None, typer.Option(help="How tasks are chosen: gp-ucb, random, ...")] = None,
+    search: Annotated[str | None, typer.Option(help="How tasks are chosen: auto, gp-ucb, random, ...")] = None,
     threshold: Annotated[float | None, typer.Option(help="Largest distance that you can accept.")] = None,
     confidence: Annotated[float | None, typer.Option(help="Of a validation; 0.95 if not given.")] = None,
     until_decided: Annotated[
@@ -71,8 +71,11 @@ def run(
     given = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence, "seed": seed}
     settings = read_settings(target, {**given, "store": store, "options": options})
     said = {"stochastic": stochastic, "resolution": resolution}
+    require_use(settings.certificate.kind, said)
     settings = settings.certified_as({key: value for key, value in said.items() if value is not None})
     experiment = settings.load()
+    if truth:
+        _require_truth(experiment)  # before executions are paid for
     chosen = experiment.threshold if settings.threshold is None else settings.threshold
     limit = None if chosen is None else require_threshold(chosen)
     path = settings.store_path(experiment.name)
@@ -81,7 +84,7 @@ def run(
     execute = _until_decided(campaign, limit, settings) if until_decided else campaign.run
     with hands(workers, dask, timeout) as given_hands, progress(campaign, total, show=not as_json) as on_trial:
         execute(budget=total, on_trial=on_trial, **given_hands)
-    known = _truth(experiment) if truth else None
+    known = experiment.truth() if truth and experiment.truth is not None else None
     verdict = None if limit is None else decide(campaign, limit, settings.confidence, settings.certificate)
     report = _report(campaign, experiment, settings, total, path, verdict, known)
     report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path)]
@@ -105,10 +108,11 @@ def _until_decided(campaign: Campaign, threshold: float | None, settings: Settin
     )
 
 
-def _truth(experiment: Experiment) -> Truth:
+def _require_truth(experiment: Experiment) -> None:
     if experiment.truth is None:
-        raise InputError(f"the truth of {experiment.name!r} is not known: its system is not simulated here.")
-    return experiment.truth()
+        raise InputError(
+            f"the truth of {experiment.name!r} is not known: only cases, and experiments that say it, have it."
+        )
 
 
 def _report(

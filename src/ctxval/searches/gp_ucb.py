@@ -10,14 +10,19 @@ from ctxval.arrays import Array, single_threaded
 from ctxval.errors import InputError
 from ctxval.kernels import Kernel, Matern
 from ctxval.searches.base import SequentialSearch, best_first
+from ctxval.searches.history import kept_rows
 from ctxval.surrogate import Surrogate, fit_surrogate
 
 _NEGLIGIBLE = 1e-3
 """The least promised improvement worth an execution, in standard deviations of the values."""
+_KEPT = 500
+"""Points of a long history that the surrogate is fitted to: its hyperparameters are learned anew each time."""
 
 
 class GPUCB(SequentialSearch):
     """Bayesian optimisation with the GP upper confidence bound (Algorithm 1, eqs. 10 and 11).
+
+    From 1,000 points on the surrogate is fitted to 500 of them: the largest values, the latest, and well-spread ones.
 
     Args:
         beta: the confidence parameter of eq. 11.
@@ -68,4 +73,6 @@ class GPUCB(SequentialSearch):
 
     def surrogate(self) -> Surrogate:
         """Return the GP conditioned on the history."""
-        return fit_surrogate(self.points, self.values, self.kernel, noise=self.noise, prior_mean=self.prior_mean)
+        points, values = self.points, self.values
+        rows = kept_rows(points, values, _KEPT)
+        return fit_surrogate(points[rows], values[rows], self.kernel, noise=self.noise, prior_mean=self.prior_mean)

@@ -9,6 +9,7 @@ the best of all, as a wide basin that is not the highest is left only through wh
 
 from __future__ import annotations
 
+from bisect import insort
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from ctxval.acquisition import Acquisition, Box, LogExpectedImprovement, UpperCo
 from ctxval.arrays import Array, single_threaded
 from ctxval.errors import InputError
 from ctxval.searches.base import Note, SequentialSearch, best_first
+from ctxval.searches.history import kept_rows
 from ctxval.surrogate import Learned, learn
 
 _WORTH = 0.005
@@ -34,6 +36,8 @@ _FEW, _FILLERS = 2, 512
 """Dimensions up to which a share of the executions fills the space, and candidates for each of these."""
 _EACH = 20
 """Up to so many values the hyperparameters are learned with each new one, up to twice as many with each second ..."""
+_KEPT = 1000
+"""Points of a long history that the surrogate is conditioned on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +69,9 @@ class _Branch:
 
 class Scalar(SequentialSearch):
     """The search where only values are known: expected improvement and upper bounds, with branches out of basins.
+
+    From 1,000 points on the surrogate is conditioned on 1,000 of them: the largest values, the latest, and well-spread
+    ones.
 
     Args:
         initial: how many random points come first; in one and two dimensions all but one are far from each other.
@@ -111,9 +118,11 @@ class Scalar(SequentialSearch):
     def _most_worth(self, points: Array, values: Array, rng: np.random.Generator) -> tuple[Array, Note]:
         known = np.isfinite(values)
         learned = self._learned(points[known], values[known])
-        process = learned.condition(points, values)
+        rows = kept_rows(points, values, _KEPT)
+        process = learned.condition(points[rows], values[rows])
         branch = None if len(values) % _EVERYWHERE == 0 else _branch(points[known], values[known])
-        acquisition = self._acquisition(learned, process, values, branch)
+        believed = process.y[int(known[rows].sum()) :].max(initial=-np.inf)
+        acquisition = self._acquisition(learned, process, values, branch, float(believed))
         box = None if branch is None else branch.box(self.dimension)
         known_first, away = best_first(points, values), points[~known]
         point = maximise(acquisition, self.dimension, known_first, rng, box=box, corners=True, away=away)
@@ -125,7 +134,7 @@ class Scalar(SequentialSearch):
         }
 
     def _acquisition(
-        self, learned: Learned, process: gp.GaussianProcess, values: Array, branch: _Branch | None
+        self, learned: Learned, process: gp.GaussianProcess, values: Array, branch: _Branch | None, believed: float
     ) -> Acquisition:
         if branch is not None and not np.isfinite(branch.best):
             # Far from the flank of the basin that was left: there the branch would only lead back to it.
@@ -135,9 +144,8 @@ class Scalar(SequentialSearch):
         if branch is not None:
             return LogExpectedImprovement(process, _worthwhile(learned, values, branch.best))
         # What is believed of pending points counts: questions of one batch do not all improve on the same value.
-        believed = process.y[int(np.isfinite(values).sum()) :].max(initial=-np.inf)
         best = _worthwhile(learned, values, float(np.nanmax(values)))
-        return LogExpectedImprovement(process, max(best, float(believed)))
+        return LogExpectedImprovement(process, max(best, believed))
 
     def _learned(self, points: Array, values: Array) -> Learned:
         """Return the hyperparameters, which are a function of the first so many values by a fixed schedule."""
@@ -172,8 +180,11 @@ def _filling(points: Array, rng: np.random.Generator) -> Array:
 def _branch(points: Array, values: Array) -> _Branch | None:
     """Return the branch in which these known values leave the search, in their order; None for the whole cube."""
     branch, misses, best, place = None, 0, -np.inf, points[0]
+    ordered: list[float] = []
     for count, (point, value) in enumerate(zip(points, values.tolist(), strict=True), start=1):
-        margin = _WORTH * max(best, value) - _WORTH * float(np.median(values[:count]))
+        insort(ordered, value)
+        median = (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
+        margin = _WORTH * max(best, value) - _WORTH * median
         improves = value > best + margin
         if value > best:
             best, place = value, point

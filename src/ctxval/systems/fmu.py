@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
+import os
 import shutil
+import subprocess
+import sys
 import tempfile
-import threading
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,18 +21,19 @@ from ctxval.arrays import Array
 from ctxval.controller import Controller
 from ctxval.errors import ExecutionError, InputError, UnknownNameError
 from ctxval.systems.episode import require_one, require_started, run_episode
+from ctxval.systems.subprocess import signal_name
 from ctxval.task import Task
-from ctxval.trajectory import Trajectory
+from ctxval.trajectory import COMPLETE, Trajectory
 
-_LOADING = threading.Lock()
-"""FMPy changes the working directory while it loads a library."""
+_PROGRAM = Path(__file__).with_name("fmu_process.py")
 
 
 class FMU:
     """An FMU for co-simulation, FMI 2 or 3, as the true system.
 
     Every execution has an instance of its own: parameters and the initial state are set as start values, inputs are
-    held over a step, and the instance is freed however the execution ends. An FMU holds machine code, which runs.
+    held over a step, and the instance is freed however the execution ends. An FMU holds machine code, which runs in a
+    process of its own, kept for the next execution: an FMU that crashes it is a failed execution.
 
     Args:
         path: the ``.fmu`` file.
@@ -66,7 +70,9 @@ class FMU:
     def _open(self) -> None:
         """Unpack the file and look up the variables, here and again in another process."""
         self._description, self._folder = _unpacked(self.path)
-        weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        # By the process that started them: a fork of this one must not talk to the same.
+        self._idle: dict[int, list[_Process]] = {}
+        weakref.finalize(self, _clean, self._idle, self._folder, os.getpid())
         self._digest = hashlib.sha256(self.path.read_bytes()).hexdigest()[:16]
         known = {variable.name: variable for variable in self._description.modelVariables}
         foreign = sorted(set(self.start) - set(self.states))
@@ -75,13 +81,22 @@ class FMU:
         for name in (*self.states, *self.inputs, *self.start.values(), *self.parameters):
             if name not in known:
                 raise UnknownNameError.among("variable of the FMU", name, known)
-        self._outputs = _references(known, self.states)
-        self._inputs = _references(known, self.inputs)
-        self._starts = _references(known, [self.start[name] for name in self.states])
-        self._parameters = [(known[name], value) for name, value in self.parameters.items()]
+        start = [self.start[name] for name in self.states]
+        _references(known, start)
+        self._setup = {
+            "folder": self._folder,
+            "name": self.path.name,
+            "states": _references(known, self.states),
+            "inputs": _references(known, self.inputs),
+            "start": start,
+            "parameters": self.parameters,
+        }
         try:
-            with self._instance() as instance:
-                instance.initialise()
+            with self._process() as process:
+                process.ask("begin", None, 0.0, 1)
+                process.ask("free")
+        except _CrashError as crash:
+            raise InputError(f"{self.path.name}: {crash} when it was initialised.") from crash
         except ExecutionError as error:
             raise InputError(str(error)) from error
 
@@ -96,16 +111,18 @@ class FMU:
         Raises:
             InputError: the task's dt is no multiple of the step, or the initial state cannot be set.
             ShapeError: states or inputs are not as many as the names.
-            ExecutionError: the FMU refuses to start.
+            ExecutionError: the FMU refuses to start, or crashes then.
         """
         require_one(task)
         substeps = self._substeps(task)
-        with self._instance() as instance:
-            instance.set_start(task.initial_state)
-            instance.initialise()
-            require_started(task, instance.state())
-            instance.substeps, instance.step = substeps, task.dt / substeps
-            return run_episode(instance.advance, controller, task, len(self.inputs))
+        with self._process() as process:
+            state = process.ask("begin", task.initial_state.tolist(), task.dt / substeps, substeps)
+            require_started(task, np.array(state))
+            trajectory = run_episode(process.advance, controller, task, len(self.inputs))
+            process.sound = trajectory.ended == COMPLETE
+            with contextlib.suppress(_CrashError):  # the execution is over
+                process.ask("free")
+            return trajectory
 
     def _substeps(self, task: Task) -> int:
         ratio = 1.0 if self.step is None else task.dt / self.step
@@ -114,19 +131,23 @@ class FMU:
         return round(ratio)
 
     @contextlib.contextmanager
-    def _instance(self) -> Iterator[_Instance]:
-        from fmpy.simulation import instantiate_fmu
-
+    def _process(self) -> Iterator[_Process]:
+        """Lend a process; one in which anything went wrong is not used again."""
+        idle = self._idle.setdefault(os.getpid(), [])
         try:
-            with _LOADING:
-                fmu = instantiate_fmu(self._folder, self._description, fmi_type="CoSimulation")
-        except Exception as error:  # FMPy raises Exception itself
-            raise ExecutionError(f"the FMU {self.path.name} cannot be instantiated: {error}") from error
-        instance = _Instance(self, fmu)
+            process = idle.pop()
+        except IndexError:
+            process = _Process(self._setup)
         try:
-            yield instance
+            yield process
+        except BaseException:
+            process.sound = False
+            raise
         finally:
-            instance.free()
+            if process.sound:
+                idle.append(process)
+            else:
+                process.end()
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if not name.startswith("_")}
@@ -136,64 +157,81 @@ class FMU:
         self._open()
 
 
-class _Instance:
-    """One simulation, and what FMI 2 and 3 call differently."""
+class _CrashError(ExecutionError):
+    """The FMU has crashed its process."""
 
-    def __init__(self, system: FMU, fmu: Any) -> None:
-        self.system, self.fmu = system, fmu
-        self.is_fmi3 = system._description.fmiVersion.startswith("3")
-        self.step, self.substeps, self.steps = 0.0, 1, 0
-        self.set = fmu.setFloat64 if self.is_fmi3 else fmu.setReal
-        self.get = fmu.getFloat64 if self.is_fmi3 else fmu.getReal
-        self.initialised = False
 
-    def set_start(self, x: Array) -> None:
-        starts = self.system._starts
-        if len(x) != len(starts):
-            return  # require_started says so
-        try:
-            self.set(starts, x.tolist())
-        except Exception as error:
-            names = ", ".join(self.system.start.values())
-            raise InputError(f"the FMU does not let the start values of {names} be set: {error}") from error
+class _Process:
+    """The process that runs an FMU; see :mod:`ctxval.systems.fmu_process`.
 
-    def initialise(self) -> None:
-        try:
-            for variable, value in self.system._parameters:
-                _set_parameter(self.fmu, variable, value)
-            if not self.is_fmi3:
-                self.fmu.setupExperiment(startTime=0.0)
-            self.fmu.enterInitializationMode()
-            self.fmu.exitInitializationMode()
-        except Exception as error:
-            raise ExecutionError(f"the FMU {self.system.path.name} cannot be initialised: {error}") from error
-        self.initialised = True
+    Attributes:
+        sound: whether it can be used again.
+    """
 
-    def state(self) -> Array:
-        return np.array(self.get(self.system._outputs), dtype=np.float64)
+    def __init__(self, setup: Mapping[str, Any]) -> None:
+        path = os.pathsep.join(entry for entry in sys.path if entry)
+        self.sound, self.size = True, len(setup["states"])
+        # -P: the folder of the program has modules named as those of others. A session of its own: Ctrl-C is for the
+        # campaign, which ends after what is running.
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", str(_PROGRAM), str(os.getpid())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            encoding="utf-8",
+            env={**os.environ, "PYTHONPATH": path},
+            start_new_session=True,
+        )
+        self._send(setup)
+
+    def _send(self, message: Any) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):  # it has crashed, which the answer will say
+            self._process.stdin.write(json.dumps(message) + "\n")
+            self._process.stdin.flush()
+
+    def ask(self, act: str, *arguments: Any) -> Any:
+        """Have something done; return what came of it.
+
+        Raises:
+            InputError, ExecutionError: the FMU refuses it, or crashes.
+        """
+        assert self._process.stdout is not None
+        self._send([act, *arguments])
+        line = self._process.stdout.readline()
+        if not line.endswith("\n"):
+            self.sound = False
+            status = self._process.wait()
+            how = signal_name(-status) if status < 0 else f"status {status}"
+            raise _CrashError(f"the FMU crashed its process ({how})")
+        answer = json.loads(line)
+        if "refused" in answer:
+            raise (InputError if answer["input"] else ExecutionError)(answer["refused"])
+        return answer["value"]
 
     def advance(self, u: Array) -> tuple[Array, str]:
         """Hold the inputs over one control step; return the state, and why it failed if it did."""
-        nothing = np.full(len(self.system.states), np.nan)
         try:
-            if len(u):
-                self.set(self.system._inputs, u.tolist())
-            for _ in range(self.substeps):
-                # A product, not a sum: the time of a long run is exact.
-                ended = self.fmu.doStep(self.steps * self.step, self.step)
-                self.steps += 1
-                if ended is not None and ended[1]:
-                    return nothing, "the FMU terminated the simulation"
-            return self.state(), ""
-        except Exception as error:
-            return nothing, f"the FMU failed ({error})"
+            state, reason = self.ask("advance", u.tolist())
+        except _CrashError as crash:
+            state, reason = None, str(crash)
+        return np.full(self.size, np.nan) if state is None else np.array(state), reason
 
-    def free(self) -> None:
-        if self.initialised:
-            with contextlib.suppress(Exception):  # it may have failed before
-                self.fmu.terminate()
-        with contextlib.suppress(Exception):
-            self.fmu.freeInstance()
+    def end(self) -> None:
+        """Kill the process: it has nothing that must be kept."""
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            with contextlib.suppress(OSError):
+                pipe.close()
+
+
+def _clean(idle: dict[int, list[_Process]], folder: str, owner: int) -> None:
+    """End this process's own processes, and remove the files where it was this one that unpacked them."""
+    for process in idle.pop(os.getpid(), []):
+        process.end()
+    if os.getpid() == owner:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _unpacked(path: Path) -> tuple[Any, str]:
@@ -230,9 +268,3 @@ def _references(known: Mapping[str, Any], names: Sequence[str]) -> list[int]:
             kind = f"{variable.type}{' array' if variable.dimensions else ''}"
             raise InputError(f"the FMU's variable {name!r} must be one real number, it is of type {kind}.")
     return [known[name].valueReference for name in names]
-
-
-def _set_parameter(fmu: Any, variable: Any, value: Any) -> None:
-    enumeration = "Int64" if hasattr(fmu, "setInt64") else "Integer"
-    kind = enumeration if variable.type == "Enumeration" else variable.type
-    getattr(fmu, f"set{kind}")([variable.valueReference], [value])

@@ -18,6 +18,7 @@ from ctxval.controller import Controller
 from ctxval.errors import CtxvalError, ExecutionError, InputError
 from ctxval.exchange import write_controller, write_task
 from ctxval.systems.episode import require_one
+from ctxval.systems.guard import guarded
 from ctxval.task import Task
 from ctxval.trajectory import COMPLETE, Trajectory
 
@@ -35,7 +36,7 @@ class Subprocess:
     ``controller.npz`` (see :mod:`ctxval.exchange`). The command is run with that folder as its last argument, and
     writes ``trajectory.npz`` (times, states, inputs, perhaps ended) or ``trajectory.csv`` (columns ``t, x0, ..., u0,
     ...``, no inputs in the last row) into it. An exit status other than 0 is a failed execution, whose reason is the
-    last line of stderr. Whatever the command started is ended with it.
+    last line of stderr. Whatever the command started is ended with it, and with this process, however that ends.
 
     Args:
         command: the program and its arguments; a string is split as a shell would. No shell runs it.
@@ -106,13 +107,14 @@ def _run(command: Sequence[str], folder: Path, timeout: float) -> None:
         except OSError as error:
             raise ExecutionError(f"the command cannot be started: {error}") from error
         try:
-            status = process.wait(timeout)
+            with guarded(process.pid):
+                status = process.wait(timeout)
         except subprocess.TimeoutExpired:
             raise ExecutionError(f"the command did not end within {timeout:g} s and was killed") from None
         finally:
             _kill_group(process)
     if status:
-        how = f"was ended by {_signal_name(-status)}" if status < 0 else f"ended with status {status}"
+        how = f"was ended by {signal_name(-status)}" if status < 0 else f"ended with status {status}"
         raise ExecutionError(f"the command {how}: {_last_line(folder / 'stderr.txt') or 'nothing on stderr'}")
 
 
@@ -127,7 +129,8 @@ def _kill_group(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def _signal_name(number: int) -> str:
+def signal_name(number: int) -> str:
+    """Return a signal's name."""
     try:
         return signal.Signals(number).name
     except ValueError:

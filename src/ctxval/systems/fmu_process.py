@@ -1,0 +1,171 @@
+"""The process that an FMU runs in, which it may crash; :mod:`ctxval.systems.fmu` starts this file as a program.
+
+Each line that comes in is JSON, what to do and its arguments, and so is each that goes out, what came of it. Nothing of
+ctxval is imported: the process starts in the time that FMPy takes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import IO, Any
+
+_POLL = 0.5
+"""Seconds between two looks whether the campaign is still there."""
+
+
+class Refused(Exception):  # noqa: N818
+    """What an FMU does not do, and whether the user's input is to blame."""
+
+    def __init__(self, sentence: str, *, input_is_wrong: bool = False) -> None:
+        super().__init__(sentence)
+        self.input_is_wrong = input_is_wrong
+
+
+class Unit:
+    """An unpacked FMU, of which one instance at a time is simulated; FMI 2 and 3 call things differently.
+
+    Args:
+        folder: where it is unpacked.
+        name: of its file.
+        states, inputs: value references.
+        start: names of the variables whose start values set the state.
+        parameters: values by name.
+    """
+
+    def __init__(
+        self,
+        folder: str,
+        name: str,
+        states: list[int],
+        inputs: list[int],
+        start: list[str],
+        parameters: dict[str, Any],
+    ) -> None:
+        import fmpy
+
+        self.folder, self.name, self.states, self.inputs, self.start = folder, name, states, inputs, start
+        self.description = fmpy.read_model_description(folder)
+        known = {variable.name: variable for variable in self.description.modelVariables}
+        self.start_references = [known[variable].valueReference for variable in start]
+        self.parameters = [(known[variable], value) for variable, value in parameters.items()]
+        self.is_fmi3 = self.description.fmiVersion.startswith("3")
+        self.fmu: Any = None
+        self.initialised = False
+
+    def begin(self, x: list[float] | None, step: float, substeps: int) -> list[float]:
+        """Start a simulation in a state, or as the FMU would; return the state in which it stands."""
+        from fmpy.simulation import instantiate_fmu
+
+        self.steps, self.step, self.substeps = 0, step, substeps
+        try:
+            self.fmu = instantiate_fmu(self.folder, self.description, fmi_type="CoSimulation")
+        except Exception as error:  # FMPy raises Exception itself
+            raise Refused(f"the FMU {self.name} cannot be instantiated: {error}") from error
+        self._set, self._get = (
+            (self.fmu.setFloat64, self.fmu.getFloat64) if self.is_fmi3 else (self.fmu.setReal, self.fmu.getReal)
+        )
+        # Another number of states is for the campaign to say.
+        if x is not None and len(x) == len(self.start):
+            self._set_start(x)
+        self._initialise()
+        return self._state()
+
+    def _set_start(self, x: list[float]) -> None:
+        try:
+            self._set(self.start_references, x)
+        except Exception as error:
+            names = ", ".join(self.start)
+            raise Refused(
+                f"the FMU does not let the start values of {names} be set: {error}", input_is_wrong=True
+            ) from error
+
+    def _initialise(self) -> None:
+        try:
+            for variable, value in self.parameters:
+                _set_parameter(self.fmu, variable, value)
+            if not self.is_fmi3:
+                self.fmu.setupExperiment(startTime=0.0)
+            self.fmu.enterInitializationMode()
+            self.fmu.exitInitializationMode()
+        except Exception as error:
+            raise Refused(f"the FMU {self.name} cannot be initialised: {error}") from error
+        self.initialised = True
+
+    def _state(self) -> list[float]:
+        return [float(value) for value in self._get(self.states)]
+
+    def advance(self, u: list[float]) -> tuple[list[float] | None, str]:
+        """Hold the inputs over one control step; return the state, or None and why it failed."""
+        try:
+            if u:
+                self._set(self.inputs, u)
+            for _ in range(self.substeps):
+                # A product, not a sum: the time of a long run is exact.
+                ended = self.fmu.doStep(self.steps * self.step, self.step)
+                self.steps += 1
+                if ended is not None and ended[1]:
+                    return None, "the FMU terminated the simulation"
+            return self._state(), ""
+        except Exception as error:
+            return None, f"the FMU failed ({error})"
+
+    def free(self) -> None:
+        """End the simulation."""
+        fmu, self.fmu = self.fmu, None
+        if fmu is None:
+            return
+        if self.initialised:
+            with contextlib.suppress(Exception):  # it may have failed before
+                fmu.terminate()
+        self.initialised = False
+        with contextlib.suppress(Exception):
+            fmu.freeInstance()
+
+
+def _set_parameter(fmu: Any, variable: Any, value: Any) -> None:
+    enumeration = "Int64" if hasattr(fmu, "setInt64") else "Integer"
+    kind = enumeration if variable.type == "Enumeration" else variable.type
+    getattr(fmu, f"set{kind}")([variable.valueReference], [value])
+
+
+def serve(requests: IO[str], answers: IO[str]) -> None:
+    """Do what each line says, until there are no more."""
+    unit = Unit(**json.loads(requests.readline()))
+    acts: dict[str, Callable[..., Any]] = {"begin": unit.begin, "advance": unit.advance, "free": unit.free}
+    for line in requests:
+        act, *arguments = json.loads(line)
+        try:
+            answer: dict[str, Any] = {"value": acts[act](*arguments)}
+        except Refused as refused:
+            answer = {"refused": str(refused), "input": refused.input_is_wrong}
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
+
+
+def _watch(parent: int) -> None:
+    """Leave with the campaign, also out of a step that does not end."""
+    while os.getppid() == parent:
+        time.sleep(_POLL)
+    os._exit(1)
+
+
+def main() -> None:
+    """Serve the process that started this one; what an FMU reads and prints must not get between."""
+    threading.Thread(target=_watch, args=(int(sys.argv[1]),), daemon=True).start()
+    requests, answers = os.fdopen(os.dup(0), encoding="utf-8"), os.fdopen(os.dup(1), "w", encoding="utf-8")
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.dup2(2, 1)
+    serve(requests, answers)
+    # An FMU that is unloaded badly could still crash, and this process has nothing left to do.
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()
