@@ -127,6 +127,15 @@ FAMILIES: dict[str, tuple[Callable[[int, np.random.Generator], Values], tuple[in
 }
 
 
+NOISY: dict[str, str] = {"noisy paths": "prior", "noisy kinks": "kinks"}
+"""Families whose values come with noise, with those of their expected values. The tasks are random draws."""
+
+NOISE = 0.2
+"""Standard deviation of that noise, as a share of that of the expected values."""
+
+NOISY_CHECKPOINTS = {1: (12, 24), 2: (30,)}
+
+
 def maximum(values: Values, d: int) -> float:
     """Return the maximum over the unit cube: a dense sample, and climbs from its best points."""
     rng = np.random.default_rng(0)
@@ -202,6 +211,8 @@ class Run:
         """After how many executions to certify."""
         if self.family in SYSTEMS:
             return SYSTEMS[self.family].checkpoints
+        if self.family in NOISY:
+            return NOISY_CHECKPOINTS[self.dimension]
         return CHECKPOINTS[self.dimension]
 
 
@@ -209,26 +220,34 @@ def history(run: Run) -> tuple[Array, Array, float]:
     """Return points, values and the true maximum of one campaign."""
     if run.family in SYSTEMS:
         return stored_history(SYSTEMS[run.family], run.seed)
-    make, _ = FAMILIES[run.family]
-    rng = np.random.default_rng([run.seed, run.dimension, sorted(FAMILIES).index(run.family)])
+    family = NOISY.get(run.family, run.family)
+    make, _ = FAMILIES[family]
+    rng = np.random.default_rng([run.seed, run.dimension, sorted(FAMILIES).index(family)])
     values = make(run.dimension, rng)
+    truth = maximum(values, run.dimension)
+    if run.family in NOISY:
+        points = rng.random((run.checkpoints[-1], run.dimension))
+        spread = float(values(rng.random((2000, run.dimension))).std())
+        return points, values(points) + NOISE * spread * rng.normal(size=len(points)), truth
     search = GPUCB()
     search.reset(run.dimension, run.seed)
-    for _ in range(CHECKPOINTS[run.dimension][-1]):
+    for _ in range(run.checkpoints[-1]):
         point = search.ask()
         search.tell(point, values(point))
-    return search.points, search.values, maximum(values, run.dimension)
+    return search.points, search.values, truth
 
 
-def certified(points: Array, values: Array, seed: int, prior: Prior | None = None) -> dict[str, Any]:
+def certified(
+    points: Array, values: Array, seed: int, prior: Prior | None = None, *, stochastic: bool = False
+) -> dict[str, Any]:
     """Return the bounds after a history, and what the diagnosis says."""
     states = ["completed"] * len(values)
     sample = Sample(points, values, ["acquisition"] * len(values), states)  # type: ignore[list-item, arg-type]
     try:
-        found = draw_maxima(sample, draws=DRAWS, paths=PATHS, seed=seed, prior=prior)
+        found = draw_maxima(sample, draws=DRAWS, paths=PATHS, seed=seed, prior=prior, stochastic=stochastic)
     except CertificateError as error:
         return {"n": len(values), "refused": str(error)}
-    details = certify_posterior(sample, found=found).details
+    details = certify_posterior(sample, found=found, stochastic=stochastic).details
     return {
         "n": len(values),
         "best": sample.best,
@@ -245,7 +264,8 @@ def campaign(run: Run) -> dict[str, Any]:
     """Run one campaign and certify it at its checkpoints."""
     with single_threaded():
         points, values, truth = history(run)
-        checks = [certified(points[:n], values[:n], run.seed) for n in run.checkpoints]
+        noisy = run.family in NOISY
+        checks = [certified(points[:n], values[:n], run.seed, stochastic=noisy) for n in run.checkpoints]
         exact = []
         if run.family == "prior":  # the same draws, once more as Bayes has it
             exact = [certified(points[:n], values[:n], run.seed, Prior(spread_share=1.0)) for n in run.checkpoints]
@@ -286,7 +306,8 @@ def stored(family: str, dimension: int) -> list[dict[str, Any]]:
 def missing(campaigns: int) -> Iterator[Run]:
     """Yield the campaigns that are not stored: families of few dimensions, systems, families of more dimensions."""
     families = [(family, d) for family, (_, dimensions) in FAMILIES.items() for d in dimensions]
-    yield from _in_turn([name for name in families if name[1] <= 2], campaigns)
+    noisy = [(family, d) for family in NOISY for d in NOISY_CHECKPOINTS]
+    yield from _in_turn([*noisy, *(name for name in families if name[1] <= 2)], campaigns)
     yield from _in_turn([(name, system.dimension) for name, system in SYSTEMS.items()], campaigns)
     yield from _in_turn([name for name in families if name[1] > 2], campaigns)
 
