@@ -113,16 +113,17 @@ def _summary(trials: list[Trial], threshold: float, *, decided: bool) -> dict[st
 # The stored campaigns
 
 
-def name_of(one: Decision) -> str:
-    """Return the name of the file that a campaign is stored in."""
-    return f"decided-{one.family}-{one.dimension}d"
+def name_of(family: str, dimension: int) -> str:
+    """Return the name of the file that campaigns are stored in."""
+    return f"decided-{family}-{dimension}d"
 
 
 def missing(campaigns: int) -> list[Decision]:
     """Return the campaigns that are not stored."""
     asked = list(wanted(campaigns))
-    known = {name: {_key(line) for line in lines(name)} for name in {name_of(one) for one in asked}}
-    return [one for one in asked if (one.search, one.share, one.seed) not in known[name_of(one)]]
+    names = {(one.family, one.dimension) for one in asked}
+    known = {name: {_key(line) for line in lines(name_of(*name))} for name in names}
+    return [one for one in asked if (one.search, one.share, one.seed) not in known[one.family, one.dimension]]
 
 
 def _key(line: dict[str, Any]) -> tuple[str, float, int]:
@@ -132,12 +133,12 @@ def _key(line: dict[str, Any]) -> tuple[str, float, int]:
 def main() -> None:
     """Run what is missing."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--campaigns", type=int, default=40, help="for each family in one dimension; fewer in two")
+    parser.add_argument("--campaigns", type=int, default=16, help="for each family in one dimension; fewer in two")
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
     for one, result in all_of(decide, missing(arguments.campaigns), arguments.workers):
-        append(name_of(one), result)
+        append(name_of(one.family, one.dimension), result)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,24 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import beta, binom
 
-from calibrate import CONFIDENCES, DRAWS, FAMILIES, PATHS, RESULTS, ROOT, SYSTEMS, Run, stored
-from ctxval.certificates.diagnostics import LEVEL, RESOLUTION
+from calibrate import (
+    CONFIDENCES,
+    DRAWS,
+    FAMILIES,
+    NOISE,
+    NOISY,
+    NOISY_CHECKPOINTS,
+    PATHS,
+    RESULTS,
+    ROOT,
+    SYSTEMS,
+    Run,
+    lines,
+    stored,
+)
+from calibrate_verdicts import BUDGETS, DRIVEN, SEARCHES, SHARES, name_of
+from ctxval.certificates import RESOLUTION
+from ctxval.certificates.diagnostics import LEVEL
 
 PAGE = ROOT / "docs" / "calibration.md"
 THRESHOLDS = (0.5, 0.8, 0.9, 0.95, 0.99)
@@ -143,6 +159,64 @@ def validation_table(names: Iterable[tuple[str, int]]) -> str:
     return table(header, rows)
 
 
+# Verdicts
+
+
+def decided() -> dict[tuple[str, int, str], list[dict[str, Any]]]:
+    """Return the campaigns that ran until they were decided, by family, dimension and search."""
+    functions = [(family, d) for family, (_, ds) in FAMILIES.items() for d in ds if d in BUDGETS]
+    systems = [(name, SYSTEMS[name].dimension) for name in DRIVEN]
+    found = {}
+    for family, d in [*functions, *systems]:
+        results = lines(name_of(family, d))
+        for search in (*SEARCHES, "auto"):
+            of_search = [result for result in results if result["search"] == search]
+            if of_search:
+                found[family, d, search] = of_search
+    return found
+
+
+def verdict_table() -> str:
+    """Return what campaigns answered that ran until they were decided."""
+    below, above = SHARES
+    rows = []
+    for (family, d, search), results in decided().items():
+        false = [result for result in results if result["share"] == below]
+        true = [result for result in results if result["share"] == above]
+        rows.append([family, f"{d}-D", search, *_answers(false, "validated"), *_answers(true, "undecided")])
+    return table(
+        [
+            *("function", "", "search"),
+            *(f"tau = {below:g} d*: validated, falsely", "executions"),
+            *(f"tau = {above:g} d*: left undecided", "executions"),
+        ],
+        rows,
+    )
+
+
+def _answers(results: list[dict[str, Any]], wrong: str) -> tuple[str, str]:
+    """Return how many gave the answer that they should not, and quartiles of the executions."""
+    if not results:
+        return "-", "-"
+    count = sum(result["answer"] == wrong for result in results)
+    low, middle, high = np.quantile([result["executions"] for result in results], [0.25, 0.5, 0.75])
+    return f"{count} of {len(results)}", f"{middle:.3g} ({low:.3g} to {high:.3g})"
+
+
+def verdict_summary() -> str:
+    """Return how many verdicts were false in all, with an interval."""
+    results = [result for found in decided().values() for result in found]
+    low = [result for result in results if result["share"] == SHARES[0]]
+    false = sum(result["answer"] == "validated" for result in low)
+    if not low:
+        return "None is stored yet."
+    most = 100 - interval(false, len(low))[0]
+    return (
+        f"Of {len(low)} campaigns with a threshold below d*, {false} said `validated` ({100 * false / len(low):.2g} %, "
+        f"at most {most:.2g} % with confidence 97.5 %; the target is 5 %)."
+    )
+
+
 # Pictures
 
 
@@ -234,9 +308,24 @@ From the campaigns that `ctxval reproduce` stored, ten seeds each; ten cannot te
 
 {systems}
 
+## Noisy systems
+
+Values with normal noise of {noise:g} standard deviations of the expected values, at random tasks, with `--stochastic`:
+the bound is one on the largest expected value, and that is what it is held against.
+
+{noisy}
+
+## Until decided
+
+Campaigns that run as `--until-decided` does, in which the tasks that nothing came near to are executed before anything
+is validated; at most {budgets}. One threshold is below d*, so that `validated` is false, and one above, so that nothing
+can be falsified. {verdicts}
+
+{verdict_table}
+
 ## Said to be validated, and not so
 
-Campaigns that say `validated` with confidence 95 % against a threshold below the true maximum, the diagnosis on. The
+The same of campaigns that never mind what they leave uncovered, and are certified where they stand: campaigns that say `validated` with confidence 95 % against a threshold below the true maximum, the diagnosis on. The
 target is at most 5 %. A threshold far below d* is hardly ever validated; one just below it is as hard as can be.
 
 {validation}
@@ -250,12 +339,13 @@ def main() -> None:
     matplotlib.use("Agg")
     names = [(family, d) for family, (_, dimensions) in FAMILIES.items() for d in dimensions]
     systems = [(name, system.dimension) for name, system in SYSTEMS.items()]
-    all_cells = cells([*names, *systems])
+    noisy = [(name, d) for name in NOISY for d in NOISY_CHECKPOINTS]
+    all_cells = cells([*names, *systems, *noisy])
     draw_coverage()
     draw_tightness()
     PAGE.write_text(
         TEXT.format(
-            total=sum(len(stored(*name)) for name in [*names, *systems]),
+            total=sum(len(stored(*name)) for name in [*names, *systems, *noisy]),
             bounds=sum(len(cell.results) for cell in all_cells),
             draws=DRAWS,
             paths=PATHS,
@@ -265,6 +355,11 @@ def main() -> None:
             systems=used_table(systems),
             validation=validation_table(names),
             system_validation=validation_table(systems),
+            noise=NOISE,
+            noisy=used_table(noisy),
+            budgets=" and ".join(f"{budget} executions in {d}-D" for d, budget in BUDGETS.items()),
+            verdicts=verdict_summary(),
+            verdict_table=verdict_table(),
         )
     )
     print(f"page: {Path(PAGE).relative_to(ROOT)}")

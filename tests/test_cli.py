@@ -111,7 +111,7 @@ def test_a_falsified_model_exits_with_1(invoke) -> None:  # type: ignore[no-unty
 
 
 def test_the_human_report_names_the_worst_task_and_the_verdict(invoke) -> None:  # type: ignore[no-untyped-def]
-    result = invoke("run", "rig:validation", "--budget", "6", "--threshold", "5")
+    result = invoke("run", "rig:validation", "--budget", "6", "--threshold", "5", "--resolution", "1")
     assert result.exit_code == 0
     assert "goal =" in result.stdout
     assert "validated against 5" in result.stdout

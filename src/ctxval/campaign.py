@@ -141,8 +141,10 @@ class Campaign(Ledger):
         def chosen() -> OpenTrial | None:
             return None if until is not None and until(self) else self._open(None, attempts=1)
 
-        hands = self._crew(workers, executor, timeout)
-        return self._carry_out(self._within(budget, chosen), hands, on_trial, _Patience(retries, retry_failures))
+        hands, patience = self._crew(workers, executor, timeout), _Patience(retries, retry_failures)
+        if retry_failures and hands is None:
+            raise InputError("retry_failures is for workers, an executor or a timeout, and none is given.")
+        return self._carry_out(self._within(budget, chosen), hands, on_trial, patience)
 
     def run_until_decided(
         self,

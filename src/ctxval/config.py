@@ -7,13 +7,13 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from ctxval import cases
 from ctxval.campaign import Campaign
-from ctxval.certificates import KINDS, RESOLUTION
-from ctxval.errors import CtxvalError, InputError
+from ctxval.certificates import KINDS, RESOLUTION, USES, require_use
+from ctxval.errors import CertificateError, CtxvalError, InputError, UnknownNameError
 from ctxval.experiment import Experiment
 from ctxval.parts import argument, part, reference, require_types, space_of, task_function
 from ctxval.searches import NAMES as SEARCHES
@@ -77,6 +77,19 @@ class CertificateTable(BaseModel):
         if kind not in KINDS:
             raise PydanticCustomError("kind", f"the kind must be one of {', '.join(KINDS)}")
         return kind
+
+    @model_validator(mode="after")
+    def _used(self) -> CertificateTable:
+        changed = {name for name in USES if hasattr(self, name) and getattr(self, name) != _default(self, name)}
+        try:
+            require_use(self.kind, sorted(changed))
+        except CertificateError as error:
+            raise PydanticCustomError("use", str(error).removesuffix(".")) from error
+        return self
+
+
+def _default(table: BaseModel, name: str) -> Any:
+    return type(table).model_fields[name].default
 
 
 Part = str | dict[str, Any]
@@ -268,6 +281,11 @@ def _read_toml(path: Path) -> dict[str, Any]:
 def _sentence(target: str, error: ValidationError) -> str:
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "use":
+        return f"{target}: {first['msg']}."
+    if first["type"] == "extra_forbidden":
+        table = CertificateTable if first["loc"][:-1] == ("certificate",) else Settings
+        return f"{target}: {UnknownNameError.among('setting', str(first['loc'][-1]), table.model_fields)}"
     return f"{target}: {where}: {first['msg'].lower()}, got {str(first['input'])[:100]!r}."
 
 

@@ -5,13 +5,14 @@ from ctxval.certificates.convergence import TheoremConstants, certify_convergenc
 from ctxval.certificates.covering import RESOLUTION, covering, farthest_task
 from ctxval.certificates.diagnostics import Diagnosis, diagnose
 from ctxval.certificates.forecast import Forecast, forecast
-from ctxval.certificates.named import KINDS, Options, certify, require_possible
+from ctxval.certificates.named import KINDS, USES, Options, certify, require_possible, require_use
 from ctxval.certificates.posterior import Maxima, certify_posterior, draw_maxima, instantaneous_bound
 from ctxval.certificates.scenario import certify_audit, certify_scenario, samples_needed, tail, volume_bound
 
 __all__ = [
     "KINDS",
     "RESOLUTION",
+    "USES",
     "Certificate",
     "Diagnosis",
     "Forecast",
@@ -32,6 +33,7 @@ __all__ = [
     "instantaneous_bound",
     "rate",
     "require_possible",
+    "require_use",
     "samples_needed",
     "tail",
     "volume_bound",

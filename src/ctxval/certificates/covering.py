@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 
 from ctxval.arrays import Array
 
-RESOLUTION = 0.17
+RESOLUTION = 0.125
 """How far from every trial a task may be, in diagonals of the task space, unless the user states more; what lies
 farther away may be unlike anything that was seen (docs/calibration.md)."""
 

@@ -16,6 +16,16 @@ from ctxval.trial import Origin
 KINDS = ("posterior", "audit", "scenario", "sampling-discarding", "convergence")
 """What can be certified, the bound that people will use first."""
 
+USES: dict[str, tuple[str, ...]] = {
+    "discard": ("sampling-discarding",),
+    "constant": ("convergence",),
+    "theorem": ("convergence",),
+    "stochastic": ("posterior",),
+    "resolution": ("posterior",),
+    "volume": ("audit", "scenario", "sampling-discarding"),
+}
+"""Which kinds have a use for an option."""
+
 _NO_DISCARD = "sampling and discarding needs to be told how many to discard, at least 1."
 
 
@@ -63,6 +73,18 @@ def certify(sample: Sample, kind: str, confidence: float, options: Options | Non
             raise CertificateError(f"Proposition 1 is about tasks that GP-UCB chose; {chosen.search} chose these.")
         return certify_convergence(sample, _constant(sample, confidence, chosen), confidence)
     raise UnknownNameError.among("certificate", kind, KINDS)
+
+
+def require_use(kind: str, given: Iterable[str]) -> None:
+    """Refuse options that a kind would ignore: somebody who gives one believes that it counts.
+
+    Raises:
+        CertificateError: one is given that is for other kinds.
+    """
+    for name in given:
+        if kind not in USES[name]:
+            kinds = " or ".join(USES[name])
+            raise CertificateError(f"{name} is for certificates of the kind {kinds}; the kind here is {kind}.")
 
 
 def require_possible(origins: Iterable[Origin], kind: str, options: Options) -> None:

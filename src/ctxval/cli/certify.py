@@ -8,7 +8,16 @@ from typing import Annotated, Any
 import typer
 
 from ctxval.campaign import Campaign
-from ctxval.certificates import KINDS, Certificate, Options, Sample, TheoremConstants, certify, require_possible
+from ctxval.certificates import (
+    KINDS,
+    Certificate,
+    Options,
+    Sample,
+    TheoremConstants,
+    certify,
+    require_possible,
+    require_use,
+)
 from ctxval.cli.base import (
     FALSIFIED,
     AsJson,
@@ -26,16 +35,6 @@ from ctxval.errors import CertificateError, InputError, UnknownNameError
 from ctxval.store import Store
 from ctxval.trial import Trial
 from ctxval.verdict import Verdict, counterexample, judge, judge_by, require_threshold
-
-_OF_KINDS = {
-    "discard": ("sampling-discarding",),
-    "constant": ("convergence",),
-    "theorem": ("convergence",),
-    "stochastic": ("posterior",),
-    "resolution": ("posterior",),
-    "volume": ("audit", "scenario", "sampling-discarding"),
-}
-"""Which kinds have a use for an option."""
 
 
 @app.command("certify")
@@ -85,7 +84,7 @@ def certify_store(
     _require_shares(confidence, volume)
     if chosen not in KINDS:
         raise UnknownNameError.among("certificate", chosen, KINDS)
-    require_use(chosen, given)
+    require_use(chosen, [name for name, value in given.items() if value is not None])
     _require_together(given, limit)
     if audit is not None:
         require_possible([trial.origin for trial in opened.trials()], chosen, options)
@@ -138,18 +137,6 @@ def decide(campaign: Campaign, threshold: float, confidence: float, table: Certi
     except CertificateError as error:
         return Verdict("undecided", threshold, str(error))
     return judge_by(certificate, trials, threshold, volume=table.volume)
-
-
-def require_use(kind: str, given: dict[str, Any]) -> None:
-    """Refuse options that a kind of certificate would ignore: somebody who gives one believes that it counts.
-
-    Raises:
-        InputError: one is given that is for others.
-    """
-    for name, value in given.items():
-        if value is not None and kind not in _OF_KINDS[name]:
-            kinds = " or ".join(_OF_KINDS[name])
-            raise InputError(f"--{name} is for certificates of the kind {kinds}; the kind here is {kind}.")
 
 
 def _require_together(given: dict[str, Any], threshold: float | None) -> None:

@@ -28,7 +28,7 @@ from ctxval.cli.base import (
     progress,
     worst_of,
 )
-from ctxval.cli.certify import decide, require_use
+from ctxval.cli.certify import decide
 from ctxval.config import Settings, read_settings
 from ctxval.errors import InputError
 from ctxval.experiment import Experiment
@@ -71,7 +71,6 @@ def run(
     given = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence, "seed": seed}
     settings = read_settings(target, {**given, "store": store, "options": options})
     said = {"stochastic": stochastic, "resolution": resolution}
-    require_use(settings.certificate.kind, said)
     settings = settings.certified_as({key: value for key, value in said.items() if value is not None})
     experiment = settings.load()
     if truth:

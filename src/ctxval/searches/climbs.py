@@ -137,7 +137,7 @@ class Climbs(SequentialSearch):
         """Return the next point of the last climb, or of a new one; None where nothing is predicted."""
         climb = self._state()
         optimism = self._calibrated()
-        promise = _Promise(prediction, _discrepancy(prediction, self.points, self.values), optimism)
+        promise = _Promise(prediction, self._discrepancy(prediction), optimism)
         largest = float(np.nanmax(self.values, initial=0.0))
         if climb.misses < self.misses and climb.radius >= _LEAST_RADIUS:
             point = self._best(promise, climb, prediction.budget, rng)
@@ -149,6 +149,22 @@ class Climbs(SequentialSearch):
         bold = replace(promise, optimism=optimism * 4.0 ** (1 + climb.stale))
         point = self._best(bold, _Climb(), prediction.budget, rng)
         return None if point is None else self._noted(prediction, point, _Climb(climb.number + 1, _NEW_RADIUS))
+
+    def _discrepancy(self, prediction: Prediction) -> gp.GaussianProcess | None:
+        """Return the GP of log d - log d_hat over the points, on a scale that suits heavy tails; None without any."""
+        known = np.isfinite(self.values)
+        if not known.any():
+            return None
+        points, values = self.points[known], self.values[known]
+        expected = prediction.expected(points)[0]
+        floor = max(1e-3 * float(np.median(values)), 1e-12)
+        ratio = np.log(values + floor) - np.log(np.maximum(expected, 0.0) + floor)
+        usable = np.isfinite(ratio)
+        if not usable.any():
+            return None
+        size = max(float((ratio[usable] ** 2).mean()), 1e-8)
+        theta = np.log([size, 0.15 * np.sqrt(self.dimension)])
+        return gp.condition(Matern(2.5), theta, points[usable], ratio[usable], noise=1e-4 * size)
 
     def _calibrated(self) -> float:
         """Return kappa: by how much values differed from what was expected of them, for each unit of doubt."""
@@ -246,22 +262,6 @@ class _Promise:
     def more_than(self, value: float, point: Array) -> bool:
         """Return whether an execution at ``(d,)`` promises enough more than a value."""
         return bool(self(point[None])[0] > value * (1 + _PROMISING))
-
-
-def _discrepancy(prediction: Prediction, points: Array, values: Array) -> gp.GaussianProcess | None:
-    """Return the GP of log d - log d_hat over the points, on a scale that suits heavy tails."""
-    known = np.isfinite(values)
-    if not known.any():
-        return None
-    expected = prediction.expected(points[known])[0]
-    floor = max(1e-3 * float(np.median(values[known])), 1e-12)
-    ratio = np.log(values[known] + floor) - np.log(np.maximum(expected, 0.0) + floor)
-    usable = np.isfinite(ratio)
-    if not usable.any():
-        return None
-    size = max(float((ratio[usable] ** 2).mean()), 1e-8)
-    theta = np.log([size, 0.15 * np.sqrt(points.shape[1])])
-    return gp.condition(Matern(2.5), theta, points[known][usable], ratio[usable], noise=1e-4 * size)
 
 
 def _log_error(expected: Array, values: Array) -> float:
