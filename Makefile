@@ -7,7 +7,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test check reliability bench study reproduce calibrate pictures clean
+.PHONY: demo test check reliability bench bench-peers study reproduce search calibrate pictures clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -26,6 +26,11 @@ reliability: .venv/.test  ## kill -9 and resume, KILLS times
 bench: .venv/.test  ## speed, as ratios measured in one run
 	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
 
+bench-peers: .venv/peers/.installed .venv/peers-verifai/.installed  ## beside others; writes docs/benchmarks.md, and resumes
+	cd benchmarks && for group in peers peers-verifai; do for part in run overhead; do \
+	  ../.venv/$$group/bin/python -W ignore -m peers.$$part || exit 1; done; done
+	cd benchmarks && ../.venv/peers/bin/python -m peers.page
+
 study: .venv/.test  ## the running example over many seeds; writes docs/main-job.md
 	$(BIN)/python benchmarks/study_main_job.py
 
@@ -35,7 +40,16 @@ pictures: .venv/.installed  ## those of the README
 
 calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/calibration.md, and resumes
 	$(BIN)/python benchmarks/calibrate.py --campaigns $(CAMPAIGNS)
+	$(BIN)/python benchmarks/calibrate_verdicts.py
 	$(BIN)/python benchmarks/calibration_page.py
+
+search: .venv/.test  ## how many executions the searches need; writes docs/search.md, and resumes
+	$(BIN)/python benchmarks/study_auto.py
+	$(BIN)/python benchmarks/study_scalar.py linear-10 --search scalar
+	$(BIN)/python benchmarks/study_scalar.py dubins-basin
+	$(BIN)/python benchmarks/misleading.py
+	$(BIN)/python benchmarks/study_ablations.py
+	$(BIN)/python benchmarks/search_page.py
 
 clean:
 	rm -rf .venv build dist
@@ -51,6 +65,12 @@ clean:
 .venv/.test: pyproject.toml | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	touch $@ .venv/.installed
+
+.venv/peers/.installed .venv/peers-verifai/.installed: .venv/%/.installed: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1'  # knows groups
+	$(@D)/bin/python -m pip install --quiet --editable '.[searches,cases,mujoco]' --group $*
+	touch $@
 
 reproduce: .venv/.test  ## the paper's experiments in full; writes docs/reproduction.md, and resumes
 	$(BIN)/ctxval reproduce all --out docs/reproduction

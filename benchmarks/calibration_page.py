@@ -319,14 +319,17 @@ the bound is one on the largest expected value, and that is what it is held agai
 
 Campaigns that run as `--until-decided` does, in which the tasks that nothing came near to are executed before anything
 is validated; at most {budgets}. One threshold is below d*, so that `validated` is false, and one above, so that nothing
-can be falsified. {verdicts}
+can be falsified.
+
+{verdicts}
 
 {verdict_table}
 
 ## Said to be validated, and not so
 
-The same of campaigns that never mind what they leave uncovered, and are certified where they stand: campaigns that say `validated` with confidence 95 % against a threshold below the true maximum, the diagnosis on. The
-target is at most 5 %. A threshold far below d* is hardly ever validated; one just below it is as hard as can be.
+The same of campaigns that never mind what they leave uncovered, and are certified where they stand: campaigns that say
+`validated` with confidence 95 % against a threshold below the true maximum, the diagnosis on. The target is at most
+5 %. A threshold far below d* is hardly ever validated; one just below it is as hard as can be.
 
 {validation}
 

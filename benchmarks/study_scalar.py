@@ -8,12 +8,11 @@ then the table is printed. ``python benchmarks/study_scalar.py linear-10 dubins-
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from ctxval import Validation, searches
 from ctxval.arrays import Array
 from ctxval.distances import ComposedDistance
 from ctxval.searches.vector import predict_composed
-from study_auto import add_options, experiment, first_within, print_rows, truth
+from study_auto import Result, add_options, experiment, first_within, print_rows, stored, truth
 
 BUDGETS = {"pendulum": 25, "dubins-basin": 100, "dubins-heavy-tail": 100}
 BUDGETS |= {f"arm-{model}": 40 for model in ("fnn", "gp", "linear")} | {f"linear-{n}": 50 for n in range(1, 11)}
@@ -59,12 +58,13 @@ def suggest_by_vector(validation: Validation, seed: int) -> Callable[[list[Array
     return suggest
 
 
-def run(case: str, seed: int, search: str, folder: Path, truths: Path) -> dict[str, Any]:
-    """Return the distances of one search, one after the other up to 1 % of the maximum, running what is not stored."""
-    path = folder / f"{case}-{seed}-{search}.json"
-    if path.exists():
-        stored: dict[str, Any] = json.loads(path.read_text())
-        return stored
+def run(case: str, seed: int, search: str, folder: Path, truths: Path) -> Result:
+    """Return the distances of one search of a case, running what is not stored."""
+    return stored(folder / f"{case}-{seed}-{search}.json", partial(searched, case, seed, search, truths))
+
+
+def searched(case: str, seed: int, search: str, truths: Path) -> Result:
+    """Return the distances of one search, one after the other, up to 1 % of the maximum."""
     found = experiment(case, seed)
     best_known = truth(case, found, truths)
     validation = found.validation
@@ -77,13 +77,10 @@ def run(case: str, seed: int, search: str, folder: Path, truths: Path) -> dict[s
         points.append(suggest(points, values))
         seconds += time.process_time() - started
         values.append(float(validation.distances(validation.space.from_unit(points[-1])[None])[0]))
-    result = {"truth": best_known, "distances": values, "seconds": seconds / len(values)}
-    folder.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(result))
-    return result
+    return {"truth": best_known, "budget": BUDGETS[case], "distances": values, "seconds": seconds / len(values)}
 
 
-def row(case: str, search: str, results: list[dict[str, Any]]) -> str:
+def row(case: str, search: str, results: list[Result]) -> str:
     cells = []
     for percent in WITHIN:
         counts = [first_within(result, percent) for result in results]

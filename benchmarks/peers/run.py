@@ -1,0 +1,144 @@
+"""Run what is not stored: every method on every function, seed by seed.
+
+``python -m peers.run`` in ``benchmarks``, with the packages of one dependency group; the methods whose packages are
+not installed are left to another environment. Each result is stored at once, so a stopped run goes on, and all
+methods have the same seeds at any time, but for the one that is running.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+from pathlib import Path
+from typing import Any
+
+from peers.functions import CASES, SEEDS, function
+from peers.methods import METHODS
+from peers.recorder import Finished, Maximise, Recorder
+from study_auto import ROOT
+
+RESULTS = ROOT / "benchmarks" / "results" / "peers"
+STUDY = ROOT / "benchmarks" / "results" / "auto"
+CLOSE = 0.99
+"""Share of d* that finishes a run."""
+
+CUT = {("dubins-basin", "botorch-log-ei"): 60, ("dubins-basin", "botorch-ucb"): 60}
+"""Budgets of methods that take too long for the function's own."""
+
+Result = dict[str, Any]
+
+the_function = functools.lru_cache(maxsize=1)(function)
+"""The last one again: the arm's network takes longer to train than most methods to run."""
+
+
+def stored(name: str, folder: Path = RESULTS) -> list[Result]:
+    """Return the stored results of a function, or of ``overhead``."""
+    path = folder / f"{name}.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def keep(name: str, result: Result, folder: Path = RESULTS) -> None:
+    """Append a result."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / f"{name}.jsonl").open("a") as file:
+        file.write(json.dumps(result) + "\n")
+
+
+def record(maximise: Maximise, recorder: Recorder, seed: int) -> tuple[Recorder, str | None]:
+    """Return what a method asked for until it was finished or ended by itself, and why it could not go on if so."""
+    try:
+        maximise(recorder, recorder.function.dimension, recorder.budget, seed)
+    except Finished:
+        pass
+    except Exception as error:  # of whatever kind it is: a peer that fails has a row that says so
+        return recorder, f"{type(error).__name__}: {error}"
+    return recorder, None
+
+
+def improvements(values: list[float]) -> list[tuple[int, float]]:
+    """Return after how many executions a larger value than all before was found, and that value."""
+    found: list[tuple[int, float]] = []
+    for count, value in enumerate(values, 1):
+        if not found or value > found[-1][1]:
+            found.append((count, value))
+    return found
+
+
+def budget_of(case: str, method: str) -> int:
+    """Return how many executions a method is allowed."""
+    return CUT.get((case, method), CASES[case].budget)
+
+
+def run(case: str, method: str, seed: int) -> Result:
+    """Return the result of one run."""
+    maximise, found = METHODS[method].load(), the_function(case, seed)
+    recorder, error = record(maximise, Recorder(found, budget_of(case, method), CLOSE * found.maximum), seed)
+    return {
+        "method": method,
+        "seed": seed,
+        "maximum": found.maximum,
+        "executions": len(recorder.values),
+        "improvements": improvements(recorder.values),
+        "seconds": round(sum(recorder.seconds), 4),
+        "error": error,
+    }
+
+
+def of_the_study(case: str, method: str, seed: int, folder: Path = STUDY) -> Result | None:
+    """Return the result of a campaign that ``study_auto`` has stored, which is the same; None if it ended earlier."""
+    path = folder / (f"{case}-no-data-{seed}-auto.json" if method == "auto-no-data" else f"{case}-{seed}-{method}.json")
+    if not path.exists():
+        return None
+    campaign = json.loads(path.read_text())
+    values, maximum = [distance or 0.0 for distance in campaign["distances"]], campaign["truth"]
+    if max(values) < CLOSE * maximum and len(values) < CASES[case].budget:
+        return None
+    executions = next((k for k, value in enumerate(values, 1) if value >= CLOSE * maximum), CASES[case].budget)
+    return {
+        "method": method,
+        "seed": seed,
+        "maximum": maximum,
+        "executions": executions,
+        "improvements": improvements(values[:executions]),
+        "seconds": round(campaign["seconds"] * executions, 4),
+        "error": None,
+    }
+
+
+def applies(method: str, case: str) -> bool:
+    """Return whether a method can be given what it needs."""
+    needed = {"vector": CASES[case].vector, "auto-no-data": CASES[case].data}
+    return needed.get(method, True)
+
+
+def main() -> None:
+    """Run what is missing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cases", nargs="*", default=list(CASES), help=f"of {', '.join(CASES)}")
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
+    options = parser.parse_args()
+    methods = [name for name in options.methods if METHODS[name].installed]
+    for case in options.cases:
+        done = {(result["method"], result["seed"]) for result in stored(case)}
+        for seed in options.seeds:
+            for method in methods:
+                if applies(method, case) and (method, seed) not in done:
+                    result = of_the_study(case, method, seed) or run(case, method, seed)
+                    keep(case, result)
+                    share = max((value for _, value in result["improvements"]), default=0.0) / result["maximum"]
+                    print(
+                        case,
+                        seed,
+                        method,
+                        result["executions"],
+                        f"{share:.4f}",
+                        result["seconds"],
+                        result["error"] or "",
+                        flush=True,
+                    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,428 @@
+"""``docs/search.md`` and its pictures, from the stored campaigns of the studies. Nothing is run here."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import misleading
+from calibration_page import table
+from ctxval.arrays import Array
+from study_ablations import ABLATIONS
+from study_ablations import CASES as ABLATED
+from study_auto import ROOT, WITHIN, Result, first_within
+
+PAGE = ROOT / "docs" / "search.md"
+PICTURES = ROOT / "docs" / "search"
+RESULTS = ROOT / "benchmarks" / "results"
+SEEDS = range(10)
+ABLATION_SEEDS = range(5)
+
+Counts = list[float]
+"""Executions to somewhere, seed by seed; infinity where the budget did not suffice."""
+
+
+def results(study: str, case: str, search: str, seeds: Iterable[int] = SEEDS) -> dict[int, Result]:
+    """Return the stored campaigns of a case and a search, by their seeds."""
+    paths = {seed: RESULTS / study / f"{case}-{seed}-{search.replace(' ', '-')}.json" for seed in seeds}
+    return {seed: json.loads(path.read_text()) for seed, path in paths.items() if path.exists()}
+
+
+# The targets
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is asked of a search on a case.
+
+    Attributes:
+        case: its name among the stored campaigns.
+        text: what the reader calls it.
+        percent: of the maximum that it must come near.
+        asked: in words.
+        holds: whether executions, seed by seed, are as asked.
+        study, search: whose campaigns.
+    """
+
+    case: str
+    text: str
+    percent: float
+    asked: str
+    holds: Callable[[Counts], bool]
+    study: str = "auto"
+    search: str = "auto"
+
+    def row(self) -> list[str]:
+        """Return what was measured beside it; empty where nothing was."""
+        found = results(self.study, self.case, self.search)
+        if not found:
+            return []
+        counts = [first_within(result, self.percent) for result in found.values()]
+        budget = next(iter(found.values()))["budget"]
+        worst = max(found, key=lambda seed: first_within(found[seed], self.percent))
+        seconds = float(np.median([result["seconds"] for result in found.values()]))
+        return [
+            self.text,
+            f"{self.percent:g} %",
+            self.asked,
+            shown(float(np.median(counts)), budget),
+            spread(counts, budget),
+            f"{shown(max(counts), budget)} (seed {worst})",
+            reached(counts),
+            f"{seconds:.2g}",
+            "yes" if self.holds(counts) else "**no**",
+        ]
+
+
+def within(count: float) -> Callable[[Counts], bool]:
+    """Return whether the median is at most so much."""
+    return lambda counts: float(np.median(counts)) <= count
+
+
+def all_within(count: float) -> Callable[[Counts], bool]:
+    """Return whether every seed is at most so much."""
+    return lambda counts: max(counts) <= count
+
+
+def _median(case: str, text: str, percent: float, count: int) -> Target:
+    return Target(case, text, percent, f"<= {count}", within(count))
+
+
+def targets() -> list[Target]:
+    """Return everything asked, in the order of the page."""
+    found = [
+        _median("pendulum", "pendulum, 1-D", 1.0, 3),
+        _median("pendulum-no-data", "pendulum without M's data", 1.0, 5),
+    ]
+    for case, text in (("dubins", "Dubins, 11-D"), ("dubins-no-data", "Dubins without M's data")):
+        found += [_median(case, text, 5.0, 10), _median(case, text, 1.0, 15)]
+    for case, text in (("dubins-basin", "its variant `basin`"), ("dubins-basin-no-data", "`basin` without M's data")):
+        found += [_median(case, text, 5.0, 13), _median(case, text, 1.0, 16)]
+        found += [Target(case, text, 1.0, "no seed above 30", all_within(30))]
+    found += [_median("dubins-heavy-tail", "its variant `heavy-tail`", 5.0, 20)]
+    for model, text in (("fnn", "network"), ("gp", "Gaussian process"), ("linear", "linear model")):
+        found += [_median(f"arm-{model}", f"arm, 2-D, {text}", 2.0, 10)]
+        found += [_median(f"arm-{model}-no-data", f"arm, {text} without its data", 2.0, 10)]
+    found += [_median(f"linear-{n}", f"linear, {2 * n}-D", 1.0, n + 2) for n in range(1, 11)]
+    found += [
+        Target("linear-10", "`scalar` alone: linear, 20-D", 1.0, "all seeds <= 35", all_within(35), "scalar", "scalar"),
+        Target(
+            *("dubins-basin", "`scalar` alone: `basin`", 5.0, "8 of 10 seeds within 100"),
+            *(lambda counts: sum(count <= 100 for count in counts) >= 8, "scalar", "scalar"),
+        ),
+    ]
+    return found
+
+
+def target_table() -> str:
+    """Return the targets beside what was measured."""
+    header = ["case", "within", "asked", "median", "25 to 75 %", "worst seed", "got there", "CPU s", "as asked"]
+    return table(header, [row for target in targets() if (row := target.row())])
+
+
+def unmeasured() -> str:
+    """Return which cases of the table have no campaigns, or fewer seeds than the others; empty where none."""
+    counts = {target.text: len(results(target.study, target.case, target.search)) for target in targets()}
+    few = [f"{text} ({count} of {len(SEEDS)} seeds)" for text, count in counts.items() if count < len(SEEDS)]
+    return f"Not measured in full: {', '.join(few)}." if few else ""
+
+
+def heavy_tail() -> str:
+    """Return how `auto` compares with many random tasks on the heavy tail; empty without campaigns."""
+    found = results("auto", "dubins-heavy-tail", "auto")
+    if not found:
+        return ""
+    shares = [largest(result) / result["random"] for result in found.values()]
+    worse = sum(share < 1 for share in shares)
+    return (
+        f"On `heavy-tail`, {worse} of {len(shares)} seeds end below the best of 2,000 random executions (asked: none); "
+        f"the largest distance found is {min(shares):.2f} to {max(shares):.3g} times that, median "
+        f"{float(np.median(shares)):.3g}."
+    )
+
+
+# What is written in cells
+
+
+def largest(result: Result) -> float:
+    """Return the largest distance of a campaign."""
+    return max(distance or 0.0 for distance in result["distances"])
+
+
+def shown(count: float, budget: int) -> str:
+    """Return a number of executions, or that the budget did not suffice."""
+    return f"{count:g}" if np.isfinite(count) else f"> {budget}"
+
+
+def spread(counts: Counts, budget: int) -> str:
+    """Return the quartiles, each the number of one seed."""
+    low, high = np.quantile(counts, [0.25, 0.75], method="inverted_cdf")
+    return f"{shown(float(low), budget)} to {shown(float(high), budget)}"
+
+
+def reached(counts: Counts) -> str:
+    """Return how many seeds got there."""
+    return f"{int(np.isfinite(counts).sum())} of {len(counts)}"
+
+
+def cells(found: Iterable[Result]) -> list[str]:
+    """Return medians with quartiles and how many seeds got there, for 5 and 1 %, and the share of d* in the end."""
+    campaigns = list(found)
+    budget = campaigns[0]["budget"]
+    row = []
+    for percent in (WITHIN[0], WITHIN[-1]):
+        counts = [first_within(result, percent) for result in campaigns]
+        row.append(f"{shown(float(np.median(counts)), budget)} ({spread(counts, budget)}), {reached(counts)}")
+    shares = [100 * largest(result) / result["truth"] for result in campaigns]
+    return [*row, f"{np.median(shares):.1f} % ({min(shares):.1f})"]
+
+
+ENDS = ["5 %: median (25 to 75 %), got there", "1 %: the same", "best found: median (least)"]
+
+
+# Ablations
+
+
+def of_ablation(case: str, without: str) -> dict[int, Result]:
+    """Return the campaigns without a part, or those of `auto` itself."""
+    if without != "auto":
+        return results("ablations", case, without, ABLATION_SEEDS)
+    return results("misleading" if case in misleading.CASES else "auto", case, "auto", ABLATION_SEEDS)
+
+
+def ablation_table() -> str:
+    """Return what is found without each part, on the seeds that all have."""
+    rows = []
+    for case in ABLATED:
+        found = {without: of_ablation(case, without) for without in ("auto", *ABLATIONS)}
+        found = {without: campaigns for without, campaigns in found.items() if campaigns}
+        common = sorted(set.intersection(*map(set, found.values()))) if found else []
+        if common and len(found) > 1:
+            rows += [[case, without, *cells(found[without][seed] for seed in common)] for without in found]
+    return table(["case", "what runs", *ENDS], rows)
+
+
+# Misleading cases
+
+
+def misleading_table() -> str:
+    """Return how the searches fare on the cases built to mislead."""
+    rows = []
+    for case, search in ((case, search) for case in misleading.CASES for search in ("auto", "scalar", "random")):
+        found = results("misleading", case, search)
+        if found:
+            rows.append([case, search, *cells(found.values()), fallen(found.values()) if search == "auto" else "-"])
+    return table(["case", "search", *ENDS, "fell back"], rows)
+
+
+def reasons(result: Result) -> list[str]:
+    """Return why the search turned away from all predictions, suggestion by suggestion."""
+    return [note["why"] for note in result["notes"] if note is not None and "why" in note]
+
+
+def fallen(found: Iterable[Result]) -> str:
+    """Return in how many campaigns, and in what share of their suggestions, the search fell back."""
+    campaigns = list(found)
+    shares = [len(reasons(result)) / len(result["notes"]) for result in campaigns]
+    return f"{sum(share > 0 for share in shares)} of {len(shares)} seeds, {100 * np.mean(shares):.0f} % of suggestions"
+
+
+def example() -> str:
+    """Return what a note says where the search fell back; empty where it never did."""
+    for case in misleading.CASES:
+        for seed, result in results("misleading", case, "auto").items():
+            if reasons(result):
+                return f"`{case}`, seed {seed}: *{reasons(result)[-1]}*."
+    return ""
+
+
+# Pictures
+
+STYLES = {
+    "auto": ("#0072b2", "-", "o"),
+    "auto without M's data": ("#56b4e9", (0, (5, 1)), "s"),
+    "scalar": ("#d55e00", "--", "^"),
+    "gp-ucb": ("#009e73", "-.", "D"),
+    "random": ("#000000", ":", "x"),
+}
+"""Colours that the colour-blind tell apart, and lines and marks for grey print."""
+
+
+def missing(found: Iterable[Result]) -> Array:
+    """Return what is missing to d* after 1, 2, ... executions in per cent, 1 where it is less, ``(seeds, budget)``.
+
+    A campaign that ended within 1 % stays where it is.
+    """
+    rows = []
+    for result in found:
+        best = np.maximum.accumulate([distance or 0.0 for distance in result["distances"]])
+        best = np.append(best, np.full(result["budget"] - len(best), best[-1]))
+        rows.append(np.maximum(100 * (1 - best / result["truth"]), WITHIN[-1]))
+    return np.array(rows)
+
+
+def draw_missing(axes: Axes, name: str, found: Iterable[Result]) -> None:
+    """Draw the median of what is missing, with its quartiles."""
+    rows = missing(found)
+    if not len(rows):
+        return
+    colour, line, marker = STYLES[name]
+    executions = np.arange(1, rows.shape[1] + 1)
+    low, middle, high = np.quantile(rows, [0.25, 0.5, 0.75], axis=0)
+    axes.fill_between(executions, low, high, color=colour, alpha=0.15, linewidth=0)
+    every = max(1, len(executions) // 8)
+    axes.plot(executions, middle, color=colour, linestyle=line, marker=marker, markevery=every, ms=4, label=name)
+
+
+def finish(axes: Axes) -> None:
+    """Give the axes their scales and names."""
+    axes.set_yscale("log")
+    axes.set_ylim(0.9, 110)
+    axes.set_yticks([1, 2, 5, 10, 20, 50, 100], ["1", "2", "5", "10", "20", "50", "100"])
+    axes.minorticks_off()
+    axes.set_xlabel("executions of S")
+    axes.grid(alpha=0.25)
+
+
+def draw_regret() -> None:
+    """Draw what is missing to the maximum on the Dubins car's variant `basin`."""
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    sources = {
+        "auto": ("auto", "dubins-basin", "auto"),
+        "auto without M's data": ("auto", "dubins-basin-no-data", "auto"),
+        **{search: ("scalar", "dubins-basin", search) for search in ("scalar", "gp-ucb", "random")},
+    }
+    for name, source in sources.items():
+        draw_missing(axes, name, results(*source).values())
+    finish(axes)
+    # What auto does in ten executions, and the others in a hundred.
+    axes.set_xscale("log")
+    axes.set_xticks([1, 2, 5, 10, 20, 50, 100], ["1", "2", "5", "10", "20", "50", "100"])
+    axes.minorticks_off()
+    axes.set_ylabel("missing to d*: 100 (1 - best / d*) [%]")
+    figure.legend(loc="outside upper center", ncols=5, fontsize=8)
+    figure.savefig(PICTURES / "regret.png", dpi=150)
+
+
+def draw_misleading() -> None:
+    """Draw the same for the cases built to mislead."""
+    figure = Figure(figsize=(7, 3.2), layout="constrained")
+    panels = figure.subplots(1, len(misleading.CASES), sharey=True)
+    for axes, case in zip(panels, misleading.CASES, strict=True):
+        for search in ("auto", "scalar", "random"):
+            draw_missing(axes, search, results("misleading", case, search).values())
+        finish(axes)
+        axes.set_title(case, fontsize=9)
+    panels[0].set_ylabel("missing to d* [%]")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
+    figure.savefig(PICTURES / "misleading.png", dpi=150)
+
+
+TEXT = """# The search `auto`: how it works, and how many executions it needs
+
+Generated by `make search` from the stored campaigns in `benchmarks/results/`; no number here is written by hand.
+
+## How it works
+
+1. Before each execution `auto` learns, from every recorded trajectory and from the data that M carries, the residual
+   r(x, u) = x' - M(x, u) as a Gaussian process: [dynamics.py](../src/ctxval/dynamics.py).
+2. M + r is a model again, so the distance predicted at a task is the [validation](../src/ctxval/validation.py) of M
+   against it: it costs no execution, and it sees where the controller that is designed on M jumps.
+3. How uncertain r is along the predicted closed loop is the doubt in that prediction.
+4. A second Gaussian process, over the tasks, learns by what factor the executed distances differ from the predicted
+   ones: the discrepancy.
+5. The next task maximises the prediction times the discrepancy, raised by the doubt:
+   [climbs.py](../src/ctxval/searches/climbs.py), by the means of [ascent.py](../src/ctxval/searches/ascent.py).
+6. It is sought in a box around the best task of the current climb, which grows where the prediction was right and
+   shrinks where it was wrong.
+7. A climb that promises nothing more, or misses three times, ends; the next starts where the most is promised when
+   the doubt counts several times as much, and more so with each climb that finds nothing larger.
+8. From six executions on, each is predicted from all others, and where that is no better than a surrogate of the
+   distance the prediction is not used: the trust score.
+9. Then the vector that the distance is composed of is modelled over the tasks,
+   [vector.py](../src/ctxval/searches/vector.py), and where that is no better either, the distance alone,
+   [scalar.py](../src/ctxval/searches/scalar.py); the trial's note says so and why.
+10. All of it follows from the seed and the stored trials, so that a campaign that was stopped goes on as if it had not
+    been: [architecture.md](architecture.md).
+
+## What was asked, and what was measured
+
+Executions of S until the best distance is within so much of the true maximum d*, the first ones counted; model and
+data are new with each seed. d* is exact for the linear systems, from a dense grid for pendulum and arm, and else the
+best value known from a large search. A campaign ends within 1 % of it or with its budget; `> 30`: not within 30.
+`25 to 75 %`: quartiles over the seeds. CPU s: for one suggestion, median over the seeds, while other work shared the
+machine.
+
+{targets}
+
+{unmeasured}
+
+{heavy_tail}
+
+![What is missing to the maximum against executions](search/regret.png)
+
+*The Dubins car's variant `basin`, 11-D: medians over the seeds with quartiles. Campaigns end within 1 %. `auto` sees
+trajectories; `scalar`, `gp-ucb` and `random` see distances alone.*
+
+## What each part buys
+
+The same campaigns, on the same seeds ({ablation_seeds}), each without one part. No residual: the scalar search, from
+one random point on. No discrepancy: the prediction is taken as it is. No trust score: it is used however wrong it is.
+No climbs: the most promising task of the whole space each time, without box and restarts. The trust score acts from
+the seventh execution on, and climbs end after three misses: campaigns that are over sooner show nothing of either.
+
+{ablations}
+
+## Built to mislead
+
+In [misleading.py](../benchmarks/misleading.py): `hidden-heat`, a drive whose torque fades with a temperature that is
+not recorded, and `hidden-load`, a drive with a load on a spring of which only the drive is recorded, so that no r(x, u)
+exists as a function; `corner-stop`, a cart on a rail with a stop that fewer than 2 % of the tasks meet, at the other
+end of the task space than all else points to. {budget} executions; M brings data of short, gentle runs.
+
+{misleading}
+
+What a note says where `auto` fell back, {example}
+
+![What is missing to the maximum on the misleading cases](search/misleading.png)
+
+*Medians over the seeds with quartiles; campaigns end within 1 %.*
+"""
+
+
+def text() -> str:
+    """Return the page."""
+    page = TEXT.format(
+        targets=target_table(),
+        unmeasured=unmeasured(),
+        heavy_tail=heavy_tail(),
+        ablation_seeds=f"{ABLATION_SEEDS[0]} to {ABLATION_SEEDS[-1]}",
+        ablations=ablation_table(),
+        misleading=misleading_table(),
+        budget=misleading.BUDGET,
+        example=example(),
+    )
+    # What is empty leaves no gap.
+    return re.sub(r"\n{3,}", "\n\n", page)
+
+
+def main() -> None:
+    """Write the page and its pictures."""
+    matplotlib.use("Agg")
+    PICTURES.mkdir(exist_ok=True)
+    draw_regret()
+    draw_misleading()
+    PAGE.write_text(text())
+    print(f"page: {PAGE.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()
