@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -35,6 +36,8 @@ def campaign(store: str | None, folder: str, seconds: float = 0.4) -> Campaign:
 
 
 if __name__ == "__main__":
+    # A shell starts what is in the background deaf to it, and tests may run there.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     store, budget, workers, folder = sys.argv[1:]
     running = campaign(store, folder)
     print("ready", flush=True)

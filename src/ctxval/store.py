@@ -319,9 +319,10 @@ class Store:
     # The file
 
     def _prepare(self) -> None:
-        version = self._connection.execute("PRAGMA user_version").fetchone()[0]
-        application = self._connection.execute("PRAGMA application_id").fetchone()[0]
+        # In this order: another process may be making the store, and what is not empty any more has its mark.
         empty = self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+        application = self._connection.execute("PRAGMA application_id").fetchone()[0]
+        version = self._connection.execute("PRAGMA user_version").fetchone()[0]
         if not empty and application != _APPLICATION:
             raise ForeignStoreError(f"{self._name} is a database, but not a ctxval store.")
         if version > len(_MIGRATIONS):
