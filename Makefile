@@ -35,7 +35,7 @@ study: .venv/.test  ## the running example over many seeds; writes docs/main-job
 	$(BIN)/python benchmarks/study_main_job.py
 
 pictures: .venv/.installed  ## those of the README
-	$(BIN)/ctxval run pendulum --seed 1 --store docs/pictures/pendulum.sqlite
+	$(BIN)/ctxval run pendulum --search gp-ucb --seed 1 --store docs/pictures/pendulum.sqlite
 	rm docs/pictures/pendulum.sqlite
 
 calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/calibration.md, and resumes
