@@ -268,6 +268,7 @@ class Executor(Crew):
 
     def start(self, number: int, plan: Plan) -> None:
         """Start the execution of a trial."""
+        self._await_scheduler()
         try:
             future = self.executor.submit(execute_task, self.system, plan.controller, plan.task)
         except Exception as error:
@@ -291,12 +292,29 @@ class Executor(Crew):
                     return Ended(
                         number, failure=f"the execution did not end within {self.timeout:g} s", seconds=seconds
                     )
+            # What was sent while a client looked for its scheduler stays pending for ever.
+            self._await_scheduler()
+
+    def _await_scheduler(self) -> None:
+        """Wait as long as a Dask client looks for a scheduler that it has lost.
+
+        Raises:
+            CampaignError: it has given up. The trials stay open, so that the campaign can go on with another.
+        """
+        while self._status() == "connecting":
+            time.sleep(_POLL)
+        if self._status() == "closed":
+            raise CampaignError("the executor takes no more work: its scheduler is gone.")
+
+    def _status(self) -> str:
+        return str(getattr(getattr(self.executor, "_client", None), "status", "running"))
 
     def _ended(self, number: int, future: cf.Future[Answer]) -> Ended:
         try:
             trajectory, failure, seconds = future.result()
         except (Exception, cf.CancelledError) as error:
             if _is_loss(error):
+                self._await_scheduler()
                 return Ended(number, lost=reason_of(error))
             raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
         return Ended(number, trajectory, failure, seconds=seconds)
