@@ -17,7 +17,7 @@ from calibration_page import table
 from ctxval.arrays import Array
 from study_ablations import ABLATIONS
 from study_ablations import CASES as ABLATED
-from study_auto import ROOT, WITHIN, Result, first_within
+from study_auto import ROOT, WITHIN, Result, first_within, shown
 
 PAGE = ROOT / "docs" / "search.md"
 PICTURES = ROOT / "docs" / "search"
@@ -154,11 +154,6 @@ def heavy_tail() -> str:
 def largest(result: Result) -> float:
     """Return the largest distance of a campaign."""
     return max(distance or 0.0 for distance in result["distances"])
-
-
-def shown(count: float, budget: int) -> str:
-    """Return a number of executions, or that the budget did not suffice."""
-    return f"{count:g}" if np.isfinite(count) else f"> {budget}"
 
 
 def spread(counts: Counts, budget: int) -> str:

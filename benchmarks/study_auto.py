@@ -115,6 +115,11 @@ def first_within(result: Result, percent: float) -> float:
     return next((k + 1 for k, d in enumerate(result["distances"]) if d is not None and d >= enough), float("inf"))
 
 
+def shown(count: float, budget: int) -> str:
+    """Return a number of executions, or that the budget did not suffice."""
+    return f"{count:g}" if np.isfinite(count) else f"> {budget}"
+
+
 def row(case: str, search: str, results: list[Result]) -> str:
     cells = []
     for percent in WITHIN:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 # Before numpy is imported: small algebra is faster on one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -13,6 +14,7 @@ from hypothesis import settings
 
 from ctxval import Task, TaskSpace, Validation, controllers, distances, models, systems
 from ctxval.cases import pendulum
+from ctxval.certificates import Maxima, Sample, draw_maxima
 
 settings.register_profile("ctxval", deadline=None, derandomize=True)
 settings.load_profile("ctxval")
@@ -42,3 +44,14 @@ def make_validation(
 @pytest.fixture
 def validation() -> Validation:
     return make_validation()
+
+
+@pytest.fixture
+def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take few draws of d*, for what does not depend on how many there are."""
+
+    def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
+        return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
+
+    for module in ("ctxval.verdict", "ctxval.certificates.posterior"):
+        monkeypatch.setattr(f"{module}.draw_maxima", fewer)

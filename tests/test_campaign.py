@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from scipy.stats import kstest
 from conftest import make_validation
 from ctxval import Campaign, TaskSpace, Validation, searches
 from ctxval.arrays import Array
-from ctxval.certificates import RESOLUTION, Maxima, Sample, draw_maxima, farthest_task
+from ctxval.certificates import RESOLUTION, farthest_task
 from ctxval.errors import (
     CtxvalError,
     DistanceError,
@@ -387,17 +386,6 @@ def test_a_campaign_stops_before_the_execution_that_is_not_needed(validation: Va
     assert campaign.run(20, until=enough).executions == 7
     assert campaign.run(5, until=lambda _: False).executions == 7
     assert facts(campaign.trials) == facts(Campaign(validation, seed=1).run(7).trials)
-
-
-@pytest.fixture
-def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take few draws of d*: what is tested here does not depend on how many there are."""
-
-    def fewer(sample: Sample, *, draws: int = 12, **options: Any) -> Maxima:
-        return draw_maxima(sample, draws=min(draws, 12), **options)
-
-    for module in ("ctxval.verdict", "ctxval.certificates.posterior"):
-        monkeypatch.setattr(f"{module}.draw_maxima", fewer)
 
 
 @pytest.mark.usefixtures("few_draws")

@@ -6,14 +6,12 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
 from conftest import make_validation
 from ctxval import Campaign, Store
-from ctxval.certificates import Maxima, Sample, draw_maxima
 from ctxval.cli import app
 from ctxval.searches import CMAES
 
@@ -40,15 +38,7 @@ number = 3
 """
 
 
-@pytest.fixture(autouse=True)
-def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take few draws of d*: what is tested here does not depend on how many there are."""
-
-    def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
-        return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
-
-    for module in ("ctxval.verdict", "ctxval.certificates.posterior"):
-        monkeypatch.setattr(f"{module}.draw_maxima", fewer)
+pytestmark = pytest.mark.usefixtures("few_draws")
 
 
 @pytest.fixture

@@ -316,3 +316,14 @@ def test_a_point_that_is_no_number_is_refused() -> None:
     X[3, 0] = np.nan
     with pytest.raises(InputError, match="not positive definite"):
         gp.condition(Matern(), THETA["matern32"], X, y)
+
+
+def test_outputs_that_share_a_covariance_are_as_likely_as_each_alone() -> None:
+    rng = np.random.default_rng(5)
+    X, Y, theta = rng.random((9, 2)), rng.normal(size=(9, 3)), np.log([1.5, 0.4])
+    K = Matern(1.5)(theta, X, X) + 0.01 * np.eye(9)
+    value, W = gp.log_likelihood_of_outputs(K, Y)
+    alone = [gp.log_marginal_likelihood(Matern(1.5), theta, 0.01, X, y) for y in Y.T]
+    assert value - 0.5 * Y.size * np.log(2 * np.pi) == pytest.approx(sum(one for one, _ in alone), rel=1e-12)
+    gradient = np.append(Matern(1.5).weighted_gradient(theta, X, W), 0.01 * np.trace(W))
+    np.testing.assert_allclose(gradient, sum(slope for _, slope in alone), rtol=1e-9)

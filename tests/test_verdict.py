@@ -1,36 +1,23 @@
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from ctxval import Trial
 from ctxval.certificates import (
     Certificate,
-    Maxima,
     Sample,
     certify_audit,
     certify_posterior,
     certify_scenario,
-    draw_maxima,
 )
 from ctxval.errors import CertificateError, InputError
 from ctxval.trial import Origin, State
 from ctxval.verdict import counterexample, judge, judge_by, require_threshold, standing
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 WORST = 1.0
-
-
-@pytest.fixture(autouse=True)
-def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take few draws of d*: what is tested here does not depend on how many there are."""
-
-    def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
-        return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
-
-    for module in ("ctxval.verdict", "ctxval.certificates.posterior"):
-        monkeypatch.setattr(f"{module}.draw_maxima", fewer)
 
 
 def trial(

@@ -14,7 +14,7 @@ from peers.functions import CASES, SEEDS
 from peers.methods import METHODS
 from peers.overhead import COUNTS, SUGGESTIONS
 from peers.run import CUT, Result, applies, budget_of, stored
-from study_auto import ROOT
+from study_auto import ROOT, shown
 
 PAGE = ROOT / "docs" / "benchmarks.md"
 PICTURES = ROOT / "docs" / "benchmarks"
@@ -84,19 +84,14 @@ def missing(case: str) -> list[str]:
 # Tables
 
 
-def count(value: float, budget: int) -> str:
-    """Return a number of executions; one that was not enough is the budget with a sign."""
-    return f"> {budget}" if np.isinf(value) else f"{value:g}"
-
-
 def spread(counts: list[float], budget: int) -> str:
     """Return median, quartiles, and how many of the runs got there."""
     low, high = np.quantile(counts, [0.25, 0.75], method="inverted_cdf")
     reached = int(np.isfinite(counts).sum())
     if not reached:
         return f"- (0/{len(counts)})"
-    middle = count(statistics.median(counts), budget)
-    return f"{middle} [{count(low, budget)}, {count(high, budget)}] ({reached}/{len(counts)})"
+    middle = shown(statistics.median(counts), budget)
+    return f"{middle} [{shown(low, budget)}, {shown(high, budget)}] ({reached}/{len(counts)})"
 
 
 def row(cell: Cell) -> list[str]:

@@ -24,7 +24,7 @@ def on_all_cores(function: Callable[[Part], Result], parts: Sequence[Part]) -> l
     The function is inherited and need not be picklable; the parts and the results must be.
     """
     workers = min(_cores(), len(parts))
-    if workers < 2 or not _forks():
+    if workers < 2 or not can_fork():
         return [function(part) for part in parts]
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _inherit, (function,))
     try:
@@ -35,7 +35,8 @@ def on_all_cores(function: Callable[[Part], Result], parts: Sequence[Part]) -> l
         return [function(part) for part in parts]
 
 
-def _forks() -> bool:
+def can_fork() -> bool:
+    """Return whether a process can be forked without harm: a child then inherits what cannot be pickled."""
     return sys.platform == "linux" and "fork" in multiprocessing.get_all_start_methods()
 
 

@@ -17,6 +17,7 @@ from scipy.spatial.distance import cdist
 
 from ctxval import kernels
 from ctxval.arrays import Array, Rows, single_threaded
+from ctxval.gp import log_likelihood_of_outputs
 from ctxval.model import Model
 from ctxval.models.scaling import spread, standardised_pairs
 from ctxval.trajectory import Trajectory, Transitions
@@ -220,11 +221,8 @@ def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
     K = _KERNEL(theta[:-1], Z, Z)
     noise = float(np.exp(theta[-1]))
     K[np.diag_indices_from(K)] += noise
-    factor = cho_factor(K, lower=True)
-    alpha = cho_solve(factor, Y)
-    value = -0.5 * (Y * alpha).sum() - Y.shape[1] * np.log(np.diag(factor[0])).sum()
-    W = 0.5 * (alpha @ alpha.T - Y.shape[1] * cho_solve(factor, np.eye(len(Z))))
-    return float(value), np.append(_KERNEL.weighted_gradient(theta[:-1], Z, W), noise * np.trace(W))
+    value, W = log_likelihood_of_outputs(K, Y)
+    return value, np.append(_KERNEL.weighted_gradient(theta[:-1], Z, W), noise * np.trace(W))
 
 
 def _well_spread(theta: Array, noise: float, Z: Array, count: int) -> Rows:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 from scipy.optimize import minimize
 
@@ -142,6 +143,25 @@ def _inverse(L: Array) -> Array:
 def _log_likelihood(L: Array, alpha: Array, residual: Array) -> float:
     fit = -0.5 * residual @ alpha
     return float(fit - np.log(np.diag(L)).sum() - 0.5 * len(L) * np.log(2 * np.pi))
+
+
+def log_likelihood_of_outputs(K: Array, Y: Array) -> tuple[float, Array]:
+    """Return ``sum_o log p(Y[:, o])``, but for a constant, and W, with which ``sum(W * dK)`` is how it changes with K.
+
+    Args:
+        K: covariance of the observations, their noise included, ``(n, n)``.
+        Y: outputs that share it, ``(n, k)``.
+
+    Raises:
+        LinAlgError: the covariance is not positive definite.
+
+    Source:
+        Rasmussen and Williams 2006, eqs. 5.8 and 5.9.
+    """
+    factor = cho_factor(K, lower=True)
+    alpha = cho_solve(factor, Y)
+    value = -0.5 * (Y * alpha).sum() - Y.shape[1] * np.log(np.diag(factor[0])).sum()
+    return float(value), 0.5 * (alpha @ alpha.T - Y.shape[1] * cho_solve(factor, np.eye(len(K))))
 
 
 def log_marginal_likelihood(

@@ -9,7 +9,6 @@ import os
 import pickle
 import random
 import signal
-import sys
 import threading
 import time
 import warnings
@@ -23,6 +22,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from ctxval.controller import Controller
+from ctxval.cores import can_fork
 from ctxval.errors import CampaignError, InputError
 from ctxval.system import System
 from ctxval.task import Task
@@ -53,6 +53,10 @@ class Ended:
     failure: str | None = None
     lost: str | None = None
     seconds: float | None = None
+
+
+def _not_ended_within(timeout: float, number: int, seconds: float) -> Ended:
+    return Ended(number, failure=f"the execution did not end within {timeout:g} s", seconds=seconds)
 
 
 Answer = tuple[Trajectory | None, str | None, float]
@@ -122,8 +126,7 @@ class Processes(Crew):
 
     def __init__(self, system: System, size: int, timeout: float | None = None) -> None:
         self.system, self.size, self.timeout = system, size, timeout
-        forks = sys.platform == "linux" and "fork" in multiprocessing.get_all_start_methods()
-        self._context: Any = multiprocessing.get_context("fork" if forks else "spawn")
+        self._context: Any = multiprocessing.get_context("fork" if can_fork() else "spawn")
         self._workers: list[_Worker] = []
 
     def start(self, number: int, plan: Plan) -> None:
@@ -192,9 +195,10 @@ class Processes(Crew):
     def _too_late(self, worker: _Worker) -> Ended:
         number, worker.number = worker.number, None
         assert number is not None
+        assert self.timeout is not None
         self._dismiss(worker)
         seconds = time.monotonic() - worker.started
-        return Ended(number, failure=f"the execution did not end within {self.timeout:g} s", seconds=seconds)
+        return _not_ended_within(self.timeout, number, seconds)
 
     def _dismiss(self, worker: _Worker) -> None:
         """End a worker: it may clean up first, as a command's process must go with it."""
@@ -289,9 +293,7 @@ class Executor(Crew):
                 if self.timeout is not None and seconds >= self.timeout:
                     del self._running[future]
                     future.cancel()
-                    return Ended(
-                        number, failure=f"the execution did not end within {self.timeout:g} s", seconds=seconds
-                    )
+                    return _not_ended_within(self.timeout, number, seconds)
             # What was sent while a client looked for its scheduler stays pending for ever.
             self._await_scheduler()
 

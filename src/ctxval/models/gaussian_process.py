@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 
 from ctxval.arrays import Array, ArrayLike, as_finite, single_threaded
 from ctxval.errors import InputError, ShapeError
+from ctxval.gp import log_likelihood_of_outputs
 from ctxval.models.scaling import IncrementScaling
 from ctxval.trajectory import Transitions
 
@@ -187,11 +188,8 @@ def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
     variance, noise, *length_scales = np.exp(theta)
     covariance = SquaredExponential(float(variance), np.array(length_scales))
     K = covariance(Z, Z)
-    factor = cho_factor(K + noise * np.eye(len(Z)), lower=True)
-    alpha = cho_solve(factor, Y)
-    value = -0.5 * (Y * alpha).sum() - Y.shape[1] * np.log(np.diag(factor[0])).sum()
-    W = 0.5 * (alpha @ alpha.T - Y.shape[1] * cho_solve(factor, np.eye(len(Z))))
+    value, W = log_likelihood_of_outputs(K + noise * np.eye(len(Z)), Y)
     G = W * K
     S = Z / covariance.length_scales
     by_scales = 2 * ((G.sum(axis=1)[:, None] * S**2).sum(axis=0) - (S * (G @ S)).sum(axis=0))
-    return float(value), np.concatenate([[G.sum(), noise * np.trace(W)], by_scales])
+    return value, np.concatenate([[G.sum(), noise * np.trace(W)], by_scales])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,11 +33,8 @@ class _Means:
     last: int
 
     @classmethod
-    def of(cls, points: Array, values: Array) -> _Means:
-        rows: dict[bytes, list[int]] = {}
-        for row, point in enumerate(points):
-            rows.setdefault((point + 0.0).tobytes(), []).append(row)
-        groups = [np.array(group) for group in rows.values()]
+    def of(cls, points: Array, values: Array, slots: Iterable[list[int]]) -> _Means:
+        groups = [np.array(group) for group in slots]
         known = np.isfinite(values)
         order = np.cumsum(known) - 1
         known_rows = [group[known[group]] for group in groups]
@@ -84,11 +82,12 @@ class Repeated(SequentialSearch):
 
     def propose(self, rng: np.random.Generator) -> Array:
         """Return the last point as long as it was not evaluated often enough, then another."""
+        points = self.points
+        means = _Means.of(points, self.values, self._slots.values()) if len(points) else None
+        if means is not None and means.counts[means.last] < self.times:
+            return np.asarray(means.points[means.last])
         self.search.reset(self.dimension, self._seed)
-        if len(self.points):
-            means = _Means.of(self.points, self.values)
-            if means.counts[means.last] < self.times:
-                return np.asarray(means.points[means.last])
+        if means is not None:
             self._tell(means)
         point = np.asarray(self.search.ask(1)[0])
         self._thought = self.search.note() if hasattr(self.search, "note") else None

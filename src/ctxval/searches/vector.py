@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 
 from ctxval.arrays import Array, Rows, single_threaded
 from ctxval.errors import ShapeError
+from ctxval.gp import log_likelihood_of_outputs
 from ctxval.kernels import Linear, Matern, Sum
 from ctxval.searches.base import Prediction
 
@@ -134,8 +135,5 @@ def _most_likely(X: Array, Y: Array) -> Array:
 
 def _log_likelihood(theta: Array, X: Array, Y: Array) -> tuple[float, Array]:
     """Return ``sum_j log p(Y[:, j] | X, theta)``, up to a constant, and its gradient (Rasmussen and Williams, 5.9)."""
-    factor = cho_factor(_covariance(theta, X), lower=True)
-    alpha = cho_solve(factor, Y)
-    value = -0.5 * float((Y * alpha).sum()) - Y.shape[1] * float(np.log(np.diag(factor[0])).sum())
-    W = 0.5 * (alpha @ alpha.T - Y.shape[1] * cho_solve(factor, np.eye(len(X))))
+    value, W = log_likelihood_of_outputs(_covariance(theta, X), Y)
     return value, _KERNEL.weighted_gradient(theta, X, W)
