@@ -45,8 +45,9 @@ calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/
 
 search: .venv/.test  ## how many executions the searches need; writes docs/search.md, and resumes
 	$(BIN)/python benchmarks/study_auto.py
-	$(BIN)/python benchmarks/study_scalar.py linear-10 --search scalar
+	$(BIN)/python benchmarks/study_scalar.py linear-10 --search scalar --seeds 60
 	$(BIN)/python benchmarks/study_scalar.py dubins-basin
+	$(BIN)/python benchmarks/study_scalar.py dubins-basin --search scalar --seeds 30
 	$(BIN)/python benchmarks/misleading.py
 	$(BIN)/python benchmarks/study_ablations.py
 	$(BIN)/python benchmarks/search_page.py

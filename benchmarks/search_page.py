@@ -148,6 +148,29 @@ def heavy_tail() -> str:
     )
 
 
+MORE_SEEDS = (("linear-10", "linear, 20-D", 1.0, (35, 50)), ("dubins-basin", "`basin`", 5.0, (100,)))
+"""Case, what the reader calls it, per cent of the maximum, and numbers of executions to count the seeds within."""
+
+
+def more_seeds() -> str:
+    """Return how the scalar search fares on all stored seeds, where they are more than the table has; else empty."""
+    sentences = []
+    for case, text, percent, limits in MORE_SEEDS:
+        found = results("scalar", case, "scalar", range(1000))
+        if len(found) <= len(SEEDS):
+            continue
+        counts, budget = [first_within(result, percent) for result in found.values()], found[0]["budget"]
+        sentences.append(
+            f"{text}, {len(counts)} seeds: within {percent:g} % after {shown(float(np.median(counts)), budget)} "
+            f"(median; 25 to 75 %: {spread(counts, budget)}), "
+            + " and ".join(f"{sum(count <= most for count in counts)} within {most}" for most in limits)
+            + "."
+        )
+    if not sentences:
+        return ""
+    return "\n".join(["Ten seeds tell little of `scalar` alone. More of them:", "", *(f"- {one}" for one in sentences)])
+
+
 # What is written in cells
 
 
@@ -362,6 +385,8 @@ machine.
 
 {heavy_tail}
 
+{more_seeds}
+
 ![What is missing to the maximum against executions](search/regret.png)
 
 *The Dubins car's variant `basin`, 11-D: medians over the seeds with quartiles. Campaigns end within 1 %. `auto` sees
@@ -399,6 +424,7 @@ def text() -> str:
         targets=target_table(),
         unmeasured=unmeasured(),
         heavy_tail=heavy_tail(),
+        more_seeds=more_seeds(),
         ablation_seeds=f"{ABLATION_SEEDS[0]} to {ABLATION_SEEDS[-1]}",
         ablations=ablation_table(),
         misleading=misleading_table(),

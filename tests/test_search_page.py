@@ -57,6 +57,13 @@ def test_numbers_of_executions_are_shown_with_the_budget_where_it_did_not_suffic
     assert search_page.reached(counts) == "3 of 4"
 
 
+def test_more_seeds_than_the_table_has_are_reported_beside_it() -> None:
+    text = search_page.more_seeds()
+    for case, *_ in search_page.MORE_SEEDS:
+        stored = list((search_page.RESULTS / "scalar").glob(f"{case}-*-scalar.json"))
+        assert f", {len(stored)} seeds: within" in text
+
+
 def test_what_is_missing_goes_on_flat_where_a_campaign_ended() -> None:
     result = {"truth": 2.0, "budget": 4, "distances": [1.0, None, 2.0]}
     np.testing.assert_allclose(search_page.missing([result]), [[50.0, 50.0, 1.0, 1.0]])

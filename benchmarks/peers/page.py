@@ -247,7 +247,7 @@ is given d(p), as a function of the unit cube, to maximise.
 ## What was done
 
 The functions are the cases of `ctxval.cases`, the model and its data drawn anew for each seed, and all methods have the
-same seeds, the slowest ones the first of them only. d* is known: in closed form for the linear systems, by a dense grid
+same seeds. d* is known: in closed form for the linear systems, by a dense grid
 for pendulum and arm, by differential evolution and climbs for the Dubins car; for arm and car it is the best known
 value. A run ends within 1 % of d*, or when its budget is used up; first points are counted. Where a method is
 deterministic, as DIRECT is, seeds differ by their functions alone.
