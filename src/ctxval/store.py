@@ -14,6 +14,7 @@ from typing import Any, Literal
 from ctxval.describe import first_difference
 from ctxval.disks import warn_of_network
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
+from ctxval.locks import lock
 from ctxval.rows import COLUMNS, checksum_of, read_trajectory, read_trial, real, row_of
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
@@ -118,34 +119,25 @@ class Store:
         if self.path is None or self._locked:
             yield
             return
-        lock = self._lock(wait)
+        held = self._lock(wait)
         self._locked = True
         try:
             yield
         finally:
             self._locked = False
-            lock.close()
+            held.close()
 
     def _lock(self, wait: float) -> sqlite3.Connection:
         until = time.monotonic() + wait
         while True:
             try:
-                return self._locked_at_once()
+                return lock(f"{self.path}.lock")
             except sqlite3.DatabaseError as error:
                 if "locked" not in str(error):
                     raise StoreAccessError(f"{self._name} cannot be locked by {self.path}.lock: {error}.") from error
                 if time.monotonic() >= until:
                     raise StoreAccessError(f"{self._name} is being run by another process.") from error
             time.sleep(_WAIT)
-
-    def _locked_at_once(self) -> sqlite3.Connection:
-        lock = sqlite3.connect(f"{self.path}.lock", isolation_level=None, timeout=0)
-        try:
-            lock.execute("BEGIN EXCLUSIVE")
-        except sqlite3.DatabaseError:
-            lock.close()
-            raise
-        return lock
 
     # The experiment
 

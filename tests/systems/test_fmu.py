@@ -336,7 +336,7 @@ print("alive")
 
 def test_the_unpacked_files_go_with_the_system(path: Path) -> None:
     system = FMU(path, **NAMES)
-    folder = Path(system._folder)
+    folder = system._unpacked.path
     assert folder.exists()
     del system
     assert not folder.exists()

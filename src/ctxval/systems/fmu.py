@@ -6,10 +6,8 @@ import contextlib
 import hashlib
 import json
 import os
-import shutil
 import subprocess
 import sys
-import tempfile
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,6 +18,7 @@ import numpy as np
 from ctxval.arrays import Array
 from ctxval.controller import Controller
 from ctxval.errors import ExecutionError, InputError, UnknownNameError
+from ctxval.scratch import Scratch
 from ctxval.systems.episode import require_one, require_started, run_episode
 from ctxval.systems.subprocess import signal_name
 from ctxval.task import Task
@@ -69,10 +68,10 @@ class FMU:
 
     def _open(self) -> None:
         """Unpack the file and look up the variables, here and again in another process."""
-        self._description, self._folder = _unpacked(self.path)
+        self._description, self._unpacked = _unpacked(self.path)
         # By the process that started them: a fork of this one must not talk to the same.
         self._idle: dict[int, list[_Process]] = {}
-        weakref.finalize(self, _clean, self._idle, self._folder, os.getpid())
+        weakref.finalize(self, _clean, self._idle, self._unpacked, os.getpid())
         self._digest = hashlib.sha256(self.path.read_bytes()).hexdigest()[:16]
         known = {variable.name: variable for variable in self._description.modelVariables}
         foreign = sorted(set(self.start) - set(self.states))
@@ -84,7 +83,7 @@ class FMU:
         start = [self.start[name] for name in self.states]
         _references(known, start)
         self._setup = {
-            "folder": self._folder,
+            "folder": str(self._unpacked.path),
             "name": self.path.name,
             "states": _references(known, self.states),
             "inputs": _references(known, self.inputs),
@@ -226,15 +225,15 @@ class _Process:
                 pipe.close()
 
 
-def _clean(idle: dict[int, list[_Process]], folder: str, owner: int) -> None:
+def _clean(idle: dict[int, list[_Process]], unpacked: Scratch, owner: int) -> None:
     """End this process's own processes, and remove the files where it was this one that unpacked them."""
     for process in idle.pop(os.getpid(), []):
         process.end()
     if os.getpid() == owner:
-        shutil.rmtree(folder, ignore_errors=True)
+        unpacked.remove()
 
 
-def _unpacked(path: Path) -> tuple[Any, str]:
+def _unpacked(path: Path) -> tuple[Any, Scratch]:
     """Return the model description and a new folder with the FMU's content."""
     try:
         import fmpy
@@ -249,8 +248,8 @@ def _unpacked(path: Path) -> tuple[Any, str]:
             f"{path} must be an FMU for co-simulation, FMI 2 or 3; it is of FMI {description.fmiVersion}"
             f"{'' if description.coSimulation else ' without co-simulation'}."
         )
-    folder = tempfile.mkdtemp(prefix="ctxval-fmu-")
-    fmpy.extract(str(path), folder)
+    folder = Scratch()
+    fmpy.extract(str(path), str(folder.path))
     return description, folder
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from ctxval.controller import Controller
 from ctxval.errors import CtxvalError, ExecutionError, InputError
 from ctxval.exchange import write_controller, write_task
+from ctxval.scratch import scratch
 from ctxval.systems.episode import require_one
 from ctxval.systems.guard import guarded
 from ctxval.task import Task
@@ -93,8 +94,8 @@ class Subprocess:
             self.keep.mkdir(parents=True, exist_ok=True)
             yield Path(tempfile.mkdtemp(prefix="execution-", dir=self.keep)).resolve()
             return
-        with tempfile.TemporaryDirectory(prefix="ctxval-", ignore_cleanup_errors=True) as name:
-            yield Path(name).resolve()
+        with scratch() as folder:
+            yield folder
 
 
 def _run(command: Sequence[str], folder: Path, timeout: float) -> None:
