@@ -19,6 +19,7 @@ EXPERIMENT = """
 import sys
 from conftest import make_validation
 from ctxval import Experiment, truth
+from ctxval.testing import FaultyRig
 
 validation = make_validation()
 
@@ -31,6 +32,15 @@ def slow(seed):
 
 def crashing(seed):
     return {}["nothing"]
+
+def faulty(*executions):
+    return make_validation(FaultyRig(validation.system, dict.fromkeys(executions, "raise")))
+
+def sometimes(seed):
+    return Experiment("sometimes", faulty(1))
+
+def never(seed):
+    return Experiment("never", faulty(0, 1))
 
 leaving = lambda seed: sys.exit(0)
 broken = make_validation(model=lambda x, u: x * float("nan"))
@@ -415,6 +425,48 @@ def test_status_and_cases_speak_to_people_and_to_programs(invoke) -> None:  # ty
     assert "executions  6" in invoke("status", "a.sqlite").stdout
     assert "pendulum" in invoke("cases").stdout
     assert "pendulum" in json.loads(invoke("cases", "--json").stdout)
+
+
+def test_a_store_is_certified_against_the_threshold_of_its_file(invoke) -> None:  # type: ignore[no-untyped-def]
+    Path("e.toml").write_text('experiment = "pendulum"\nbudget = 5\nthreshold = 0.01\nstore = "e.sqlite"')
+    assert invoke("run", "e.toml").exit_code == 1
+    result = invoke("certify", "e.sqlite", "--json")
+    assert result.exit_code == 1
+    report = json.loads(result.stdout)
+    assert (report["verdict"], report["threshold"]) == ("falsified", 0.01)
+    assert json.loads(invoke("certify", "e.sqlite", "--threshold", "90", "--json").stdout)["threshold"] == 90
+
+
+def test_why_executions_failed_is_said(invoke) -> None:  # type: ignore[no-untyped-def]
+    assert invoke("run", "rig:sometimes", "--budget", "4", "--store", "a.sqlite").exit_code == 0
+    for command in (["status", "a.sqlite"], ["run", "rig:sometimes", "--budget", "4", "--store", "a.sqlite"]):
+        assert "the motor cut out" in invoke(*command).stderr
+        report = json.loads(invoke(*command, "--json").stdout)
+        assert [failure["trials"] for failure in report["failures"]] == [[1]]
+        assert report["failed"] == 1
+
+
+def test_a_run_without_any_distance_is_an_error(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:never", "--budget", "2", "--store", "a.sqlite")
+    assert result.exit_code == 3
+    assert "all 2 executions failed" in result.stderr
+    assert "2 trials failed" in result.stderr
+    assert "the motor cut out" in result.stderr
+
+
+def test_what_is_no_store_is_not_exported(invoke) -> None:  # type: ignore[no-untyped-def]
+    Path("e.toml").write_text('experiment = "pendulum"')
+    result = invoke("export", "e.toml")
+    assert result.exit_code == 2
+    assert "nothing can be read in e.toml" in result.stderr
+    assert not Path("e.export").exists()
+
+
+def test_a_reader_that_goes_away_is_no_error(tmp_path: Path) -> None:
+    command = f"{sys.executable} -c 'from ctxval.cli import main; main()' cases --help | head -c 1"
+    script = f"set -o pipefail; for i in 1 2 3 4 5; do {command}; done"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, cwd=tmp_path)
+    assert "error" not in done.stderr
 
 
 def test_every_command_is_in_the_readme() -> None:

@@ -121,6 +121,7 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         ("horizon = 60", "horizonn = 60", "did you mean 'horizon'"),
         ("horizon = 60", "horizon = -1", "horizon must be a positive integer"),
         ("goal = [0.5, 3.0", "goal = [3.0, 0.5", "low < high"),
+        ("threshold = 0.5", "threshold = true", "threshold"),
         ('goal = [0.5, 3.0, "m"]', "goal = 3", "space.goal"),
         ("experiment_system:step", "nowhere:step", "cannot be loaded"),
         ("[system] ", "[sistem] ", "no setting is called 'sistem'; did you mean 'system'?"),

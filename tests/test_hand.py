@@ -261,7 +261,8 @@ def with_cell(line: int, column: int, text: str) -> Any:
     [
         (without(2), "run.csv has no column speed; there are t, position, force"),
         (without(3), "must have the columns of the inputs, force"),
-        (without(0), "must have the columns t, position, speed, force"),
+        (with_cell(1, 1, "position [km]"), "has position in km, and m is needed; convert it"),
+        (without(0), "must have the columns t, position [m], speed [m/s], force [N]"),
         (lambda rows: rows[:15], "must have 21 times, 20 steps of 0.1 s, got 14"),
         (lambda rows: rows[:1], "must have a header and at least two rows"),
         (with_cell(5, 1, "n/a"), "run.csv, line 5: position [m] must be a number, got 'n/a'"),

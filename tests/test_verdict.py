@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -215,3 +217,32 @@ def test_a_reason_does_not_round_its_comparison_away() -> None:
         "above 1.23456 was executed, but d* may be up to 1.235"
         in judge_by(certificate(1.23457), trials(), 1.23456).reason
     )
+
+
+@pytest.mark.parametrize("resolution", [np.nan, 0.0, -0.1, np.inf])
+def test_a_resolution_that_is_no_positive_number_is_refused_before_anything_is_said(resolution: float) -> None:
+    for trials_of in (trials(), [trial(0, 0.5, 9.0)]):  # a counterexample among them or not
+        with pytest.raises(CertificateError, match="resolution must be a positive number"):
+            judge(trials_of, 1.0, resolution=resolution)
+        with pytest.raises(CertificateError, match="resolution must be a positive number"):
+            standing(trials_of, 1.0, 5, resolution=resolution)
+
+
+def test_a_failure_that_was_made_good_counts_no_more() -> None:
+    known = trials()
+    failed = trial(len(known), 0.31, None, state="failed")
+    again = trial(len(known) + 1, 0.31, WORST * np.sin(3 * 0.31))
+    failed_later = [*known, replace(again, number=len(known)), replace(failed, number=99)]
+    for not_made_good in ([*known, failed], failed_later):
+        assert "executions failed" in judge(not_made_good, 1e3).reason
+    made_good, never_failed = judge([*known, failed, again], 1e3), judge([*known, again], 1e3)
+    assert made_good.certificate is not None
+    assert never_failed.certificate is not None
+    assert made_good.certificate.upper_bound == never_failed.certificate.upper_bound
+    sample = Sample.of([*known, failed, again])
+    assert list(sample.numbers) == [*range(len(known)), len(known) + 1]
+
+
+def test_a_failed_draw_stays_one_whatever_came_later() -> None:
+    drawn = [*trials(origin="iid"), trial(8, 0.31, None, state="failed", origin="iid"), trial(9, 0.31, 0.1)]
+    assert Sample.of(drawn).failed == 1

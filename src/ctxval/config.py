@@ -14,7 +14,7 @@ from ctxval import cases
 from ctxval.campaign import Campaign
 from ctxval.certificates import KINDS, RESOLUTION, USES, require_use
 from ctxval.errors import CertificateError, CtxvalError, InputError, UnknownNameError
-from ctxval.experiment import Experiment
+from ctxval.experiment import Experiment, labelled
 from ctxval.parts import argument, part, reference, require_types, space_of, task_function
 from ctxval.searches import NAMES as SEARCHES
 from ctxval.searches import Search, by_name
@@ -66,8 +66,8 @@ class CertificateTable(BaseModel):
 
     kind: str = "posterior"
     stochastic: bool = False
-    volume: float = Field(default=0.0, ge=0, lt=1)
-    resolution: float = Field(default=RESOLUTION, gt=0)
+    volume: float = Field(default=0.0, ge=0, lt=1, strict=True)
+    resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
     discard: int | None = Field(default=None, ge=0)
     constant: float | None = None
 
@@ -133,8 +133,8 @@ class Settings(BaseModel):
     inputs: dict[str, str] = Field(default_factory=dict)
     units: str | None = None
     budget: int | None = Field(default=None, ge=1)
-    threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    confidence: float = Field(default=CONFIDENCE, gt=0, lt=1)
+    threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
+    confidence: float = Field(default=CONFIDENCE, gt=0, lt=1, strict=True)
     certificate: CertificateTable = Field(default_factory=CertificateTable)
     seed: int = Field(default=0, ge=0)
     store: Path | None = None
@@ -181,8 +181,8 @@ class Settings(BaseModel):
             self.name or "experiment",
             validation,
             units=self.units or "",
-            states=tuple(_label(*item) for item in self.states.items()),
-            inputs=tuple(_label(*item) for item in self.inputs.items()),
+            states=tuple(labelled(*item) for item in self.states.items()),
+            inputs=tuple(labelled(*item) for item in self.inputs.items()),
         )
 
     def campaign(self, experiment: Experiment, store: Store | Path) -> Campaign:
@@ -287,10 +287,6 @@ def _sentence(target: str, error: ValidationError) -> str:
         table = CertificateTable if first["loc"][:-1] == ("certificate",) else Settings
         return f"{target}: {UnknownNameError.among('setting', str(first['loc'][-1]), table.model_fields)}"
     return f"{target}: {where}: {first['msg'].lower()}, got {str(first['input'])[:100]!r}."
-
-
-def _label(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name
 
 
 def _case(name: str, seed: int, options: dict[str, Any]) -> Experiment:

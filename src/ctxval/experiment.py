@@ -54,6 +54,11 @@ def _named(labels: tuple[str, ...], own: object, letter: str, count: int) -> dic
     return {f"{letter}{i}": "" for i in range(count)}
 
 
+def labelled(name: str, unit: str) -> str:
+    """Return ``name [unit]``, the name alone without a unit."""
+    return f"{name} [{unit}]" if unit else name
+
+
 def _parted(label: str) -> tuple[str, str]:
     """Return the name and the unit of ``name [unit]``."""
     name, _, unit = label.partition("[")

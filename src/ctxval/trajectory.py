@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -182,15 +183,16 @@ class Trajectory:
     ) -> Trajectory:
         """Read one trajectory from CSV with the columns ``t, x0.., u0..``, or with named ones.
 
-        Units in brackets, as in ``angle [rad]``, do not matter, and neither do further columns nor the inputs in the
-        last row.
+        Units in brackets, as in ``angle [rad]``, may be left out, but must agree where both have one. Further columns
+        do not matter, nor do the inputs in the last row.
 
         Args:
             path: the file.
-            states, inputs: names of the columns; those that are numbered are taken where none of the names is there.
+            states, inputs: names of the columns, with units or without; those that are numbered are taken where none of
+                the names is there.
 
         Raises:
-            InputError: the file cannot be read, or a column is missing, or a cell is no number.
+            InputError: the file cannot be read, a column is missing or has another unit, or a cell is no number.
         """
         lines, rows = _read_csv(path)
         if len(rows) < 2:
@@ -289,7 +291,23 @@ def _chosen(path: str | Path, columns: dict[str, str], letter: str, names: Seque
     missing = [name for name in named if name not in columns]
     if missing:
         raise InputError(f"{path} has no column {missing[0]}; there are {', '.join(columns)}.")
+    for wanted in names or ():
+        _require_unit(path, columns[_bare(wanted)], wanted)
     return [columns[name] for name in named]
+
+
+def _require_unit(path: str | Path, column: str, wanted: str) -> None:
+    has, needs = _unit(column), _unit(wanted)
+    if has and needs and has != needs:
+        raise InputError(
+            f"{path} has {_bare(column)} in {has}, and {needs} is needed; convert it, or if only the unit is written "
+            "in another way, write it so or leave it out."
+        )
+
+
+def _unit(name: str) -> str:
+    """Return a column's unit, empty where it has none; signs of products do not matter."""
+    return re.sub(r"[\s*·.]", "", name.partition("[")[2].rpartition("]")[0])
 
 
 def _numbered_columns(columns: dict[str, str], letter: str) -> list[str]:

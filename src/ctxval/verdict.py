@@ -20,6 +20,7 @@ from ctxval.certificates import (
     draw_maxima,
     forecast,
     instantaneous_bound,
+    require_resolution,
 )
 from ctxval.certificates.base import at_most, require_probability
 from ctxval.errors import CertificateError, InputError
@@ -152,9 +153,10 @@ def judge(
 
     Raises:
         InputError: the threshold is not a positive number.
-        CertificateError: the confidence is not a probability.
+        CertificateError: the confidence is not a probability, or the resolution not positive.
     """
     require_probability("confidence", confidence)
+    require_resolution(resolution)
     found = counterexample(trials, threshold)
     if found is not None:
         return found
@@ -209,9 +211,10 @@ def standing(
 
     Raises:
         InputError: the threshold is not a positive number.
-        CertificateError: the confidence is not a probability.
+        CertificateError: the confidence is not a probability, or the resolution not positive.
     """
     require_probability("confidence", confidence)
+    require_resolution(resolution)
     if counterexample(trials, threshold) is not None:
         return Standing(decided=True)
     try:

@@ -137,7 +137,9 @@ def test_an_audit_bounds_the_volume_above_the_worst_of_all_trials() -> None:
         "largest_drawn": 0.5,
         "largest_chosen": 0.9,
         "exceeding": 0,
+        "failed": 0,
     }
+    assert certify_audit(mixed([0.4, np.nan], [0.1, 0.5])).details["failed"] == 1
     assert certify_audit(mixed([0.4, np.nan], [0.1, 0.5, 0.6])).details["exceeding"] == 2
     assert certify_audit(mixed([], [0.1, 0.5])).details["exceeding"] is None
     assert not certificate.covers(1.0)  # it is no bound on d*

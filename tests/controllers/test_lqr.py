@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctxval import Task
-from ctxval.controllers import LQR
+from ctxval.controllers import LQR, StationaryLQR
 from ctxval.errors import InputError, ShapeError
 from ctxval.model import Function, linearize
 from ctxval.models import Linear
@@ -150,3 +150,11 @@ def test_a_task_with_other_states_than_the_weights_is_refused() -> None:
     _, model, task = problem(3, 1, 5, 0)
     with pytest.raises(ShapeError, match=r"Q must weigh the task's 3 states, got shape \(2, 2\)"):
         LQR([1, 1], [1]).design(task, model)
+
+
+def test_weights_of_other_inputs_than_the_model_has_are_refused() -> None:
+    task = Task([1.0, 0.0], goal=[0.0, 0.0], horizon=3, dt=0.1)
+    model = Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]])
+    for synthesizer in (LQR([1, 1], [1, 2]), StationaryLQR([1, 1], [1, 2])):
+        with pytest.raises(InputError, match="R weighs 2 inputs, and the model has 1"):
+            synthesizer.design(task, model)

@@ -2,7 +2,7 @@
 
 from ctxval.certificates.base import Certificate, Sample
 from ctxval.certificates.convergence import TheoremConstants, certify_convergence, rate
-from ctxval.certificates.covering import RESOLUTION, covering, farthest_task
+from ctxval.certificates.covering import RESOLUTION, covering, farthest_task, require_resolution
 from ctxval.certificates.diagnostics import Diagnosis, diagnose
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.named import KINDS, USES, Options, certify, require_possible, require_use
@@ -33,6 +33,7 @@ __all__ = [
     "instantaneous_bound",
     "rate",
     "require_possible",
+    "require_resolution",
     "require_use",
     "samples_needed",
     "tail",

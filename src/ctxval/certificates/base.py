@@ -23,6 +23,7 @@ class Sample:
         distances: shape ``(n,)``; NaN where the execution failed.
         origins: n reasons why a trial was chosen.
         states: n states; open trials are refused by every certificate.
+        numbers: of the trials, for messages; 0, 1, ... by default.
 
     Raises:
         CertificateError: the parts do not fit together, or a trial is still open.
@@ -32,12 +33,15 @@ class Sample:
     distances: Array
     origins: Sequence[Origin]
     states: Sequence[State]
+    numbers: Sequence[int] = ()
 
     def __post_init__(self) -> None:
-        lengths = {len(self.points), len(self.distances), len(self.origins), len(self.states)}
+        if not len(self.numbers):
+            object.__setattr__(self, "numbers", range(len(self.points)))
+        lengths = {len(self.points), len(self.distances), len(self.origins), len(self.states), len(self.numbers)}
         if len(lengths) != 1:
             raise CertificateError(
-                f"points, distances, origins and states must be equally many, got {sorted(lengths)}."
+                f"points, distances, origins, states and numbers must be equally many, got {sorted(lengths)}."
             )
         if "open" in self.states:
             raise CertificateError(
@@ -51,22 +55,29 @@ class Sample:
     def of(cls, trials: Sequence[Trial]) -> Sample:
         """Return what a certificate may know of trials; a task that failed before its execution has failed as well.
 
+        A failure does not count where the same task was executed with success later, but for independent draws: those
+        are what they are.
+
         Raises:
             CertificateError: there is none, or one is still open.
         """
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
+        last = {trial.unit_point.tobytes(): trial.number for trial in trials if trial.distance is not None}
+        count = [trial for trial in trials if not _made_good(trial, last.get(trial.unit_point.tobytes(), -1))]
         return cls(
-            np.array([trial.unit_point for trial in trials]),
-            np.array([np.nan if trial.distance is None else trial.distance for trial in trials]),
-            [trial.origin for trial in trials],
-            [trial.state for trial in trials],
+            np.array([trial.unit_point for trial in count]),
+            np.array([np.nan if trial.distance is None else trial.distance for trial in count]),
+            [trial.origin for trial in count],
+            [trial.state for trial in count],
+            [trial.number for trial in count],
         )
 
     def only(self, origin: Origin) -> Sample:
         """Return the trials of one origin."""
         rows = [row for row, own in enumerate(self.origins) if own == origin]
-        return Sample(self.points[rows], self.distances[rows], [origin] * len(rows), [self.states[row] for row in rows])
+        states, numbers = [self.states[row] for row in rows], [self.numbers[row] for row in rows]
+        return Sample(self.points[rows], self.distances[rows], [origin] * len(rows), states, numbers)
 
     @property
     def best(self) -> float:
@@ -77,6 +88,11 @@ class Sample:
     def failed(self) -> int:
         """How many executions failed."""
         return int(np.isnan(self.distances).sum())
+
+
+def _made_good(trial: Trial, last: int) -> bool:
+    """Return whether a trial failed whose task was executed with success later, in trial number ``last``."""
+    return trial.state == "failed" and trial.origin != "iid" and trial.number < last
 
 
 @dataclass(frozen=True)

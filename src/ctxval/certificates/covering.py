@@ -6,12 +6,24 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ctxval.arrays import Array
+from ctxval.errors import CertificateError
 
 RESOLUTION = 0.125
 """How far from every trial a task may be, in diagonals of the task space, unless the user states more; what lies
 farther away may be unlike anything that was seen (docs/calibration.md)."""
 
 _PROBES = 8192
+
+
+def require_resolution(value: float) -> float:
+    """Return how far a task may be from every trial, in diagonals.
+
+    Raises:
+        CertificateError: it is not a positive number.
+    """
+    if not 0 < value < float("inf"):
+        raise CertificateError(f"the resolution must be a positive number of diagonals, got {value!r}.")
+    return float(value)
 
 
 def farthest_task(X: Array) -> float:

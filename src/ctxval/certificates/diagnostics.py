@@ -8,6 +8,7 @@ these errors are independent, whatever chose the tasks (recursive residuals; Bro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,29 +51,36 @@ class Diagnosis:
 
 
 def diagnose(
-    conditioned: list[Conditioned], X: Array, *, level: float = LEVEL, resolution: float = RESOLUTION
+    conditioned: list[Conditioned],
+    X: Array,
+    numbers: Sequence[int] | None = None,
+    *,
+    level: float = LEVEL,
+    resolution: float = RESOLUTION,
 ) -> Diagnosis:
     """Return how the values, in the order of the trials, agree with the process, and how well the trials cover it.
 
     Args:
         conditioned: the values under draws of the hyperparameters.
         X: the trials' points ``(n, d)``.
+        numbers: of the trials; 0, 1, ... by default.
         level: how unlikely a surprise withdraws the bound.
         resolution: how far from every trial a task may be without withdrawing it, in diagonals.
     """
     exceed = np.mean([_exceedances(one) for one in conditioned], axis=0)
     worst = int(exceed.argmin())
+    trial = worst + 2 if numbers is None else numbers[worst + 2]
     surprise = float(-np.expm1(len(exceed) * np.log1p(-min(exceed[worst], 1 - 1e-16))))
     left_out = float(np.sqrt(np.mean([_left_out(one) for one in conditioned])))
     farthest, doubt = farthest_task(X), None
     if surprise < level:
         doubt = (
-            f"trial {worst + 2} came out {-ndtri(max(exceed[worst], 1e-300)):.1f} standard deviations above what the "
+            f"trial {trial} came out {-ndtri(max(exceed[worst], 1e-300)):.1f} standard deviations above what the "
             "trials before it predict: the distance is not what the process takes it for, and the bound is withdrawn"
         )
     elif farthest > resolution:
         doubt = _uncovered(X, farthest, resolution)
-    return Diagnosis(surprise, worst + 2, left_out, farthest, doubt)
+    return Diagnosis(surprise, trial, left_out, farthest, doubt)
 
 
 def _uncovered(X: Array, farthest: float, resolution: float) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from ctxval.acquisition import UpperConfidenceBound, maximise
 from ctxval.arrays import Array, Rows, single_threaded
 from ctxval.certificates.base import Certificate, Sample, at_most, require_probability
-from ctxval.certificates.covering import RESOLUTION
+from ctxval.certificates.covering import RESOLUTION, require_resolution
 from ctxval.certificates.diagnostics import diagnose
 from ctxval.errors import CertificateError, InputError
 from ctxval.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
@@ -102,7 +102,7 @@ def draw_maxima(
     """
     X, y = _required(sample)
     if not stochastic:
-        _require_one_distance_each(X, y)
+        _require_one_distance_each(sample)
     rng = np.random.default_rng(seed)
     # Noise on the logarithms would bound the median: the expected distance is not the exponential of the expected one.
     # And what is noise and what is roughness only all trials together can tell.
@@ -129,7 +129,7 @@ def _required(sample: Sample) -> tuple[Array, Array]:
     if sample.failed:
         raise CertificateError(
             f"{sample.failed} of {len(sample)} executions failed: what the distance is there is unknown, so nothing "
-            "bounds d*; execute those tasks again, or leave them out of the task space."
+            "bounds d*; execute those tasks again, or leave them out of the task space of a new store."
         )
     if len(sample) < FEWEST:
         raise CertificateError(f"a posterior bound needs at least {FEWEST} trials, got {len(sample)}.")
@@ -146,14 +146,16 @@ def _required(sample: Sample) -> tuple[Array, Array]:
     return sample.points, sample.distances
 
 
-def _require_one_distance_each(X: Array, y: Array) -> None:
-    _, tasks = np.unique(X, axis=0, return_inverse=True)
+def _require_one_distance_each(sample: Sample) -> None:
+    y, numbers = sample.distances, sample.numbers
+    _, tasks = np.unique(sample.points, axis=0, return_inverse=True)
     for row, task in enumerate(tasks.ravel()):
         first = int(np.argmax(tasks.ravel() == task))
         if abs(y[row] - y[first]) > _REPEATED * np.ptp(y):
             raise CertificateError(
-                f"trials {first} and {row} executed one task, and their distances are {y[first]:g} and {y[row]:g}: the "
-                "system is not deterministic; say --stochastic to bound the largest expected distance."
+                f"trials {numbers[first]} and {numbers[row]} executed one task, and their distances are {y[first]:g} "
+                f"and {y[row]:g}: the system is not deterministic; say --stochastic to bound the largest expected "
+                "distance."
             )
 
 
@@ -178,12 +180,14 @@ def certify_posterior(
         found: draws of d* made before, from the same trials.
 
     Raises:
-        CertificateError: an execution failed, the trials are too few or all alike, or the confidence is too high.
+        CertificateError: an execution failed, the trials are too few or all alike, the confidence is too high, or the
+            resolution is not positive.
     """
     require_probability("confidence", confidence)
+    require_resolution(resolution)
     maxima_found = draw_maxima(sample, stochastic=stochastic, seed=seed) if found is None else found
     upper, best = maxima_found.upper(confidence), float(sample.distances.max())
-    diagnosis = diagnose(maxima_found.conditioned, sample.points, resolution=resolution)
+    diagnosis = diagnose(maxima_found.conditioned, sample.points, sample.numbers, resolution=resolution)
     what = "the largest expected distance" if stochastic else "d*"
     statement = f"With probability {confidence} under the prior, given the trials, {what} is at most {at_most(upper)}."
     return Certificate(

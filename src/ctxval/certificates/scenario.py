@@ -147,7 +147,7 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
             "nothing is assumed of how the distance depends on the task",
             "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
         ),
-        details={"largest_found": h, **_against_the_search(sample, drawn)},
+        details={"largest_found": h, **_against_the_search(sample, drawn), "failed": sample.failed},
     )
 
 

@@ -9,7 +9,7 @@ import json
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import asdict
 from typing import Annotated, Any
@@ -26,7 +26,7 @@ from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
 from ctxval.trial import Trial
 from ctxval.verdict import Verdict
 
-FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED = 1, 2, 3, 130
+FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 _BAD = (InputError, StoreError, CertificateError)
 
 app = typer.Typer(
@@ -59,6 +59,8 @@ def command(function: Callable[..., Any]) -> Callable[..., Any]:
             err.print("stopped; what was executed is stored, run the same command to go on.")
             raise typer.Exit(INTERRUPTED) from None
         except (Exception, SystemExit) as error:
+            if isinstance(error.__context__, BrokenPipeError):
+                raise typer.Exit(CUT_OFF) from None  # the reader of our output has gone, as in `| head`
             # Python's own exit status here would be 1, which says that a model is falsified.
             say_error(f"{type(error).__name__}: {error}")
             raise typer.Exit(CANNOT_GO_ON) from None
@@ -181,6 +183,30 @@ def certificate_of(verdict: Verdict | None) -> dict[str, Any]:
 def worst_of(trial: Trial | None) -> dict[str, Any] | None:
     """Return a trial's task and distance."""
     return None if trial is None else {"task": trial.parameters, "distance": trial.distance}
+
+
+def failures_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
+    """Return why trials failed, the most frequent reason first, and which ones."""
+    by_reason: dict[str, list[int]] = {}
+    for trial in trials:
+        if trial.state == "failed":
+            by_reason.setdefault(trial.failure or "for no stated reason", []).append(trial.number)
+    ordered = sorted(by_reason.items(), key=lambda item: -len(item[1]))
+    return [{"reason": reason, "trials": numbers} for reason, numbers in ordered]
+
+
+def print_failures(failures: list[dict[str, Any]]) -> None:
+    """Print the most frequent reasons."""
+    for failure in failures[:_REASONS]:
+        count = len(failure["trials"])
+        which = f"trial {failure['trials'][0]}" if count == 1 else f"{count} trials"
+        err.print(f"[yellow]{which} failed[/]: {escaped(failure['reason'])}", highlight=False, soft_wrap=True)
+    if len(failures) > _REASONS:
+        err.print(f"and {len(failures) - _REASONS} other reasons; ctxval export has them.", highlight=False)
+
+
+_REASONS = 3
+"""Reasons of failures that are printed."""
 
 
 def print_table(rows: dict[str, Any], units: str = "") -> None:

@@ -16,6 +16,7 @@ from ctxval.certificates import (
     TheoremConstants,
     certify,
     require_possible,
+    require_resolution,
     require_use,
 )
 from ctxval.cli.base import (
@@ -76,12 +77,14 @@ def certify_store(
     stochastic = table.stochastic if stochastic is None else stochastic
     if kind is None and audit is None:
         kind, discard, constant = table.kind, _first(discard, table.discard), _first(constant, table.constant)
+    threshold = _first(threshold, planned.threshold)
     limit = None if threshold is None else require_threshold(threshold)
     chosen = kind or "audit"
     resolution = table.resolution if resolution is None else resolution
     options = Options(stochastic, discard, constant, _theorem(theorem), _search_of(opened), resolution)
     # All of it before an audit is paid for.
     _require_shares(confidence, volume)
+    require_resolution(resolution)
     if chosen not in KINDS:
         raise UnknownNameError.among("certificate", chosen, KINDS)
     require_use(chosen, [name for name, value in given.items() if value is not None])

@@ -12,6 +12,7 @@ import typer
 from ctxval import plot
 from ctxval.campaign import Campaign
 from ctxval.cli.base import (
+    CANNOT_GO_ON,
     FALSIFIED,
     AsJson,
     Dask,
@@ -22,10 +23,13 @@ from ctxval.cli.base import (
     command,
     err,
     escaped,
+    failures_of,
     hands,
+    print_failures,
     print_table,
     print_verdict,
     progress,
+    say_error,
     worst_of,
 )
 from ctxval.cli.certify import decide
@@ -89,6 +93,9 @@ def run(
     report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path)]
     if not as_json:
         _print_report(report, verdict)
+    if campaign.failed and not campaign.completed:
+        say_error(f"all {len(campaign.failed)} executions failed, so there is no distance.")
+        return report, CANNOT_GO_ON
     return report, FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
 
@@ -131,6 +138,7 @@ def _report(
         "budget": budget,
         "executions": campaign.executions,
         "failed": len(campaign.failed),
+        "failures": failures_of(campaign.failed),
         "worst": worst_of(campaign.worst),
         "estimate": campaign.estimate,
         "units": experiment.units,
@@ -182,8 +190,9 @@ def _true_curve(experiment: Experiment) -> plot.Curve | None:
 
 
 def _print_report(report: dict[str, Any], verdict: Verdict | None) -> None:
-    apart = ("verdict", "reason", "threshold", "units", "certificate", "expected")
+    apart = ("failures", "verdict", "reason", "threshold", "units", "certificate", "expected")
     shown = {key: value for key, value in report.items() if key not in apart}
     print_table(shown, units=report["units"])
+    print_failures(report["failures"])
     if verdict is not None:
         print_verdict(verdict)

@@ -7,7 +7,18 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval.cli.base import AsJson, app, command, escaped, out, print_table, worst_of
+from ctxval.cli.base import (
+    AsJson,
+    app,
+    command,
+    escaped,
+    failures_of,
+    out,
+    print_failures,
+    print_table,
+    worst_of,
+)
+from ctxval.errors import StoreAccessError
 from ctxval.salvage import export, salvage
 from ctxval.store import Store
 
@@ -27,6 +38,7 @@ def status(
         "seed": description.get("seed"),
         "executions": sum(trial.executed for trial in trials),
         "failed": sum(trial.state == "failed" for trial in trials),
+        "failures": failures_of(trials),
         "open": [trial.number for trial in trials if trial.state == "open"],
         "worst": worst_of(
             max((t for t in trials if t.distance is not None), key=lambda t: t.distance or 0, default=None)
@@ -34,7 +46,8 @@ def status(
         "store": str(store),
     }
     if not as_json:
-        print_table(report)
+        print_table({key: value for key, value in report.items() if key != "failures"})
+        print_failures(report["failures"])
     return report
 
 
@@ -47,6 +60,8 @@ def export_store(
 ) -> Any:
     """Write what is readable of a store as CSV and JSON."""
     found = salvage(store)
+    if found.damaged and not found.trials and not found.trajectories:
+        raise StoreAccessError(f"nothing can be read in {store}: it is no store, or all of it is damaged.")
     target = store.with_suffix(".export") if folder is None else folder
     export(found, target)
     report = {

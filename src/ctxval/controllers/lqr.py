@@ -9,7 +9,7 @@ import numpy as np
 from ctxval.arrays import Array, ArrayLike
 from ctxval.controller import AffineFeedback, Limits, LimitsLike
 from ctxval.controllers.cost import QuadraticCost
-from ctxval.errors import DesignError
+from ctxval.errors import DesignError, InputError
 from ctxval.model import Model, linearize
 from ctxval.task import Task
 
@@ -46,6 +46,7 @@ class LQR:
         x0 = task.initial_state
         u0 = np.zeros((*task.batch_shape, len(self.cost.R)))
         A, B = linearize(model, x0, u0)
+        _require_inputs(self.cost, B)
         offset = model.step(x0, u0) - (A @ x0[..., None])[..., 0]
         gains, feedforward = _riccati(self.cost, A, B, offset, task.reference)
         return AffineFeedback(gains, feedforward, np.zeros_like(task.reference[..., :-1, :]), self.limits)
@@ -87,6 +88,7 @@ class StationaryLQR:
         self.cost.require_task(task)
         holding = np.zeros((*task.batch_shape, len(self.cost.R)))
         _, B = linearize(model, task.goal, holding)
+        _require_inputs(self.cost, B)
         # One step of Gauss and Newton: exact for models that are affine in the input.
         missing = task.goal - model.step(task.goal, holding)
         holding = holding + (np.linalg.pinv(B) @ missing[..., None])[..., 0]
@@ -98,6 +100,11 @@ class StationaryLQR:
     def describe(self) -> dict[str, Any]:
         """Return what identifies this synthesizer in a store."""
         return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
+
+
+def _require_inputs(cost: QuadraticCost, B: Array) -> None:
+    if B.shape[-1] != len(cost.R):
+        raise InputError(f"R weighs {len(cost.R)} inputs, and the model has {B.shape[-1]}.")
 
 
 def _stationary_gain(cost: QuadraticCost, A: Array, B: Array) -> Array:
