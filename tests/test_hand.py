@@ -17,6 +17,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from ctxval import Campaign, Store, Trajectory, searches
+from ctxval.certificates import Sample
 from ctxval.cli import app
 from ctxval.controllers import read_controller
 from ctxval.errors import ExecutionError, InputError, StoreAccessError
@@ -234,6 +235,22 @@ def test_what_was_told_is_said(invoke: Any) -> None:
     assert "trial 0 has the distance" in invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv").stdout
     asked(invoke, "a.sqlite")
     assert "trial 1 failed: fuse [blown]" in invoke("tell", "a.sqlite", "1", "--failed", "fuse [blown]").stdout
+
+
+def test_the_task_of_a_failed_trial_can_be_executed_again(invoke: Any) -> None:
+    first = new(invoke)
+    assert invoke("tell", "a.sqlite", "0", "--failed", "the cable came off").exit_code == 0
+    again = asked(invoke, "a.sqlite", "--again", "0")
+    assert (again["trial"], again["task"]) == (1, first["task"])
+    record(again["folder"])
+    assert invoke("tell", "a.sqlite", "1", "--trajectory", "run.csv").exit_code == 0
+    assert "execute those tasks again" not in invoke("certify", "a.sqlite").stderr
+    failed, made_good = Store("a.sqlite").trials()
+    assert Sample.of([failed]).failed == 1
+    assert Sample.of([failed, made_good]).failed == 0
+    refused = invoke("ask", "a.sqlite", "--again", "7")
+    assert refused.exit_code == 2
+    assert "there is no trial 7; there are 2, numbered from 0" in refused.stderr
 
 
 def edit(change: Any) -> None:

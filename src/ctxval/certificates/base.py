@@ -13,6 +13,9 @@ from ctxval.errors import CertificateError
 from ctxval.trial import Origin, State, Trial
 from ctxval.version import VERSION
 
+_SAME_TASK = 1e-9
+"""How far points of the unit cube may be apart that are one task: parameters are scaled there and back."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sample:
@@ -63,8 +66,7 @@ class Sample:
         """
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
-        last = {trial.unit_point.tobytes(): trial.number for trial in trials if trial.distance is not None}
-        count = [trial for trial in trials if not _made_good(trial, last.get(trial.unit_point.tobytes(), -1))]
+        count = [trial for trial in trials if not _made_good(trial, trials)]
         return cls(
             np.array([trial.unit_point for trial in count]),
             np.array([np.nan if trial.distance is None else trial.distance for trial in count]),
@@ -90,9 +92,13 @@ class Sample:
         return int(np.isnan(self.distances).sum())
 
 
-def _made_good(trial: Trial, last: int) -> bool:
-    """Return whether a trial failed whose task was executed with success later, in trial number ``last``."""
-    return trial.state == "failed" and trial.origin != "iid" and trial.number < last
+def _made_good(trial: Trial, trials: Sequence[Trial]) -> bool:
+    """Return whether a trial failed whose task was executed with success later."""
+    return (trial.state == "failed" and trial.origin != "iid") and any(
+        np.abs(other.unit_point - trial.unit_point).max() <= _SAME_TASK
+        for other in trials
+        if other.distance is not None and other.number > trial.number
+    )
 
 
 @dataclass(frozen=True)

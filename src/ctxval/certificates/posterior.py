@@ -34,6 +34,9 @@ STOCHASTIC = (1e-6, 1.0)
 _ROUNDING = 1e-14
 """Distances that differ by less, relative to their size, are one distance and rounding."""
 
+_LISTED = 5
+"""Numbers of failed trials that a message has at most."""
+
 _EXTREME = 1e100
 """Distances beyond it, or that differ by less than its inverse, have squares that no float holds."""
 
@@ -129,7 +132,8 @@ def _required(sample: Sample) -> tuple[Array, Array]:
     if sample.failed:
         raise CertificateError(
             f"{sample.failed} of {len(sample)} executions failed: what the distance is there is unknown, so nothing "
-            "bounds d*; execute those tasks again, or leave them out of the task space of a new store."
+            f"bounds d*; execute those tasks again (trial {_listed(sample)}), or leave them out of the task space of a "
+            "new store."
         )
     if len(sample) < FEWEST:
         raise CertificateError(f"a posterior bound needs at least {FEWEST} trials, got {len(sample)}.")
@@ -144,6 +148,12 @@ def _required(sample: Sample) -> tuple[Array, Array]:
             f"between {1 / _EXTREME:g} and {_EXTREME:g}; take other units."
         )
     return sample.points, sample.distances
+
+
+def _listed(sample: Sample) -> str:
+    """Return the numbers of the first trials that failed."""
+    numbers = [str(number) for number, d in zip(sample.numbers, sample.distances, strict=True) if np.isnan(d)]
+    return ", ".join(numbers[:_LISTED]) + (", ..." if len(numbers) > _LISTED else "")
 
 
 def _require_one_distance_each(sample: Sample) -> None:

@@ -49,19 +49,22 @@ def ask(
     ] = None,
     parameters: Set = None,
     draw: Annotated[bool, typer.Option("--draw", help="An independent draw, for an audit by hand.")] = False,
+    again: Annotated[
+        int | None, typer.Option(metavar="TRIAL", help="The task of this trial once more, as a new one.")
+    ] = None,
     trial: Annotated[int | None, typer.Option(help="Write the files of this open trial again.")] = None,
     search: Annotated[str | None, typer.Option(help="How tasks are chosen, for a new store.")] = None,
     seed: Annotated[int | None, typer.Option(help="For a new store.")] = None,
     as_json: AsJson = False,
 ) -> Any:
     """Open the next trial and write its task and its controller, for a rig that people operate."""
-    if sum((bool(parameters), draw, trial is not None)) > 1:
-        raise InputError("of --set, --draw and --trial only one can be given.")
+    if sum((bool(parameters), draw, again is not None, trial is not None)) > 1:
+        raise InputError("of --set, --draw, --again and --trial only one can be given.")
     opened = _opened(target, {"store": store, "search": search, "seed": seed})
     if trial is not None:
         found = opened.campaign.reopen(trial)
     else:
-        chosen = parameters_from(parameters) if parameters else None
+        chosen = parameters_from(parameters) if parameters else _parameters_of(opened.campaign, again)
         found = opened.campaign.ask(chosen, draw=draw, wait=_WAIT)
     folder = opened.path.with_suffix(".trials") / str(found.number) if out_folder is None else out_folder
     report = {
@@ -75,6 +78,16 @@ def ask(
     if not as_json:
         _print_asked(report, found)
     return report
+
+
+def _parameters_of(campaign: Campaign, number: int | None) -> dict[str, Any] | None:
+    """Return the parameters of a trial's task, None where none is named."""
+    if number is None:
+        return None
+    known = {trial.number: trial.parameters for trial in campaign.trials}
+    if number not in known:
+        raise InputError(f"there is no trial {number}; there are {len(known)}, numbered from 0.")
+    return known[number]
 
 
 @app.command()
