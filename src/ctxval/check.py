@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval.arrays import Array
 from ctxval.errors import ConformanceError, CtxvalError
-from ctxval.experiment import Experiment, labelled
+from ctxval.experiment import Experiment, labels_of
 from ctxval.task import Task
 from ctxval.testing import check_distance, check_model, check_synthesizer
 from ctxval.trajectory import COMPLETE, Trajectory
@@ -131,7 +131,7 @@ def _names(experiment: Experiment, plan: Plan) -> Iterator[Finding]:
             yield Finding("names", "failed", sentence)
     for kind, named in zip(("states", "inputs"), experiment.names(*counts), strict=True):
         bare = [name for name, unit in named.items() if not unit]
-        text = ", ".join(labelled(*item) for item in named.items())
+        text = ", ".join(labels_of(named))
         missing = f"; no unit for {', '.join(bare)}" if bare else ""
         yield Finding("names", "noted" if bare else "ok", f"{kind}: {text}{missing}")
     if not experiment.units:

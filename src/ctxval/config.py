@@ -14,7 +14,7 @@ from ctxval import cases
 from ctxval.campaign import Campaign
 from ctxval.certificates import KINDS, RESOLUTION, USES, require_use
 from ctxval.errors import CertificateError, CtxvalError, InputError, UnknownNameError
-from ctxval.experiment import Experiment, labelled
+from ctxval.experiment import Experiment, labels_of
 from ctxval.parts import argument, part, reference, require_types, space_of, task_function
 from ctxval.searches import NAMES as SEARCHES
 from ctxval.searches import Search, by_name
@@ -181,8 +181,8 @@ class Settings(BaseModel):
             self.name or "experiment",
             validation,
             units=self.units or "",
-            states=tuple(labelled(*item) for item in self.states.items()),
-            inputs=tuple(labelled(*item) for item in self.inputs.items()),
+            states=labels_of(self.states),
+            inputs=labels_of(self.inputs),
         )
 
     def campaign(self, experiment: Experiment, store: Store | Path) -> Campaign:

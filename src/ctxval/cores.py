@@ -7,9 +7,10 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 Part = TypeVar("Part")
@@ -28,8 +29,7 @@ def on_all_cores(function: Callable[[Part], Result], parts: Sequence[Part]) -> l
         return [function(part) for part in parts]
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _inherit, (function,))
     try:
-        with pool, warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of forking beside a progress display's thread
+        with pool, forking():
             return list(pool.map(_call, parts))
     except BrokenProcessPool:  # what ends a process may do so for want of memory
         return [function(part) for part in parts]
@@ -38,6 +38,14 @@ def on_all_cores(function: Callable[[Part], Result], parts: Sequence[Part]) -> l
 def can_fork() -> bool:
     """Return whether a process can be forked without harm: a child then inherits what cannot be pickled."""
     return sys.platform == "linux" and "fork" in multiprocessing.get_all_start_methods()
+
+
+@contextmanager
+def forking() -> Iterator[None]:
+    """Start processes without a warning of the thread that a progress display has."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        yield
 
 
 def _cores() -> int:

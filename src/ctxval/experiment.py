@@ -54,9 +54,9 @@ def _named(labels: tuple[str, ...], own: object, letter: str, count: int) -> dic
     return {f"{letter}{i}": "" for i in range(count)}
 
 
-def labelled(name: str, unit: str) -> str:
-    """Return ``name [unit]``, the name alone without a unit."""
-    return f"{name} [{unit}]" if unit else name
+def labels_of(named: Mapping[str, str]) -> tuple[str, ...]:
+    """Return ``name [unit]`` for each name and its unit, the name alone where there is none."""
+    return tuple(f"{name} [{unit}]" if unit else name for name, unit in named.items())
 
 
 def _parted(label: str) -> tuple[str, str]:

@@ -15,7 +15,7 @@ from ctxval.campaign import Campaign, OpenTrial
 from ctxval.controller import AffineFeedback
 from ctxval.errors import InputError
 from ctxval.exchange import write_controller, write_task
-from ctxval.experiment import Experiment, labelled
+from ctxval.experiment import Experiment, labels_of
 from ctxval.space import TaskSpace
 from ctxval.trajectory import Trajectory
 from ctxval.validation import Plan
@@ -87,8 +87,7 @@ def read_recording(
         recording = Trajectory.from_npz(path)
     else:
         states, inputs = _names(experiment, plan)
-        columns, of_inputs = ([labelled(*item) for item in named.items()] for named in (states, inputs))
-        recording = Trajectory.from_csv(path, states=columns, inputs=of_inputs)
+        recording = Trajectory.from_csv(path, states=labels_of(states), inputs=labels_of(inputs))
         if inputs and not recording.inputs.shape[-1]:
             raise InputError(f"{path} must have the columns of the inputs, {', '.join(inputs)}.")
     return recording.resampled(plan.task.times) if resample else recording

@@ -11,7 +11,6 @@ import random
 import signal
 import threading
 import time
-import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -22,7 +21,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from ctxval.controller import Controller
-from ctxval.cores import can_fork
+from ctxval.cores import can_fork, forking
 from ctxval.errors import CampaignError, InputError
 from ctxval.system import System
 from ctxval.task import Task
@@ -151,8 +150,7 @@ class Processes(Crew):
         arguments = (self.system, theirs, others if forked else [], os.getpid())
         process = self._context.Process(target=_serve, args=arguments, daemon=False)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DeprecationWarning)  # of forking beside a progress display's thread
+            with forking():
                 process.start()
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             raise InputError(f"the system cannot be sent to a worker: {reason_of(error)}.") from error

@@ -66,7 +66,8 @@ class Sample:
         """
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
-        count = [trial for trial in trials if not _made_good(trial, trials)]
+        good = _made_good(trials)
+        count = [trial for trial in trials if trial.number not in good]
         return cls(
             np.array([trial.unit_point for trial in count]),
             np.array([np.nan if trial.distance is None else trial.distance for trial in count]),
@@ -92,13 +93,18 @@ class Sample:
         return int(np.isnan(self.distances).sum())
 
 
-def _made_good(trial: Trial, trials: Sequence[Trial]) -> bool:
-    """Return whether a trial failed whose task was executed with success later."""
-    return (trial.state == "failed" and trial.origin != "iid") and any(
-        np.abs(other.unit_point - trial.unit_point).max() <= _SAME_TASK
-        for other in trials
-        if other.distance is not None and other.number > trial.number
-    )
+def _made_good(trials: Sequence[Trial]) -> set[int]:
+    """Return the numbers of the trials that failed, but whose tasks were executed with success later."""
+    known = [trial for trial in trials if trial.distance is not None]
+    failed = [trial for trial in trials if trial.state == "failed" and trial.origin != "iid"]
+    if not known or not failed:
+        return set()
+    points, numbers = np.array([trial.unit_point for trial in known]), np.array([trial.number for trial in known])
+    return {
+        trial.number
+        for trial in failed
+        if ((np.abs(points - trial.unit_point).max(axis=1) <= _SAME_TASK) & (numbers > trial.number)).any()
+    }
 
 
 @dataclass(frozen=True)

@@ -71,16 +71,16 @@ def certify_store(
     given |= {"stochastic": stochastic, "resolution": resolution}
     opened = Store.existing(store)
     planned = _planned(opened)
-    confidence = planned.confidence if confidence is None else confidence
+    confidence = _first(confidence, planned.confidence)
     table = planned.certificate
-    volume = table.volume if volume is None else volume
-    stochastic = table.stochastic if stochastic is None else stochastic
+    volume = _first(volume, table.volume)
+    stochastic = _first(stochastic, table.stochastic)
     if kind is None and audit is None:
         kind, discard, constant = table.kind, _first(discard, table.discard), _first(constant, table.constant)
     threshold = _first(threshold, planned.threshold)
     limit = None if threshold is None else require_threshold(threshold)
     chosen = kind or "audit"
-    resolution = table.resolution if resolution is None else resolution
+    resolution = _first(resolution, table.resolution)
     options = Options(stochastic, discard, constant, _theorem(theorem), _search_of(opened), resolution)
     # All of it before an audit is paid for.
     _require_shares(confidence, volume)
