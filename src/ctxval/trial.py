@@ -11,7 +11,8 @@ from ctxval.space import Point
 Origin = Literal["iid", "initial", "acquisition", "covering", "manual"]
 """Why a trial was chosen. Only iid trials enter a scenario bound."""
 
-State = Literal["open", "completed", "failed"]
+State = Literal["open", "completed", "failed", "unmeasured"]
+"""Unmeasured: S was executed and its trajectory is stored, but the distance gave nothing usable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,15 +22,16 @@ class Trial:
     Attributes:
         number: from 0, in the order of asking.
         origin: why it was chosen: iid, initial, acquisition, covering (nothing had come near to it) or manual.
-        state: open, completed or failed.
+        state: open, completed, failed, or unmeasured.
         unit_point: p in the unit cube, shape ``(d,)``.
         parameters: p by name.
         attempts: how often its execution was started.
         executed: whether an execution of S ended, well or badly; this is what the budget counts.
         distance: d(p), if completed.
-        failure: why it failed, if it did.
+        failure: why it failed, or why its distance could not be measured.
         seconds: how long the execution took.
         note: what the search thought when it chose the point, plain enough for JSON; it is reminded of it on resuming.
+        because: what was changed on the system after an earlier trial of the same task had ended otherwise.
     """
 
     number: int
@@ -43,3 +45,4 @@ class Trial:
     failure: str | None = None
     seconds: float | None = None
     note: dict[str, Any] | None = None
+    because: str | None = None
