@@ -12,12 +12,11 @@ import numpy as np
 
 from ctxval.certificates import RESOLUTION
 from ctxval.errors import CtxvalError, ExecutionError, InputError
-from ctxval.interrupts import Interrupts
+from ctxval.interrupts import Interrupts, kept_alive
 from ctxval.ledger import Ledger, OpenTrial, text_of
 from ctxval.surrogate import Surrogate, fit_surrogate
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
-from ctxval.validation import require_execution
 from ctxval.verdict import CONFIDENCE, Verdict, judge, require_threshold, standing
 from ctxval.workers import Crew, Ended, crew
 
@@ -36,9 +35,13 @@ class Campaign(Ledger):
         store: file of the trials; in memory by default.
         seed: of the search's randomness, not negative.
         name: what the store calls the experiment.
+        accept_change: why a difference from the experiment that the store was made by does not matter, or what was
+            repaired on the system; it is kept in the store.
+        remeasure: measure the distance of all stored executions anew, if the store has those of another distance.
 
     Raises:
         InputError: a value cannot be used.
+        DistanceError: a stored execution cannot be measured anew; nothing is changed.
         StoreError: the store cannot be used, or was made by another experiment.
     """
 
@@ -247,11 +250,16 @@ class Campaign(Ledger):
         """Execute what is wanted, given how many executions are running, until nothing is."""
         with self.store.sole_writer(), Interrupts() as interrupts:
             self._refresh()
+            if self.unmeasured:
+                self.remeasure()
             self._again = deque(trial for trial in self._trials if trial.state == "open" and trial.attempts)
-            if hands is None:
-                self._one_by_one(wanted, on_trial, interrupts)
-            else:
-                _Together(self, hands, on_trial, patience).carry_out(wanted, interrupts)
+            try:
+                if hands is None:
+                    self._one_by_one(wanted, on_trial, interrupts)
+                else:
+                    _Together(self, hands, on_trial, patience).carry_out(wanted, interrupts)
+            finally:
+                self._executing.clear()
         return self
 
     def _one_by_one(
@@ -268,7 +276,8 @@ class Campaign(Ledger):
     def _execute(self, opened: OpenTrial, on_trial: Callable[[Trial], None] | None) -> None:
         started = time.perf_counter()
         try:
-            trajectory = self.validation.execute(opened.plan)
+            with kept_alive():
+                trajectory = self.validation.execute(opened.plan)
         except ExecutionError as error:
             ended = self._close(opened.trial, failure=text_of(error), seconds=time.perf_counter() - started)
         else:
@@ -353,7 +362,7 @@ class _Together:
                 return None
             reason = f"the worker was lost {self.losses[number]} times, at last: {ended.lost}"
             return campaign._close(opened.trial, failure=text_of(reason))
-        failure = ended.failure or _failure(opened, ended.trajectory)
+        failure = ended.failure or self._refused(opened, ended.trajectory)
         if failure is not None:
             self.failures[number] += 1
             if self.failures[number] <= self.patience.failures:
@@ -363,19 +372,18 @@ class _Together:
         assert ended.trajectory is not None
         return campaign._measure(opened, ended.trajectory, ended.seconds)
 
+    def _refused(self, opened: OpenTrial, trajectory: Trajectory | None) -> str | None:
+        """Return why what a worker returned is no execution; None if it is one."""
+        try:
+            self.campaign.validation.require(opened.plan, trajectory)
+        except (ExecutionError, InputError) as error:
+            return str(error)
+        return None
+
     def _repeat(self, opened: OpenTrial) -> None:
         if self.stopped is None:
             begun = self.campaign._begin_again(opened.trial)
             self._start(OpenTrial(begun, opened.plan))
-
-
-def _failure(opened: OpenTrial, trajectory: Trajectory | None) -> str | None:
-    """Return why what a worker returned is no execution."""
-    try:
-        require_execution(opened.plan, trajectory)
-    except ExecutionError as error:
-        return str(error)
-    return None
 
 
 def _require_count(sentence: str, count: object) -> None:

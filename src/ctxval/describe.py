@@ -1,46 +1,164 @@
-"""Plain descriptions of objects: how a store knows the experiment that it belongs to."""
+"""Plain descriptions of objects: how a store knows the experiment that it belongs to.
+
+What is described is what is computed: values, and of a user's functions and classes the syntax tree without names and
+docstrings, with the outer values that it uses. Where a module lies does not matter.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import inspect
 import math
-import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from ctxval.code_digest import Code, bytecode_digest, code_of, is_library, is_own, same_package
 
 _DEPTH = 6
 _LISTED = 100
 _TOLERANCE = 1e-6
 """Floats that a least-squares fit gives on two machines differ by less than this."""
 
+_MISSING = object()
 
-def describe(value: Any, depth: int = _DEPTH) -> Any:
-    """Return what identifies an object, as JSON: its type and its public values, or what its ``describe()`` says."""
-    if isinstance(value, str | int | bool | type(None)):
-        return value
-    if isinstance(value, np.bool_):
-        return bool(value)
-    if isinstance(value, float | np.number):
-        return float(value) if math.isfinite(value) else str(value)
-    if depth == 0:
-        return type(value).__qualname__
-    if isinstance(value, np.ndarray):
-        return _describe_array(value)
-    if isinstance(value, Mapping):
-        return {str(key): describe(item, depth - 1) for key, item in value.items()}
-    if isinstance(value, set | frozenset):
-        # Sorted: the order of a set of strings changes from process to process.
-        return sorted((describe(item, depth - 1) for item in value), key=repr)
-    if isinstance(value, Sequence):
-        return [describe(item, depth - 1) for item in value]
-    if inspect.isroutine(value) or isinstance(value, functools.partial | type):
-        return _describe_callable(value, depth)
-    return _describe_object(value, depth)
+
+def describe(value: Any, depth: int = _DEPTH, *, private: bool = False) -> Any:
+    """Return what identifies an object, as JSON: its type and its public values, or what its ``describe()`` says.
+
+    Args:
+        value: the object.
+        depth: how deep what is inside it is described.
+        private: also describe attributes whose names begin with an underscore.
+    """
+    return _Description(private).of(value, depth)
+
+
+class _Description:
+    """One description, in which the code of each function and class stands once."""
+
+    def __init__(self, private: bool) -> None:
+        self.private = private
+        self._known: set[int] = set()
+
+    def of(self, value: Any, depth: int) -> Any:
+        if isinstance(value, str | int | bool | type(None)):
+            return value
+        if isinstance(value, np.bool_):
+            return bool(value)
+        if isinstance(value, float | np.number):
+            return float(value) if math.isfinite(value) else str(value)
+        if depth == 0:
+            return type(value).__qualname__
+        if isinstance(value, np.ndarray):
+            return _describe_array(value)
+        if isinstance(value, Mapping):
+            return {str(key): self.of(item, depth - 1) for key, item in value.items()}
+        if isinstance(value, set | frozenset):
+            # Sorted: the order of a set of strings changes from process to process.
+            return sorted((self.of(item, depth - 1) for item in value), key=repr)
+        if isinstance(value, Sequence):
+            return [self.of(item, depth - 1) for item in value]
+        if inspect.isroutine(value) or isinstance(value, functools.partial | type):
+            return self._callable(value, depth)
+        return self._object(value, depth)
+
+    def _callable(self, value: Any, depth: int) -> Any:
+        if isinstance(value, functools.partial):
+            return {
+                "partial": self.of(value.func, depth - 1),
+                "args": self.of(value.args, depth - 1),
+                "keywords": self.of(value.keywords, depth - 1),
+            }
+        owner = getattr(value, "__self__", None)
+        bound = {"of": self.of(owner, depth - 1)} if owner is not None and not inspect.ismodule(owner) else {}
+        function = getattr(value, "__func__", value)
+        closed_over = inspect.getclosurevars(function).nonlocals if inspect.isfunction(function) else {}
+        enclosed = {key: self.of(item, depth - 1) for key, item in closed_over.items()}
+        defaults = (getattr(function, "__defaults__", None) or (), getattr(function, "__kwdefaults__", None) or {})
+        if any(defaults):
+            enclosed["defaults"] = self.of(defaults, depth - 1)
+        code = self._code(function, depth)
+        return {"function": _name(function), **bound, **enclosed, **code} if bound or enclosed or code else _name(value)
+
+    def _object(self, value: Any, depth: int) -> Any:
+        own = getattr(value, "describe", None)
+        if callable(own) and not self.private:
+            fields = own()
+        else:
+            fields = {k: v for k, v in _attributes(value).items() if self.private or not k.startswith("_")}
+        described = {key: self.of(item, depth - 1) for key, item in fields.items()}
+        if not fields and self.private and hasattr(value, "__array__"):
+            described["values"] = _describe_array(np.asarray(value))
+        return {"type": type(value).__qualname__, **described, **self._class_code(type(value), depth)}
+
+    # Code
+
+    def _class_code(self, cls: type, depth: int) -> dict[str, Any]:
+        found = [self._code(base, depth) for base in cls.__mro__ if base is not object]
+        found = [code for code in found if code]
+        return {"code": found} if found else {}
+
+    def _code(self, value: Any, depth: int) -> dict[str, Any]:
+        """Return the digest of a user's function or class, and what it uses."""
+        if is_own(value) or is_library(value) or id(value) in self._known:
+            return {}
+        self._known.add(id(value))
+        code = code_of(value)
+        if code is not None:
+            used = {name: self._used(value, item, depth - 1) for name, item in _outer(value, code)}
+            return {"digest": code.digest, **({"uses": used} if used else {})}
+        return {"digest": bytecode_digest(value.__code__)} if inspect.isfunction(value) else {}
+
+    def _used(self, user: Any, value: Any, depth: int) -> Any:
+        if inspect.ismodule(value):
+            return value.__name__
+        if inspect.isroutine(value) or isinstance(value, type):
+            if is_own(value) or (is_library(value) and not same_package(user, value)):
+                return _name(value)
+            return self._callable(value, depth) if depth > 0 else _name(value)
+        return self.of(value, max(depth, 0))
+
+
+def _outer(value: Any, code: Code) -> list[tuple[str, Any]]:
+    """Return the outer names that code uses, and what they stand for."""
+    outside = _globals_of(value)
+    found = []
+    for dotted in code.names:
+        root, *attributes = dotted.split(".")
+        item = outside.get(root, _MISSING)
+        seen = root
+        for attribute in attributes:
+            # Of an object more than the module's own names is not its code but its value.
+            if not inspect.ismodule(item) or not hasattr(item, attribute):
+                break
+            item, seen = getattr(item, attribute), f"{seen}.{attribute}"
+        if item is not _MISSING and item is not value:
+            found.append((seen, item))
+    return found
+
+
+def _globals_of(value: Any) -> Mapping[str, Any]:
+    if inspect.isfunction(value):
+        local = set(value.__code__.co_varnames) | set(value.__code__.co_cellvars) | set(value.__code__.co_freevars)
+        return {name: item for name, item in value.__globals__.items() if name not in local}
+    for item in vars(value).values() if isinstance(value, type) else ():
+        function = getattr(item, "fget", None) or getattr(item, "__func__", item)
+        if inspect.isfunction(function):
+            return function.__globals__
+    return {}
+
+
+def _name(value: Any) -> str:
+    """Return a callable's name, with its module if it is of a library."""
+    if not hasattr(value, "__qualname__"):
+        return repr(value)
+    module = getattr(value, "__module__", None)
+    if is_own(value):
+        return f"ctxval.{value.__qualname__}"
+    return f"{module}.{value.__qualname__}" if module and is_library(value) else str(value.__qualname__)
 
 
 def _describe_array(array: np.ndarray[Any, Any]) -> Any:
@@ -52,46 +170,6 @@ def _describe_array(array: np.ndarray[Any, Any]) -> Any:
     projection = float(array.ravel() @ np.cos(np.arange(array.size)))
     summary = {"mean": float(array.mean()), "std": float(array.std()), "projection": projection}
     return {"shape": list(array.shape), **summary}
-
-
-def _describe_callable(value: Any, depth: int) -> Any:
-    if isinstance(value, functools.partial):
-        return {
-            "partial": describe(value.func, depth - 1),
-            "args": describe(value.args, depth - 1),
-            "keywords": describe(value.keywords, depth - 1),
-        }
-    name = f"{value.__module__}.{value.__qualname__}" if hasattr(value, "__qualname__") else repr(value)
-    owner = getattr(value, "__self__", None)
-    bound = {"of": describe(owner, depth - 1)} if owner is not None and not inspect.ismodule(owner) else {}
-    closed_over = inspect.getclosurevars(value).nonlocals if inspect.isfunction(value) else {}
-    enclosed = {key: describe(item, depth - 1) for key, item in closed_over.items()}
-    defaults = (getattr(value, "__defaults__", None) or (), getattr(value, "__kwdefaults__", None) or {})
-    if any(defaults):
-        enclosed["defaults"] = describe(defaults, depth - 1)
-    if inspect.isfunction(value):
-        enclosed["constants"] = _constants(value.__code__)
-    return {"function": name, **bound, **enclosed} if bound or enclosed else name
-
-
-def _constants(code: types.CodeType) -> str:
-    """Return a digest of a function's names and constants: what an edit of its formula mostly changes.
-
-    The bytecode itself is left out, as it differs between versions of Python.
-    """
-    constants = [
-        _constants(item)
-        if isinstance(item, types.CodeType)
-        else repr(sorted(map(repr, item)) if isinstance(item, frozenset) else item)
-        for item in code.co_consts
-    ]
-    return hashlib.sha256(repr((code.co_names, constants)).encode()).hexdigest()[:16]
-
-
-def _describe_object(value: Any, depth: int) -> Any:
-    own = getattr(value, "describe", None)
-    fields = own() if callable(own) else {k: v for k, v in _attributes(value).items() if not k.startswith("_")}
-    return {"type": type(value).__qualname__, **{key: describe(item, depth - 1) for key, item in fields.items()}}
 
 
 def _attributes(value: Any) -> dict[str, Any]:
@@ -106,23 +184,37 @@ def _attributes(value: Any) -> dict[str, Any]:
 def first_difference(stored: Any, present: Any, path: str = "") -> str | None:
     """Return where two descriptions first differ, as ``"path: stored, present"``; None where they agree.
 
-    Floats agree within a relative 1e-6, so that a model fitted again on another machine is the same model.
+    Floats agree within a relative 1e-6, so that a model fitted again on another machine is the same model. Of a
+    function that has a digest the name does not matter.
     """
+    return next((sentence for _, sentence in differences(stored, present, path)), None)
+
+
+def differences(stored: Any, present: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    """Yield every place in which two descriptions differ, each with a sentence, as :func:`first_difference` does."""
     if isinstance(stored, dict) and isinstance(present, dict):
         for key in [*stored, *(key for key in present if key not in stored)]:
-            here = f"{path}.{key}" if path else key
-            if (key in stored) != (key in present):
-                return f"{here} is {'missing now' if key in stored else 'new'}"
-            found = first_difference(stored[key], present[key], here)
-            if found:
-                return found
-        return None
-    if isinstance(stored, list) and isinstance(present, list) and len(stored) == len(present):
-        pairs = enumerate(zip(stored, present, strict=True))
-        return next((found for i, (a, b) in pairs if (found := first_difference(a, b, f"{path}[{i}]"))), None)
-    if _same(stored, present):
-        return None
-    return f"{path} was {_short(stored)} and is now {_short(present)}"
+            yield from _at_key(stored, present, key, path)
+    elif isinstance(stored, list) and isinstance(present, list) and len(stored) == len(present):
+        for i, (a, b) in enumerate(zip(stored, present, strict=True)):
+            yield from differences(a, b, f"{path}[{i}]")
+    elif not _same(stored, present):
+        yield path, f"{path} was {_short(stored)} and is now {_short(present)}"
+
+
+def _at_key(stored: dict[str, Any], present: dict[str, Any], key: str, path: str) -> Iterator[tuple[str, str]]:
+    here = f"{path}.{key}" if path else key
+    coded = "digest" in stored and "digest" in present
+    if coded and key == "digest":
+        if stored[key] != present[key]:
+            called = f", {present['function']}," if "function" in present else ""
+            yield path, f"the code of {path or 'it'}{called} has changed"
+    elif coded and key == "function":
+        return
+    elif (key in stored) != (key in present):
+        yield here, f"{here} is {'missing now' if key in stored else 'new'}"
+    else:
+        yield from differences(stored[key], present[key], here)
 
 
 def _same(stored: Any, present: Any) -> bool:

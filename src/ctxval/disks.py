@@ -22,16 +22,24 @@ def file_system(path: Path, mounts: str) -> str:
     return max(holding, default=(0, ""))[1]
 
 
+def _kind_of(path: Path) -> str:
+    try:
+        return file_system(path.absolute(), Path("/proc/mounts").read_text())
+    except (OSError, ValueError):
+        return ""
+
+
+def on_network(path: Path) -> bool:
+    """Return whether a path is on a file system of another machine, as far as this one says."""
+    return _kind_of(path) in _NETWORKS
+
+
 def warn_of_network(path: Path) -> None:
     """Warn of a store on a file system of another machine."""
-    try:
-        kind = file_system(path.absolute(), Path("/proc/mounts").read_text())
-    except (OSError, ValueError):
-        return
-    if kind in _NETWORKS:
+    if on_network(path):
         warnings.warn(
-            f"{path} is on a network file system ({kind}), whose locks and flushes cannot be relied on: keep the store "
-            "on a disk of this computer.",
+            f"{path} is on a network file system ({_kind_of(path)}), whose locks and flushes cannot be relied on: keep "
+            "the store on a disk of this computer.",
             StoreWarning,
             stacklevel=4,
         )

@@ -1,13 +1,16 @@
-"""Ctrl-C in two steps: the first ends after what is running, the second at once."""
+"""What may end a process while it executes: Ctrl-C in two steps, and exits that a system asks for."""
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
+from types import FrameType, FunctionType
+from typing import NoReturn
 
 
 class Interrupts:
@@ -63,3 +66,37 @@ class Interrupts:
         """
         if self.asked:
             raise KeyboardInterrupt
+
+
+def raised_by_signal(error: BaseException) -> bool:
+    """Return whether an exception comes from outside, by a signal, and not from the code that was running."""
+    handlers = [signal.getsignal(number) for number in signal.valid_signals()]
+    codes = {function.__code__ for handler in handlers if (function := _function_of(handler)) is not None}
+    if any(frame.f_code in codes for frame, _ in traceback.walk_tb(error.__traceback__)):
+        return True
+    # Python's own handler has no frame.
+    in_main = threading.current_thread() is threading.main_thread()
+    default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    return isinstance(error, KeyboardInterrupt) and in_main and default
+
+
+def _function_of(handler: object) -> FunctionType | None:
+    function = getattr(handler, "__func__", handler)
+    return function if isinstance(function, FunctionType) else None
+
+
+@contextmanager
+def kept_alive() -> Iterator[None]:
+    """Make an exit of this very process, which no exception would show, an exception; forked processes may exit."""
+    ours, leave = os.getpid(), os._exit
+
+    def refuse(status: int) -> NoReturn:
+        if os.getpid() != ours:
+            leave(status)
+        raise SystemExit(f"os._exit({status!r})")
+
+    os._exit = refuse
+    try:
+        yield
+    finally:
+        os._exit = leave

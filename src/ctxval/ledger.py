@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -10,15 +11,17 @@ from typing import Any, NoReturn
 import numpy as np
 
 from ctxval.arrays import Array
-from ctxval.describe import describe
+from ctxval.describe import differences
+from ctxval.distance import Distance
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError
+from ctxval.identity import description_of, digest_of_model, identify
 from ctxval.prediction import predict_distance
-from ctxval.recording import kept_beside, known_distance, require_one_result, require_recording, same_run
+from ctxval.recording import kept_beside, known_distance, require_one_result, same_run
 from ctxval.searches import GPUCB, Prediction, Search
-from ctxval.store import Store
+from ctxval.store import Change, Store
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Origin, State, Trial
-from ctxval.validation import START, Plan, Validation
+from ctxval.validation import Plan, Validation
 
 _AUDIT = 0x6175
 """Marks the randomness of an audit's draws; searches mark streams of theirs with small numbers."""
@@ -56,6 +59,8 @@ class Ledger:
         store: Store | str | Path | None = None,
         seed: int = 0,
         name: str = "",
+        accept_change: str | None = None,
+        remeasure: bool = False,
     ) -> None:
         if not isinstance(validation, Validation):
             raise InputError(f"validation must be a Validation, got {validation!r}.")
@@ -68,25 +73,40 @@ class Ledger:
         self.seed = int(seed)
         self.name = name
         self.store = store if isinstance(store, Store) else Store(store)
-        self.store.identify(
-            {
-                "name": name,
-                "seed": self.seed,
-                "search": describe(self.search),
-                "validation": validation.describe(),
-            }
-        )
+        identify(self.store, validation, self._description(), accept_change, remeasure)
+        self._executing: set[int] = set()
         self._replay()
+        if remeasure:
+            self.remeasure()
+
+    def _description(self) -> dict[str, Any]:
+        return description_of(self.validation, self.search, self.seed, self.name)
 
     def _replay(self) -> None:
         """Bring the search to where the stored trials left it."""
-        self.search.reset(self.validation.space.dimension, self.seed)
         self._trials = self.store.trials()
+        self._changes = len(self.store.history())
+        self.search.reset(self.validation.space.dimension, self._search_seed())
         told = _as_told(self._trials)
         if told:
             self.search.tell(np.array([trial.unit_point for trial in told]), [_value(trial) for trial in told])
             if hasattr(self.search, "remember"):
                 self.search.remember([trial.note for trial in told])
+
+    def _search_seed(self) -> int:
+        """Return the search's seed; one of independent draws depends on the model too."""
+        if not getattr(self.search, "iid", False):
+            return self.seed
+        number = self._draws_number()
+        return self.seed if number is None else int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
+
+    def _draws_number(self) -> int | None:
+        """Return what independent draws depend on besides the seed: the model, so that another one has others."""
+        number = self.store.draws()
+        if number is None and not any(trial.origin == "iid" for trial in self._trials):
+            self.store.keep_draws(digest_of_model(self.validation))
+            number = self.store.draws()
+        return number
 
     # What is known
 
@@ -106,6 +126,11 @@ class Ledger:
         return [trial for trial in self._trials if trial.state == "failed"]
 
     @property
+    def unmeasured(self) -> list[Trial]:
+        """The trials that were executed but have no distance, because it could not be measured."""
+        return [trial for trial in self._trials if trial.state == "unmeasured"]
+
+    @property
     def executions(self) -> int:
         """How many executions of S have ended, well or badly."""
         return sum(trial.executed for trial in self._trials)
@@ -116,12 +141,20 @@ class Ledger:
 
     # By hand
 
-    def ask(self, parameters: Mapping[str, Any] | None = None, *, draw: bool = False, wait: float = 0.0) -> OpenTrial:
+    def ask(
+        self,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        draw: bool = False,
+        because: str | None = None,
+        wait: float = 0.0,
+    ) -> OpenTrial:
         """Open the next trial: the search's choice, the task with these parameters, or an independent uniform draw.
 
         Args:
             parameters: of a task that you chose yourself.
             draw: for an audit.
+            because: what was changed on the system since the task of these parameters was executed before.
             wait: seconds to wait for another process that is asking.
 
         Raises:
@@ -130,10 +163,12 @@ class Ledger:
             ModelError, DesignError: no controller could be designed and run on the model; the trial is stored as
                 failed and costs no execution.
         """
+        if because is not None and (parameters is None or not because.strip()):
+            raise InputError('a reason such as "fuse replaced" is given for a task that was executed before.')
         with self.store.sole_writer(wait):
             self._refresh()
             if parameters is not None:
-                return self._open((self._unit_point(parameters), "manual"), attempts=0)
+                return self._open((self._unit_point(parameters), "manual"), attempts=0, because=because)
             return self._open((self._draw(), "iid") if draw else None, attempts=0)
 
     def reopen(self, number: int) -> OpenTrial:
@@ -151,25 +186,27 @@ class Ledger:
 
     def _draw(self) -> Array:
         # Apart from the search's own randomness, which is that of [seed, number].
-        rng = np.random.default_rng(np.random.SeedSequence([self.seed, len(self._trials), _AUDIT]))
+        number = self._draws_number()
+        entropy = [self.seed, len(self._trials), _AUDIT, *([] if number is None else [number])]
+        rng = np.random.default_rng(np.random.SeedSequence(entropy))
         return rng.random(self.validation.space.dimension)
 
     def _refresh(self) -> None:
         """Learn what other processes have stored meanwhile."""
-        own = (len(self._trials), sum(trial.state == "open" for trial in self._trials))
+        own = (len(self._trials), sum(trial.state == "open" for trial in self._trials), self._changes)
         if self.store.signature() != own:
             self._replay()
 
-    def _open(self, given: tuple[Array, Origin] | None, attempts: int) -> OpenTrial:
+    def _open(self, given: tuple[Array, Origin] | None, attempts: int, because: str | None = None) -> OpenTrial:
         """Store a new trial ahead of its execution; one that is about to be executed counts as its first attempt."""
         try:
-            return self._store_next(given, attempts)
+            return self._store_next(given, attempts, because)
         except BaseException:
             # Whatever stopped it, the search must know the stored trials and no other.
             self._replay()
             raise
 
-    def _store_next(self, given: tuple[Array, Origin] | None, attempts: int) -> OpenTrial:
+    def _store_next(self, given: tuple[Array, Origin] | None, attempts: int, because: str | None) -> OpenTrial:
         note = None
         if given is None:
             unit_point, origin = self._suggestion(), self._origin()
@@ -178,7 +215,7 @@ class Ledger:
             unit_point, origin = given
             self.search.tell(unit_point[None], [np.nan])
         names = self.validation.space.describe_point(self.validation.space.from_unit(unit_point))
-        trial = Trial(len(self._trials), origin, "open", unit_point, names, attempts, note=note)
+        trial = Trial(len(self._trials), origin, "open", unit_point, names, attempts, note=note, because=because)
         try:
             plan = self._plan(trial)
         except CtxvalError as error:
@@ -186,6 +223,8 @@ class Ledger:
             raise
         self.store.open_trial(trial, plan.model_trajectory)
         self._trials.append(trial)
+        if attempts:
+            self._executing.add(trial.number)
         return OpenTrial(trial, plan)
 
     def tell(
@@ -195,7 +234,7 @@ class Ledger:
         *,
         distance: float | None = None,
         failed: str | None = None,
-        start_tolerance: float = START,
+        start_tolerance: float | None = None,
     ) -> Trial:
         """Record how an open trial, or the one of this number, ended: its trajectory, its distance, or why it failed.
 
@@ -208,14 +247,37 @@ class Ledger:
         if isinstance(opened, OpenTrial) and not np.array_equal(opened.trial.unit_point, trial.unit_point):
             raise InputError(f"this open trial {opened.number} is of another campaign.")
         require_one_result(trajectory, distance, failed)
-        if failed is not None:
-            return self._close(trial, failure=text_of(failed))
-        if distance is not None:
-            return self._close(trial, distance=known_distance(distance))
-        plan = opened.plan if isinstance(opened, OpenTrial) else self._plan(trial)
-        require_recording(plan, trajectory, start_tolerance)
-        assert trajectory is not None
-        return self._measure(OpenTrial(trial, plan), trajectory, None)
+        with self._not_executing(trial):
+            trial = self._open_trial(trial.number)
+            if failed is not None:
+                return self._close(trial, failure=text_of(failed))
+            if distance is not None:
+                return self._close(trial, distance=known_distance(distance))
+            plan = opened.plan if isinstance(opened, OpenTrial) else self._plan(trial)
+            self.validation.require(plan, trajectory, start_tolerance)
+            assert trajectory is not None
+            return self._measure(OpenTrial(trial, plan), trajectory, None)
+
+    @contextmanager
+    def _not_executing(self, trial: Trial) -> Iterator[None]:
+        """Refuse what is told of a trial that is being executed: how that ends is recorded by who executes it.
+
+        Raises:
+            InputError: it is.
+        """
+        refusal = f"trial {trial.number} is being executed, and nothing can be told of it before that has ended."
+        if trial.number in self._executing:
+            raise InputError(refusal)
+        if not trial.attempts:
+            yield  # opened by hand, and nobody else executes it
+            return
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(self.store.sole_writer())
+            except StoreAccessError as error:
+                raise InputError(refusal) from error
+            self._refresh()
+            yield
 
     def add(
         self,
@@ -224,7 +286,7 @@ class Ledger:
         *,
         distance: float | None = None,
         failed: str | None = None,
-        start_tolerance: float = START,
+        start_tolerance: float | None = None,
         wait: float = 0.0,
     ) -> Trial | None:
         """Record an execution that was made before, with the origin manual; None where it is in the store already.
@@ -238,21 +300,20 @@ class Ledger:
         unit_point, plan = self.known(
             parameters, trajectory, distance=distance, failed=failed, tolerance=start_tolerance
         )
-        if trajectory is not None and failed is None:
-            distance = self.validation.measure(plan, trajectory)
         with self.store.sole_writer(wait):
             self._refresh()
-            if any(same_run(trial, unit_point, distance, failed) for trial in self._trials):
+            measured, unusable = (distance, None) if trajectory is None else self._measured(plan, trajectory)
+            failure = unusable if failed is None else text_of(failed)
+            if any(same_run(trial, unit_point, measured, failure) for trial in self._trials):
                 return None
-            state: State = "failed" if distance is None else "completed"
+            state: State = "failed" if failed is not None else "unmeasured" if measured is None else "completed"
             names = self.validation.space.describe_point(plan.parameters.points)
             trial = Trial(
-                *(len(self._trials), "manual", state, unit_point, names, 0, True, distance),
-                None if failed is None else text_of(failed),
+                *(len(self._trials), "manual", state, unit_point, names, 0, True, measured, failure),
             )
             self.store.record_known(trial, plan.model_trajectory, trajectory)
             self._trials.append(trial)
-            self.search.tell(unit_point[None], [np.nan if distance is None else distance])
+            self.search.tell(unit_point[None], [np.nan if measured is None else measured])
         return trial
 
     def known(
@@ -262,14 +323,14 @@ class Ledger:
         *,
         distance: float | None = None,
         failed: str | None = None,
-        tolerance: float = START,
+        tolerance: float | None = None,
     ) -> tuple[Array, Plan]:
         """Check an execution as :meth:`add` does; return its point of the unit cube and its plan."""
         require_one_result(trajectory, distance, failed)
         unit_point = self._unit_point(parameters)
         plan = self.validation.plan(self.validation.space.from_unit(unit_point))
         if trajectory is not None:
-            require_recording(plan, trajectory, tolerance)
+            self.validation.require(plan, trajectory, tolerance)
         if distance is not None:
             known_distance(distance)
         return unit_point, plan
@@ -296,6 +357,7 @@ class Ledger:
         begun = replace(trial, attempts=trial.attempts + 1)
         self.store.begin_attempt(begun)
         self._trials[trial.number] = begun
+        self._executing.add(trial.number)
         return begun
 
     def _plan(self, trial: Trial) -> Plan:
@@ -327,12 +389,26 @@ class Ledger:
         return "initial" if len(self._trials) < getattr(self.search, "initial", 0) else "acquisition"
 
     def _measure(self, opened: OpenTrial, trajectory: Trajectory, seconds: float | None) -> Trial:
+        """Store an execution with its distance, or as unmeasured.
+
+        Raises:
+            DistanceError: the distance gave nothing usable; the execution is stored all the same.
+        """
+        distance, unusable = self._measured(opened.plan, trajectory)
+        ended = self._close(opened.trial, trajectory, distance=distance, unusable=unusable, seconds=seconds)
+        if unusable is not None:
+            raise DistanceError(
+                f"{unusable} The execution of trial {ended.number} is stored: once the distance is mended, "
+                "`ctxval remeasure STORE` measures it, without another execution."
+            )
+        return ended
+
+    def _measured(self, plan: Plan, trajectory: Trajectory) -> tuple[float | None, str | None]:
+        """Return the distance, or why it could not be measured."""
         try:
-            distance = self.validation.measure(opened.plan, trajectory)
+            return self.validation.measure(plan, trajectory), None
         except DistanceError as error:
-            self._close(opened.trial, trajectory, failure=text_of(error), seconds=seconds)
-            raise
-        return self._close(opened.trial, trajectory, distance=distance, seconds=seconds)
+            return None, text_of(error)
 
     def _close(
         self,
@@ -341,37 +417,106 @@ class Ledger:
         *,
         distance: float | None = None,
         failure: str | None = None,
+        unusable: str | None = None,
         seconds: float | None = None,
         executed: bool = True,
     ) -> Trial:
         ended = replace(
             trial,
-            state="completed" if failure is None else "failed",
+            state="failed" if failure is not None else "completed" if unusable is None else "unmeasured",
             executed=executed,
             distance=distance,
-            failure=failure,
+            failure=failure if unusable is None else unusable,
             seconds=seconds,
         )
         try:
             self.store.close_trial(ended, trajectory)
-        except StoreAccessError as error:
+        except (StoreAccessError, InputError) as error:
             self._rescue(ended, trajectory, error)
+        self._executing.discard(trial.number)
         self._trials[trial.number] = ended
         if distance is not None:
             self.search.tell(trial.unit_point[None], [distance])
         return ended
 
-    def _rescue(self, trial: Trial, trajectory: Trajectory | None, error: StoreAccessError) -> NoReturn:
-        """Keep an execution that was paid for where its store takes no more."""
-        if trajectory is None:
+    def _rescue(self, ended: Trial, trajectory: Trajectory | None, error: CtxvalError) -> NoReturn:
+        """Keep how an execution that was paid for ended, where its store does not take it."""
+        if not ended.executed:
             raise error
-        path = kept_beside(trajectory, trial.number, self.store.path)
-        if path is not None:
-            raise StoreAccessError(
-                f"{error} The execution of trial {trial.number} is kept in {path}: once the store can be written "
-                f"again, say `ctxval tell STORE {trial.number} --npz {path}` before anything else."
-            ) from error
-        raise StoreAccessError(f"{error} The execution of trial {trial.number} could not be kept either.") from error
+        path = kept_beside(ended, trajectory, self.store.path)
+        if path is None:
+            raise type(error)(f"{error} How trial {ended.number} ended could not be kept either.") from error
+        how = f"--npz {path}" if trajectory is not None else "--failed or --distance as it says"
+        raise type(error)(
+            f"{error} How trial {ended.number} ended is kept in {path}: once the store can take it, "
+            f"say `ctxval tell STORE {ended.number} {how}` before anything else."
+        ) from error
+
+    # Measuring again
+
+    def remeasure(self, distance: Distance | None = None) -> list[Trial]:
+        """Measure the distance of every stored execution anew, without an execution; return the trials that changed.
+
+        The values of before stay in the store's history. A distance that was told without a trajectory cannot be
+        measured anew: if the definition has changed, its trial has no distance from then on.
+
+        Args:
+            distance: the distance from now on; the one of the validation if it is not given.
+
+        Raises:
+            DistanceError: the distance of a trial that had one cannot be measured any more; nothing is changed.
+            StoreAccessError: another process is running the store.
+        """
+        validation = self.validation if distance is None else self.validation.with_distance(distance)
+        with self.store.sole_writer():
+            self._refresh()
+            before, self.validation = self.validation, validation
+            try:
+                changed = self._remeasured()
+            except CtxvalError:
+                self.validation = before
+                raise
+            self._replay()
+        return changed
+
+    def _remeasured(self) -> list[Trial]:
+        description = self._description()
+        differing = differences(self.store.description(), description)
+        other = any(path.startswith("validation.distance") for path, _ in differing)
+        now = [self._measured_again(trial, other) for trial in self._trials]
+        changed = [trial for trial, before in zip(now, self._trials, strict=True) if _ended(trial) != _ended(before)]
+        if changed or other:
+            old = {str(trial.number): _ended(self._trials[trial.number]) for trial in changed}
+            why = "the distance has changed" if other else "asked for"
+            self.store.remeasure(changed, description, Change("remeasured", why, {"before": old}))
+        return changed
+
+    def _measured_again(self, trial: Trial, other: bool) -> Trial:
+        """Return a trial with its distance as it is measured now."""
+        if trial.state == "open" or not trial.executed:
+            return trial
+        model, system = self.trajectories(trial)
+        if model is None or system is None:
+            told = trial.distance is not None and other
+            return replace(trial, state="unmeasured", distance=None, failure=_TOLD) if told else trial
+        point = self.validation.space.from_unit(trial.unit_point)
+        try:
+            distance = self.validation.remeasure(point, model, system)
+        except DistanceError as error:
+            if trial.distance is not None:
+                raise DistanceError(
+                    f"trial {trial.number} cannot be measured anew, and nothing is changed: {error}"
+                ) from error
+            return replace(trial, state="unmeasured", failure=text_of(error))
+        return replace(trial, state="completed", distance=distance, failure=None)
+
+
+_TOLD = "its distance was told without a trajectory, and the distance has changed since."
+
+
+def _ended(trial: Trial) -> dict[str, Any]:
+    """Return what measuring again may change of a trial."""
+    return {"state": trial.state, "distance": trial.distance, "failure": trial.failure}
 
 
 def _as_told(trials: list[Trial]) -> list[Trial]:

@@ -1,21 +1,101 @@
-"""A lock that goes with its process, however that ends: SQLite's on a file, which all operating systems have."""
+"""Locks that go with their process, however that ends."""
 
 from __future__ import annotations
 
+import os
 import sqlite3
+import sys
+import weakref
 from pathlib import Path
 
+if sys.platform == "linux":
+    import fcntl
 
-def lock(path: str | Path) -> sqlite3.Connection:
-    """Return the lock on a file, which is made if need be; it is held until it is closed or the process ends.
+LOCKS_FILE_ITSELF = sys.platform == "linux"
+"""Whether a file can be locked while SQLite uses it: locks of ``flock`` and of SQLite do not exclude each other."""
+
+
+class LockedError(OSError):
+    """The lock is held, by this process or another."""
+
+
+class FileLock:
+    """The exclusive lock of a file, whatever name it is opened by; a forked process does not inherit it.
+
+    On Linux the file may be a database in use. Elsewhere it must be a file of nothing else, as it is locked by a
+    transaction of SQLite.
+
+    Args:
+        path: the file; made if it does not exist.
 
     Raises:
-        sqlite3.DatabaseError: it is held, by this process or another ("locked"), or there can be none on this disk.
+        OSError: the file cannot be opened.
     """
-    held = sqlite3.connect(path, isolation_level=None, timeout=0, check_same_thread=False)
-    try:
-        held.execute("BEGIN EXCLUSIVE")
-    except sqlite3.DatabaseError:
-        held.close()
-        raise
-    return held
+
+    def __init__(self, path: str | Path) -> None:
+        self._lock: _Flock | _Transaction = _Flock(path) if LOCKS_FILE_ITSELF else _Transaction(path)
+
+    def acquire(self) -> None:
+        """Take the lock; it is held until it is released or the process ends.
+
+        Raises:
+            LockedError: it is held already.
+            OSError: this file cannot be locked.
+        """
+        self._lock.acquire()
+
+    def release(self) -> None:
+        """Release the lock; the file stays open, as closing it would end SQLite's own locks of it in this process."""
+        self._lock.release()
+
+    def close(self) -> None:
+        """Close the file, which releases the lock."""
+        self._lock.close()
+
+
+_open: weakref.WeakSet[_Flock] = weakref.WeakSet()
+
+
+def _close_inherited() -> None:
+    for lock in list(_open):
+        lock.close()
+
+
+if sys.platform == "linux":
+    os.register_at_fork(after_in_child=_close_inherited)
+
+
+class _Flock:
+    def __init__(self, path: str | Path) -> None:
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        self.close = weakref.finalize(self, os.close, self._file)
+        _open.add(self)
+
+    def acquire(self) -> None:
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise LockedError("the lock is held") from None
+
+    def release(self) -> None:
+        fcntl.flock(self._file, fcntl.LOCK_UN)
+
+
+class _Transaction:
+    def __init__(self, path: str | Path) -> None:
+        try:
+            self._connection = sqlite3.connect(path, isolation_level=None, timeout=0, check_same_thread=False)
+        except sqlite3.DatabaseError as error:
+            raise OSError(str(error)) from error
+
+    def acquire(self) -> None:
+        try:
+            self._connection.execute("BEGIN EXCLUSIVE")
+        except sqlite3.DatabaseError as error:
+            raise LockedError("the lock is held") if "locked" in str(error) else OSError(str(error)) from error
+
+    def release(self) -> None:
+        self._connection.execute("ROLLBACK")
+
+    def close(self) -> None:
+        self._connection.close()

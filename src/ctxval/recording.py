@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import os
 import tempfile
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
 from ctxval.arrays import Array
 from ctxval.errors import InputError
-from ctxval.trajectory import COMPLETE, Trajectory
+from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
-from ctxval.validation import Plan, require_execution, require_task
 
 
 def require_one_result(trajectory: Trajectory | None, distance: float | None, failed: str | None) -> None:
@@ -29,35 +31,51 @@ def known_distance(distance: float) -> float:
     return float(distance)
 
 
-def require_recording(plan: Plan, trajectory: Trajectory | None, start_tolerance: float) -> None:
-    """Check that a recording is a whole execution of a plan."""
-    if not isinstance(trajectory, Trajectory):
-        raise InputError(f"a Trajectory is needed, got {type(trajectory).__name__}.")
-    if trajectory.ended == COMPLETE:
-        require_task(plan, trajectory, start_tolerance)
-    require_execution(plan, trajectory)
-
-
 def same_run(trial: Trial, unit_point: Array, distance: float | None, failed: str | None) -> bool:
     """Return whether a trial is an execution that is told again."""
     ended = trial.distance == distance and trial.failure == failed and trial.state != "open"
     return ended and np.array_equal(trial.unit_point, unit_point)
 
 
-def kept_beside(trajectory: Trajectory, number: int, store: Path | None) -> Path | None:
-    """Write an execution that its store does not take beside it, or where there is room; return where, or None."""
+def kept_beside(trial: Trial, trajectory: Trajectory | None, store: Path | None) -> Path | None:
+    """Write how a trial ended, which its store does not take, beside the store or where there is room.
+
+    It is the trajectory as NPZ, or where there is none, the distance or the failure as JSON. What other attempts have
+    left there stays.
+
+    Returns:
+        where it is; None if it can be written nowhere.
+    """
     stem = "memory" if store is None else store.stem
+    ended = {"trial": trial.number, "distance": trial.distance, "failure": trial.failure}
+    content, suffix = (json.dumps(ended).encode(), "json") if trajectory is None else (trajectory.to_npz(), "npz")
     for folder in (Path() if store is None else store.parent, Path(tempfile.gettempdir())):
-        path = folder / f"{stem}.trial-{number}.npz"
-        try:
-            file = path.open("xb")
-        except OSError:
-            continue
-        try:
-            with file:
-                file.write(trajectory.to_npz())
-            return path
-        except OSError:
+        for count in range(_KEPT):
+            path = folder / f"{stem}.trial-{trial.number}{f'.{count}' if count else ''}.{suffix}"
+            try:
+                file = path.open("xb")
+            except FileExistsError:
+                continue
+            except OSError:
+                break
+            if _flushed(file, content):
+                return path
             with contextlib.suppress(OSError):
                 path.unlink()
+            break
     return None
+
+
+_KEPT = 1000
+"""Files of one trial that are kept in one folder."""
+
+
+def _flushed(file: IO[bytes], content: bytes) -> bool:
+    try:
+        with file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError:
+        return False
+    return True

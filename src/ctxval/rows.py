@@ -12,7 +12,7 @@ from ctxval.errors import InputError
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Origin, State, Trial
 
-COLUMNS = "number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds, note"
+COLUMNS = "number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds, note, because"
 """Of a trial, as :func:`read_trial` takes them."""
 
 
@@ -21,7 +21,7 @@ def row_of(trial: Trial) -> tuple[Any, ...]:
     return (
         *(trial.number, trial.origin, trial.state, json.dumps(trial.unit_point.tolist())),
         *(json.dumps(trial.parameters), trial.attempts, int(trial.executed)),
-        *(real(trial.distance), trial.failure, real(trial.seconds), json.dumps(trial.note)),
+        *(real(trial.distance), trial.failure, real(trial.seconds), json.dumps(trial.note), trial.because),
     )
 
 
@@ -35,10 +35,15 @@ def checksum_of(row: tuple[Any, ...]) -> int:
     return zlib.crc32(repr(row).encode("utf-8", "backslashreplace"))
 
 
+def trial_checksum(row: tuple[Any, ...]) -> int:
+    """Return the checksum of a trial's row; of one without ``because`` as before there was that column."""
+    return checksum_of(row if row[-1] is not None else row[:-1])
+
+
 def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial | None:
     """Return the trial of a row; None where it is damaged. Rows of older versions have no checksum."""
-    number, origin, state, point, names, attempts, executed, distance, failure, seconds, note = row
-    if checksum is not None and checksum_of(row) != checksum:
+    number, origin, state, point, names, attempts, executed, distance, failure, seconds, note, because = row
+    if checksum is not None and trial_checksum(row) != checksum:
         return None
     try:
         unit_point = np.array(json.loads(point), dtype=np.float64)
@@ -47,7 +52,7 @@ def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial | None:
             return None
         return Trial(
             *(int(number), origin, state, unit_point, json.loads(names), int(attempts), bool(executed)),
-            *(distance, failure, seconds, json.loads(note or "null")),
+            *(distance, failure, seconds, json.loads(note or "null"), because),
         )
     except (ValueError, TypeError, RecursionError):
         return None

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ctxval.locks import lock
+from ctxval.locks import FileLock
 
 _PREFIX = "ctxval-"
 _OWNED = "owned"
@@ -47,12 +46,13 @@ def scratch() -> Iterator[Path]:
         folder.remove()
 
 
-def _owned(folder: Path) -> sqlite3.Connection | None:
+def _owned(folder: Path) -> FileLock | None:
     """Return the lock that says whose a folder is; None on a disk without locks, where nobody else ever removes it."""
     unnamed = folder / "new"
     try:
-        held = lock(unnamed)
-    except sqlite3.DatabaseError:
+        held = FileLock(unnamed)
+        held.acquire()
+    except OSError:
         return None
     # Nobody sees the file before it is locked.
     unnamed.rename(folder / _OWNED)
@@ -62,7 +62,10 @@ def _owned(folder: Path) -> sqlite3.Connection | None:
 def _remove_left_over() -> None:
     """Remove the folders whose processes have ended."""
     for owned in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*/{_OWNED}"):
-        with suppress(OSError, sqlite3.DatabaseError):  # it is in use, or another user's
-            left = lock(owned)
-            left.close()
-            shutil.rmtree(owned.parent, ignore_errors=True)
+        with suppress(OSError):  # it is in use, or another user's
+            left = FileLock(owned)
+            try:
+                left.acquire()
+                shutil.rmtree(owned.parent, ignore_errors=True)
+            finally:
+                left.close()

@@ -98,10 +98,12 @@ class TaskSpace:
         )
         return f"TaskSpace({inside})"
 
-    def describe(self) -> dict[str, list[float]]:
-        """Return ``{scalar name: [low, high]}``, what identifies this space in a store."""
+    def describe(self) -> dict[str, list[float | str]]:
+        """Return ``{scalar name: [low, high]}``, and the unit if it has one: what identifies this space in a store."""
+        units = (self._units[name.partition("[")[0]] for name in self.names)
         return {
-            name: [low, high] for name, low, high in zip(self.names, self.low.tolist(), self.high.tolist(), strict=True)
+            name: [float(low), float(high), *([unit] if unit else [])]
+            for name, low, high, unit in zip(self.names, self.low, self.high, units, strict=True)
         }
 
     def columns(self, name: str) -> int | slice:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from ctxval.describe import first_difference
-from ctxval.disks import warn_of_network
-from ctxval.errors import ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
-from ctxval.locks import lock
-from ctxval.rows import COLUMNS, checksum_of, read_trajectory, read_trial, real, row_of
+from ctxval.disks import on_network, warn_of_network
+from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
+from ctxval.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
+from ctxval.rows import COLUMNS, checksum_of, read_trajectory, read_trial, real, row_of, trial_checksum
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
 
@@ -55,10 +55,59 @@ _MIGRATIONS = (
     ("what was run, for commands that go on", "CREATE TABLE settings (key TEXT PRIMARY KEY, value TEXT NOT NULL)"),
     ("a checksum of each trial, as SQLite has none", "ALTER TABLE trials ADD COLUMN checksum INTEGER"),
     ("a checksum of each trajectory with its place", "ALTER TABLE trajectories ADD COLUMN checksum INTEGER"),
+    (
+        "trials whose distance is not measured, why a task was executed again, and what was changed",
+        """
+        CREATE TABLE trials_now (
+            number INTEGER PRIMARY KEY,
+            origin TEXT NOT NULL,
+            state TEXT NOT NULL CHECK (state IN ('open', 'completed', 'failed', 'unmeasured')),
+            unit_point TEXT NOT NULL,
+            parameters TEXT NOT NULL,
+            attempts INTEGER NOT NULL,
+            distance REAL,
+            failure TEXT,
+            executed INTEGER NOT NULL DEFAULT 0,
+            opened_at TEXT NOT NULL,
+            closed_at TEXT,
+            seconds REAL,
+            note TEXT,
+            checksum INTEGER,
+            because TEXT
+        );
+        INSERT INTO trials_now SELECT number, origin, state, unit_point, parameters, attempts, distance, failure,
+            executed, opened_at, closed_at, seconds, note, checksum, NULL FROM trials;
+        DROP TABLE trials;
+        ALTER TABLE trials_now RENAME TO trials;
+        CREATE TABLE history (
+            number INTEGER PRIMARY KEY, at TEXT NOT NULL, what TEXT NOT NULL, why TEXT NOT NULL, content TEXT NOT NULL
+        )
+        """,
+    ),
 )
+
+_DRAWS = "draws"
+"""Key of the table experiment that is no part of the description."""
 
 _WAIT = 0.02
 """Seconds between two attempts to become the sole writer."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What was changed in a store after it was written.
+
+    Attributes:
+        what: the kind of change.
+        why: the reason that was given.
+        content: what it was before, or what differs, plain enough for JSON.
+        at: when, in UTC; empty until it is stored.
+    """
+
+    what: str
+    why: str
+    content: dict[str, Any]
+    at: str = ""
 
 
 class Store:
@@ -75,8 +124,10 @@ class Store:
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
-        self.path = None if path is None else Path(path)
-        self._name = "the store in memory" if self.path is None else str(self.path)
+        # Absolute, as what is executed may change the folder of the process.
+        self.path = None if path is None else Path(path).absolute()
+        self._name = "the store in memory" if path is None else str(path)
+        self._lock: FileLock | None = None
         self._locked = False
         with self._translating():
             if self.path is not None:
@@ -105,6 +156,8 @@ class Store:
     def close(self) -> None:
         """Close the file."""
         self._connection.close()
+        if self._lock is not None:
+            self._lock.close()
 
     @contextmanager
     def sole_writer(self, wait: float = 0.0) -> Iterator[None]:
@@ -119,51 +172,69 @@ class Store:
         if self.path is None or self._locked:
             yield
             return
-        held = self._lock(wait)
+        lock = self._acquired(self.path, wait)
         self._locked = True
         try:
             yield
         finally:
             self._locked = False
-            held.close()
+            lock.release()
 
-    def _lock(self, wait: float) -> sqlite3.Connection:
+    def _acquired(self, path: Path, wait: float) -> FileLock:
         until = time.monotonic() + wait
-        while True:
-            try:
-                return lock(f"{self.path}.lock")
-            except sqlite3.DatabaseError as error:
-                if "locked" not in str(error):
-                    raise StoreAccessError(f"{self._name} cannot be locked by {self.path}.lock: {error}.") from error
-                if time.monotonic() >= until:
-                    raise StoreAccessError(f"{self._name} is being run by another process.") from error
-            time.sleep(_WAIT)
+        try:
+            lock = self._lock = self._lock or FileLock(_lockable(path))
+            while True:
+                try:
+                    lock.acquire()
+                    return lock
+                except LockedError:
+                    if time.monotonic() >= until:
+                        raise
+                time.sleep(_WAIT)
+        except LockedError as error:
+            raise StoreAccessError(f"{self._name} is being run by another process.") from error
+        except OSError as error:
+            raise StoreAccessError(f"{self._name} cannot be locked: {error.strerror or error}.") from error
 
     # The experiment
 
-    def identify(self, description: dict[str, Any]) -> None:
-        """Write which experiment the trials are of, or check that it is the stored one.
-
-        Raises:
-            StoreMismatchError: the store was made by another experiment; the message names the first difference.
-        """
-        stored = self.description() or self._describe_first(description)
-        # Through JSON, so that tuples and keys compare as they were stored.
-        difference = first_difference(stored, json.loads(json.dumps(description)))
-        if difference:
-            raise StoreMismatchError(f"{self._name} was made by another experiment: {difference}.")
-
-    def _describe_first(self, description: dict[str, Any]) -> dict[str, Any]:
-        """Write the description unless another process was faster; return the stored one."""
+    def describe_first(self, description: dict[str, Any]) -> dict[str, Any]:
+        """Write which experiment the trials are of, unless that is written already; return what is stored."""
         with self._transaction():
             if not self.description():
-                for key, value in description.items():
-                    self._connection.execute("INSERT INTO experiment VALUES (?, ?)", (key, json.dumps(value)))
+                self._write_description(description)
         return self.description()
+
+    def describe_anew(self, description: dict[str, Any], change: Change) -> None:
+        """Replace which experiment the trials are of, and keep in the history what has changed and why."""
+        with self._transaction():
+            self._write_description(description)
+            self._insert_change(change)
+
+    def _write_description(self, description: dict[str, Any]) -> None:
+        self._connection.execute("DELETE FROM experiment WHERE key != ?", (_DRAWS,))
+        for key, value in description.items():
+            self._connection.execute("INSERT INTO experiment VALUES (?, ?)", (key, json.dumps(value)))
 
     def description(self) -> dict[str, Any]:
         """Return the stored description of the experiment; empty in a new store."""
-        return self._pairs("experiment")
+        return {key: value for key, value in self._pairs("experiment").items() if key != _DRAWS}
+
+    def draws(self) -> int | None:
+        """Return what the randomness of independent draws depends on besides the seed; None if nothing is stored."""
+        kept = self._pairs("experiment").get(_DRAWS)
+        return kept if isinstance(kept, int) else None
+
+    def keep_draws(self, number: int) -> None:
+        """Write what the randomness of independent draws depends on, once and for all."""
+        with self._transaction():
+            self._connection.execute("INSERT OR IGNORE INTO experiment VALUES (?, ?)", (_DRAWS, json.dumps(number)))
+
+    @property
+    def name(self) -> str:
+        """What the store is called in messages."""
+        return self._name
 
     def keep_settings(self, settings: dict[str, Any]) -> None:
         """Write how to make the experiment again, for commands that are given the store alone."""
@@ -185,6 +256,41 @@ class Store:
             return {key: json.loads(value) for key, value in rows}
         except (ValueError, TypeError, RecursionError) as error:
             raise self._damaged(f"the {table} in it cannot be read") from error
+
+    # The history
+
+    def history(self) -> list[Change]:
+        """Return what was changed in the store after it was written, and why, in order."""
+        with self._translating():
+            rows = self._connection.execute("SELECT what, why, content, at FROM history ORDER BY number").fetchall()
+        try:
+            return [Change(str(what), str(why), json.loads(content), str(at)) for what, why, content, at in rows]
+        except (ValueError, TypeError, RecursionError) as error:
+            raise self._damaged("its history cannot be read") from error
+
+    def _insert_change(self, change: Change) -> None:
+        self._connection.execute(
+            "INSERT INTO history (at, what, why, content) VALUES (?, ?, ?, ?)",
+            (_now(), change.what, change.why, json.dumps(change.content)),
+        )
+
+    def remeasure(self, trials: Sequence[Trial], description: dict[str, Any], change: Change) -> None:
+        """Store trials whose distances were computed anew, with the description of the distance, in one piece.
+
+        What they were stays in the history.
+        """
+        with self._transaction():
+            for trial in trials:
+                self._connection.execute(
+                    "UPDATE trials SET state = ?, distance = ?, failure = ?, executed = ?, checksum = ? "
+                    "WHERE number = ?",
+                    (
+                        *(trial.state, real(trial.distance), trial.failure, int(trial.executed)),
+                        *(trial_checksum(row_of(trial)), trial.number),
+                    ),
+                )
+            self._write_description(description)
+            self._insert_change(change)
 
     # Trials
 
@@ -213,7 +319,7 @@ class Store:
         places = ", ".join("?" * (len(row) + 3))
         self._connection.execute(
             f"INSERT INTO trials ({COLUMNS}, checksum, opened_at, closed_at) VALUES ({places})",
-            (*row, checksum_of(row), _now(), closed_at),
+            (*row, trial_checksum(row), _now(), closed_at),
         )
 
     def begin_attempt(self, trial: Trial) -> None:
@@ -225,7 +331,7 @@ class Store:
         with self._transaction():
             changed = self._connection.execute(
                 "UPDATE trials SET attempts = ?, checksum = ? WHERE number = ? AND state = 'open'",
-                (trial.attempts, checksum_of(row_of(trial)), trial.number),
+                (trial.attempts, trial_checksum(row_of(trial)), trial.number),
             ).rowcount
             if changed != 1:
                 raise self._not_open(trial.number)
@@ -242,7 +348,7 @@ class Store:
                 "checksum = ? WHERE number = ? AND state = 'open' AND attempts = ?",
                 (
                     *(trial.state, real(trial.distance), trial.failure, int(trial.executed), real(trial.seconds)),
-                    *(_now(), checksum_of(row_of(trial)), trial.number, trial.attempts),
+                    *(_now(), trial_checksum(row_of(trial)), trial.number, trial.attempts),
                 ),
             ).rowcount
             if changed != 1:
@@ -271,11 +377,13 @@ class Store:
             found.append(trial)
         return found
 
-    def signature(self) -> tuple[int, int]:
-        """Return how many trials there are and how many of them are open: what another process may have changed."""
+    def signature(self) -> tuple[int, int, int]:
+        """Return how many trials, open trials and changes there are: what another process may have changed."""
         with self._translating():
-            row = self._connection.execute("SELECT count(*), coalesce(sum(state = 'open'), 0) FROM trials").fetchone()
-        return int(row[0]), int(row[1])
+            row = self._connection.execute(
+                "SELECT count(*), coalesce(sum(state = 'open'), 0), (SELECT count(*) FROM history) FROM trials"
+            ).fetchone()
+        return int(row[0]), int(row[1]), int(row[2])
 
     def _damaged(self, what: str) -> ForeignStoreError:
         return ForeignStoreError(f"{self._name} is damaged: {what}; `ctxval export` saves what is readable.")
@@ -370,6 +478,13 @@ class Store:
             if isinstance(error, InputError):
                 raise
             raise StoreAccessError(f"{self._name} cannot be used as a store: {error}.") from error
+
+
+def _lockable(path: Path) -> Path:
+    """Return what is locked for a store: the file itself by its real name, or a file beside it where that cannot be."""
+    real = path.resolve()
+    itself = LOCKS_FILE_ITSELF and not on_network(real)
+    return real if itself else real.with_name(f"{real.name}.lock")
 
 
 def _now() -> str:

@@ -21,6 +21,7 @@ from ctxval.errors import (
     ModelError,
     ShapeError,
 )
+from ctxval.interrupts import raised_by_signal
 from ctxval.model import Model, Step, as_model
 from ctxval.rollout import rollout
 from ctxval.space import Parameters, TaskSpace
@@ -77,6 +78,8 @@ class Validation:
         model: the model M, or a function ``(x, u) -> x_next``.
         synthesizer: how controllers are designed on M.
         distance: d between the trajectories of M and S.
+        start_tolerance: by how much each state may miss the task's initial state where an execution starts, as a share
+            of that state's range in the model's trajectory, or of its initial value where that is larger.
 
     Raises:
         InputError: one of them is not what it should be; the message says which and what is missing.
@@ -91,6 +94,7 @@ class Validation:
         model: Model | Step,
         synthesizer: Synthesizer,
         distance: Distance,
+        start_tolerance: float = START,
     ) -> None:
         _require("space", space, isinstance(space, TaskSpace), "a TaskSpace")
         _require("task", task, callable(task), "a function p -> Task")
@@ -101,12 +105,14 @@ class Validation:
         _require(
             "distance", distance, callable(distance), "a function (model_trajectory, system_trajectory, task) -> d"
         )
+        _require("start_tolerance", start_tolerance, _is_share(start_tolerance), "a finite number >= 0")
         self.space = space
         self.task = task
         self.system = system
         self.model = as_model(model)
         self.synthesizer = synthesizer
         self.distance = distance
+        self.start_tolerance = float(start_tolerance)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this validation in a store."""
@@ -115,6 +121,22 @@ class Validation:
         probes = np.stack([self.space.low, 0.5 * (self.space.low + self.space.high), self.space.high])
         tasks = [describe(self._task(self.space.parameters(point))) for point in probes]
         return {**{part: describe(getattr(self, part)) for part in parts}, "tasks": tasks}
+
+    def with_distance(self, distance: Distance) -> Validation:
+        """Return this validation with another distance.
+
+        Raises:
+            InputError: it is no function.
+        """
+        return Validation(
+            space=self.space,
+            task=self.task,
+            system=self.system,
+            model=self.model,
+            synthesizer=self.synthesizer,
+            distance=distance,
+            start_tolerance=self.start_tolerance,
+        )
 
     # One task, step by step
 
@@ -138,14 +160,40 @@ class Validation:
         """Execute S once.
 
         Raises:
-            ExecutionError: the system raised, or its trajectory is not whole and finite; the message says why.
+            ExecutionError: the system raised or tried to exit, or what it returned is no execution of the plan; the
+                message says why.
         """
         try:
             trajectory = self.system.execute(plan.controller, plan.task)
-        except Exception as error:
+        except BaseException as error:
+            if raised_by_signal(error):
+                raise
             raise ExecutionError(reason_of(error)) from error
-        require_execution(plan, trajectory)
+        try:
+            self.require(plan, trajectory)
+        except InputError as error:
+            raise ExecutionError(str(error)) from error
         return trajectory
+
+    def require(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> None:
+        """Check that a trajectory, wherever it comes from, is a whole and finite execution of a plan.
+
+        Args:
+            plan: of the task.
+            trajectory: what the system returned, or a recording.
+            start_tolerance: in place of this validation's own.
+
+        Raises:
+            ExecutionError: it is no whole and finite execution.
+            InputError: it is of another task: it has other dimensions, other times, or starts elsewhere.
+        """
+        if not isinstance(trajectory, Trajectory):
+            raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
+        if trajectory.ended != COMPLETE:
+            raise ExecutionError(trajectory.ended)
+        if not trajectory.finite.all():
+            raise ExecutionError("the system's trajectory is not finite")
+        _require_task(plan, trajectory, self.start_tolerance if start_tolerance is None else start_tolerance)
 
     def measure(self, plan: Plan, trajectory: Trajectory) -> float:
         """Return d(p).
@@ -153,9 +201,21 @@ class Validation:
         Raises:
             DistanceError: the distance raised, or is no finite number that is not negative.
         """
-        value = self._distance(plan, trajectory)
+        return self._measured(plan.parameters, plan.task, plan.model_trajectory, trajectory)
+
+    def remeasure(self, point: ArrayLike, model_trajectory: Trajectory, system_trajectory: Trajectory) -> float:
+        """Return d(p) between trajectories that are known, without designing a controller.
+
+        Raises:
+            DistanceError: as in :meth:`measure`.
+        """
+        parameters = self.space.parameters(point)
+        return self._measured(parameters, self._task(parameters), model_trajectory, system_trajectory)
+
+    def _measured(self, parameters: Parameters, task: Task, model: Trajectory, system: Trajectory) -> float:
+        value = self._distance(task, model, system)
         if value.shape != () or not np.isfinite(value) or value < 0:
-            self._refuse_distance(value, plan.parameters.points)
+            self._refuse_distance(value, parameters.points)
         return float(value)
 
     def outcome(self, point: ArrayLike) -> Outcome:
@@ -205,7 +265,7 @@ class Validation:
         except Exception:
             # Which task it was, only one by one can tell.
             return np.array([self._distance_or_nan(point) for point in points])
-        values = self._distance(plan, trajectory)
+        values = self._distance(plan.task, plan.model_trajectory, trajectory)
         if values.shape != (len(points),):
             raise DistanceError(f"the distance must have shape ({len(points)},) over the batch, got {values.shape}.")
         executed = _executed(plan.model_trajectory, trajectory)
@@ -242,11 +302,11 @@ class Validation:
         _require("the task function's result", task, isinstance(task, Task), "a Task")
         return task
 
-    def _distance(self, plan: Plan, trajectory: Trajectory) -> Array:
+    def _distance(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
         try:
             with np.errstate(all="ignore"):
-                return np.asarray(self.distance(plan.model_trajectory, trajectory, plan.task), dtype=np.float64)
-        except Exception as error:
+                return np.asarray(self.distance(model, system, task), dtype=np.float64)
+        except (Exception, SystemExit) as error:
             raise DistanceError(f"the distance failed: {reason_of(error)}.") from error
 
     def _refuse_distance(self, value: Array, point: Array) -> NoReturn:
@@ -254,44 +314,13 @@ class Validation:
         raise DistanceError(f"the distance must be one finite number >= 0, got {value} for the task {where}.")
 
 
-def require_execution(plan: Plan, trajectory: object) -> None:
-    """Check that a trajectory is a whole and finite execution of the plan.
-
-    Raises:
-        ExecutionError: it is not; the message says why.
-    """
-    if not isinstance(trajectory, Trajectory):
-        raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
-    expected = plan.model_trajectory
-    if trajectory.ended != COMPLETE:
-        raise ExecutionError(trajectory.ended)
-    if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:
-        raise ExecutionError(
-            f"the system returned states {trajectory.states.shape} and inputs {trajectory.inputs.shape} "
-            f"where {expected.states.shape} and {expected.inputs.shape} were expected"
-        )
-    if not trajectory.finite:
-        raise ExecutionError("the system's trajectory is not finite")
-
-
-def require_task(plan: Plan, trajectory: Trajectory, start_tolerance: float = START) -> None:
-    """Check that a trajectory recorded elsewhere is of the plan's task: its length, its times and where it starts.
-
-    Args:
-        plan: of the task.
-        trajectory: the recording.
-        start_tolerance: by how much each state may miss the task's initial state, as a share of that state's range in
-            the model's trajectory, or of its initial value where that is larger.
-
-    Raises:
-        InputError: it is of another task; the message says what does not fit.
-    """
+def _require_task(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> None:
     expected = plan.model_trajectory
     require_times(trajectory, plan.task.times)
     if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:
         raise ShapeError(
-            f"the trajectory must have {expected.states.shape[-1]} states and {expected.inputs.shape[-1]} inputs, "
-            f"got {trajectory.states.shape[-1]} and {trajectory.inputs.shape[-1]}."
+            f"the trajectory must have states {expected.states.shape} and inputs {expected.inputs.shape}, "
+            f"got {trajectory.states.shape} and {trajectory.inputs.shape}."
         )
     start = plan.task.initial_state
     ranges = np.ptp(expected.states, axis=0)
@@ -311,6 +340,10 @@ def _executed(expected: Trajectory, batch: Trajectory) -> Mask:
     # Where the batch ended early but nothing in it is broken, it is not known which task that was.
     unknown = batch.ended != COMPLETE and bool(batch.finite.all())
     return batch.finite if same and not unknown else np.zeros(expected.finite.shape, dtype=bool)
+
+
+def _is_share(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < float("inf")
 
 
 def _require(name: str, value: object, valid: bool, wanted: str) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 from ctxval.controller import Controller
 from ctxval.cores import can_fork, forking
 from ctxval.errors import CampaignError, InputError
+from ctxval.interrupts import kept_alive, raised_by_signal
 from ctxval.system import System
 from ctxval.task import Task
 from ctxval.trajectory import Trajectory
@@ -30,6 +31,9 @@ from ctxval.validation import Plan, reason_of
 
 _GRACE = 2.0
 """Seconds that a worker has to clean up before it is killed."""
+
+_TERMINATED = 143
+"""Exit status of a worker that was asked to leave, as shells have it for SIGTERM."""
 
 _POLL = 0.5
 """Seconds between two looks at what cannot be waited for."""
@@ -67,7 +71,9 @@ def execute_task(system: System, controller: Controller, task: Task) -> Answer:
     started = time.perf_counter()
     try:
         trajectory = system.execute(controller, task)
-    except Exception as error:
+    except BaseException as error:
+        if raised_by_signal(error):
+            raise
         return None, reason_of(error), time.perf_counter() - started
     return trajectory, None, time.perf_counter() - started
 
@@ -185,9 +191,7 @@ class Processes(Crew):
             trajectory, failure, seconds = pickle.loads(worker.pipe.recv_bytes())
         except (EOFError, OSError, pickle.UnpicklingError):
             self._dismiss(worker)
-            code = worker.process.exitcode
-            how = f"by signal {-code}" if code is not None and code < 0 else f"with status {code}"
-            return Ended(number, lost=f"the worker ended {how}")
+            return _gone(number, worker.process.exitcode)
         return Ended(number, trajectory, failure, seconds=seconds)
 
     def _too_late(self, worker: _Worker) -> Ended:
@@ -232,11 +236,27 @@ def _serve(system: System, pipe: Connection, others: list[Connection], parent: i
             controller, task = pickle.loads(pipe.recv_bytes())
         except EOFError:
             return
-        pipe.send_bytes(pickle.dumps(execute_task(system, controller, task)))
+        with kept_alive():
+            answer = execute_task(system, controller, task)
+        pipe.send_bytes(pickle.dumps(answer))
+
+
+def _gone(number: int, status: int | None) -> Ended:
+    """Return what the end of a worker's process says: who ends by itself has failed, who is killed is lost."""
+    if status is None or status < 0 or status == _TERMINATED:
+        how = (
+            "by signal 15"
+            if status == _TERMINATED
+            else "for no known reason"
+            if status is None
+            else f"by signal {-status}"
+        )
+        return Ended(number, lost=f"the worker ended {how}")
+    return Ended(number, failure=f"the system ended its process with status {status}")
 
 
 def _leave(_signal: int, _frame: FrameType | None) -> NoReturn:
-    raise SystemExit
+    raise SystemExit(_TERMINATED)
 
 
 def _watch(parent: int) -> None:

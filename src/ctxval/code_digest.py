@@ -1,0 +1,195 @@
+"""What a function or class computes: a digest of its syntax tree, and the outer names that it uses."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import inspect
+import linecache
+import sys
+import sysconfig
+import types
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+_OWN = __name__.partition(".")[0]
+
+_SKIPPED = ("ctx", "kind", "type_comment", "returns", "annotation")
+"""Fields of a syntax tree that say nothing of what is computed."""
+
+_Function = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
+
+
+@dataclass(frozen=True)
+class Code:
+    """What identifies the code of a function or class.
+
+    Attributes:
+        digest: of its syntax tree, without its name, its docstrings, its annotations and its place.
+        names: dotted names in it that are looked up outside, such as ``np.sin`` and ``GAIN``.
+    """
+
+    digest: str
+    names: tuple[str, ...]
+
+
+def is_own(value: Any) -> bool:
+    """Return whether a function or class is one of this package's."""
+    return _top_level(value) == _OWN
+
+
+def is_library(value: Any) -> bool:
+    """Return whether a module, function or class is of an installed package, of Python, or of no file at all."""
+    module = value if inspect.ismodule(value) else sys.modules.get(getattr(value, "__module__", None) or "")
+    if module is None:
+        return False
+    if module.__name__ == "__main__":
+        return False
+    file = getattr(module, "__file__", None)
+    return file is None or _top_level(module) == _OWN or any(Path(file).is_relative_to(place) for place in _installed())
+
+
+def same_package(value: Any, other: Any) -> bool:
+    """Return whether a module, function or class is of the same top-level package as another."""
+    return _top_level(value) == _top_level(other)
+
+
+def _top_level(value: Any) -> str:
+    name = value.__name__ if inspect.ismodule(value) else getattr(value, "__module__", None) or ""
+    return str(name).partition(".")[0]
+
+
+@functools.cache
+def _installed() -> tuple[Path, ...]:
+    return tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+
+
+def code_of(value: Any) -> Code | None:
+    """Return the code of a Python function or class; None if its source cannot be read."""
+    node = _class_node(value) if isinstance(value, type) else _function_node(value)
+    if node is None:
+        return None
+    return Code(hashlib.sha256(repr(_plain(node, top=True)).encode()).hexdigest()[:16], tuple(sorted(_names(node))))
+
+
+def bytecode_digest(code: types.CodeType) -> str:
+    """Return a digest of a function's names and constants, for one whose source cannot be read.
+
+    The instructions are left out, as they differ between versions of Python.
+    """
+    constants = [
+        bytecode_digest(item)
+        if isinstance(item, types.CodeType)
+        else repr(sorted(map(repr, item)) if isinstance(item, frozenset) else item)
+        for item in code.co_consts
+    ]
+    return hashlib.sha256(repr((code.co_names, constants)).encode()).hexdigest()[:16]
+
+
+# The syntax tree
+
+
+def _tree(file: str | None) -> ast.Module | None:
+    if file is None:
+        return None
+    linecache.checkcache(file)
+    return _parsed("".join(linecache.getlines(file)))
+
+
+@functools.lru_cache(maxsize=64)
+def _parsed(source: str) -> ast.Module | None:
+    try:
+        return ast.parse(source) if source else None
+    except (SyntaxError, ValueError, RecursionError):
+        return None
+
+
+def _function_node(function: Any) -> ast.AST | None:
+    code = getattr(function, "__code__", None)
+    tree = _tree(code.co_filename) if isinstance(code, types.CodeType) else None
+    if tree is None or code is None:
+        return None
+    found = [node for node in ast.walk(tree) if isinstance(node, _Function) and _is_of(node, code)]
+    return min(found, key=_extent, default=None)
+
+
+def _is_of(node: _Function, code: types.CodeType) -> bool:
+    if isinstance(node, ast.Lambda):
+        return code.co_name == "<lambda>" and all(_covers(node.body, place) for place in code.co_positions())
+    first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
+    return code.co_name == node.name and first == code.co_firstlineno
+
+
+def _covers(node: ast.expr, place: tuple[int | None, int | None, int | None, int | None]) -> bool:
+    line, last_line, column, last_column = place
+    if line is None or last_line is None or column is None or last_column is None:
+        return True
+    if (line, column) == (last_line, last_column):
+        return True  # what the compiler has put there, as at the start of a function
+    end = (node.end_lineno or 0, node.end_col_offset or 0)
+    return (node.lineno, node.col_offset) <= (line, column) and (last_line, last_column) <= end
+
+
+def _extent(node: ast.AST) -> int:
+    return sum(1 for _ in ast.walk(node))
+
+
+def _class_node(cls: type) -> ast.AST | None:
+    module = sys.modules.get(cls.__module__)
+    tree = _tree(getattr(module, "__file__", None))
+    return None if tree is None else dict(_classes(tree, "")).get(cls.__qualname__)
+
+
+def _classes(node: ast.AST, path: str) -> Iterator[tuple[str, ast.AST]]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.ClassDef):
+            yield f"{path}{child.name}", child
+            yield from _classes(child, f"{path}{child.name}.")
+        elif isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield from _classes(child, f"{path}{child.name}.<locals>.")
+        else:
+            yield from _classes(child, path)
+
+
+def _plain(node: Any, *, top: bool = False) -> Any:
+    """Return a tree as tuples, the same for every version of Python: fields that are empty are left out."""
+    if isinstance(node, list):
+        return [_plain(item) for item in node]
+    if not isinstance(node, ast.AST):
+        return (type(node).__name__, repr(node))
+    fields = []
+    for name, value in ast.iter_fields(node):
+        empty = value == [] or (value is None and not isinstance(node, ast.Constant))
+        if empty or name in _SKIPPED or (top and name == "name"):
+            continue
+        fields.append((name, _plain(_without_docstring(node, value) if name == "body" else value)))
+    return (type(node).__name__, *fields)
+
+
+def _without_docstring(node: ast.AST, body: Any) -> Any:
+    documented = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and isinstance(body, list)
+    if documented and body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
+        return body[1:]
+    return body
+
+
+def _names(node: ast.AST) -> set[str]:
+    found = set()
+    for child in ast.walk(node):
+        name = _dotted(child)
+        if name is not None:
+            found.add(name)
+    # Of "np.linalg.norm" the shorter "np.linalg" and "np" are part.
+    return {name for name in found if not any(other.startswith(f"{name}.") for other in found)}
+
+
+def _dotted(node: ast.AST) -> str | None:
+    if isinstance(node, ast.Name):
+        return node.id
+    if isinstance(node, ast.Attribute):
+        before = _dotted(node.value)
+        return None if before is None else f"{before}.{node.attr}"
+    return None
