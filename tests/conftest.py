@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from typing import Any
 
 # Before numpy is imported: small algebra is faster on one thread.
@@ -39,6 +40,12 @@ def make_validation(
         synthesizer=controllers.LQR([1.0, 0.1], [1e-2], [10.0, 1.0]),
         distance=distance or distances.FinalState(norm=1),
     )
+
+
+def interrupt_at_once() -> None:
+    """Do what a person does who presses Ctrl-C twice."""
+    signal.raise_signal(signal.SIGINT)
+    signal.raise_signal(signal.SIGINT)
 
 
 @pytest.fixture

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from conftest import make_validation
-from ctxval import Campaign, TaskSpace, Validation, searches
+from conftest import interrupt_at_once, make_validation
+from ctxval import Campaign, TaskSpace, Validation, controllers, models, searches
 from ctxval.arrays import Array
 from ctxval.certificates import RESOLUTION, farthest_task
 from ctxval.errors import (
@@ -70,10 +72,36 @@ def test_the_budget_is_a_total(validation: Validation) -> None:
     assert len(campaign.run(3).trials) == 5
 
 
-def test_the_first_five_points_are_the_same_for_every_search(validation: Validation) -> None:
-    first = [Campaign(validation, search=searches.by_name(n), seed=5).run(5) for n in ("gp-ucb", "random")]
-    points = [[t.unit_point.tolist() for t in campaign.trials] for campaign in first]
-    assert points[0] == points[1]
+@pytest.mark.parametrize("draw", [lambda c: c.run(5), lambda c: c.audit(5)])
+def test_independent_draws_are_repeatable_but_not_shared_by_another_model(
+    validation: Validation, draw: Callable[[Campaign], Campaign], tmp_path: Path
+) -> None:
+    def drawn(model: object, store: Path | None = None) -> list[list[float]]:
+        campaign = Campaign(make_validation(model=model), search=searches.Random(), seed=5, store=store)
+        return [trial.unit_point.tolist() for trial in draw(campaign).trials]
+
+    learned = validation.model
+    other = models.Linear(learned.A * 1.001, learned.B, learned.c)  # type: ignore[attr-defined]
+    assert drawn(learned) == drawn(copy.deepcopy(learned)) == drawn(learned, tmp_path / "a.sqlite")
+    assert not np.isclose(drawn(learned), drawn(other)).any()
+
+
+def test_a_model_whose_weights_are_private_has_draws_of_its_own(validation: Validation) -> None:
+    class Private:
+        def __init__(self, model: models.Linear, bias: float) -> None:
+            self._model, self._bias = model, bias
+
+        def step(self, x: Array, u: Array) -> Array:
+            return np.asarray(
+                self._model.step(x, u) + self._bias * np.exp(-50 * np.sum((x - 0.7) ** 2, axis=-1))[..., None]
+            )
+
+    def drawn(bias: float) -> list[list[float]]:
+        private = make_validation(model=Private(validation.model, bias))  # type: ignore[arg-type]
+        private.synthesizer = controllers.Policy(lambda t, x, task: -x[..., :1])
+        return [trial.unit_point.tolist() for trial in Campaign(private, seed=5).audit(3).trials]
+
+    assert drawn(1e-3) == drawn(1e-3) != drawn(2e-3)
 
 
 def test_discarding_lowers_the_estimate_but_not_the_facts(validation: Validation) -> None:
@@ -91,7 +119,7 @@ def test_failures_are_data(validation: Validation) -> None:
     reasons = [t.failure for t in campaign.failed]
     assert campaign.executions == 15
     assert [t.number for t in campaign.failed] == [1, 3, 6, 8]
-    for reason, expected in zip(reasons, ["motor cut out", "not finite", "operator", "where"], strict=True):
+    for reason, expected in zip(reasons, ["motor cut out", "not finite", "operator", "must have states"], strict=True):
         assert reason is not None
         assert expected in reason
     failed = np.array([t.unit_point for t in campaign.failed])
@@ -117,7 +145,7 @@ def test_an_interrupted_execution_is_repeated_as_the_same_trial(validation: Vali
         def execute(self, controller, task):  # type: ignore[no-untyped-def]
             if self._executions == 6:
                 self._executions += 1
-                raise KeyboardInterrupt
+                interrupt_at_once()
             return super().execute(controller, task)
 
     whole = Campaign(make_validation(system=FaultyRig(validation.system)), seed=1).run(10)
@@ -344,7 +372,7 @@ def test_an_audit_finishes_what_was_interrupted_first(validation: Validation, tm
         def execute(self, controller, task):  # type: ignore[no-untyped-def]
             if self._executions in (5, 9):
                 self._executions += 1
-                raise KeyboardInterrupt
+                interrupt_at_once()
             return super().execute(controller, task)
 
     whole = Campaign(make_validation(system=FaultyRig(validation.system)), seed=1).run(7).audit(4)
@@ -452,7 +480,7 @@ def test_an_interrupt_while_planning_leaves_no_ghost_in_the_search(validation: V
 def test_an_interrupted_trial_that_cannot_be_planned_any_more_is_passed_over(tmp_path: Path) -> None:
     class Stopped(FaultyRig):
         def execute(self, controller, task):  # type: ignore[no-untyped-def]
-            raise KeyboardInterrupt
+            interrupt_at_once()
 
     plain = make_validation()
     with pytest.raises(KeyboardInterrupt):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import make_validation
+from conftest import interrupt_at_once, make_validation
 from ctxval import Campaign, Validation, cases, searches
 from ctxval.errors import CtxvalError
 from ctxval.testing import FaultyRig
@@ -62,7 +62,7 @@ def test_an_interrupted_execution_and_failures_change_nothing_that_is_chosen(tmp
         def execute(self, controller, task):  # type: ignore[no-untyped-def]
             if self.interrupt and self._executions == 4:
                 self.interrupt = False
-                raise KeyboardInterrupt
+                interrupt_at_once()
             return super().execute(controller, task)
 
         def describe(self) -> dict[str, object]:

@@ -42,6 +42,11 @@ def stored(value: object) -> object:
     return json.loads(json.dumps(describe(value)))
 
 
+def without_code(description: object) -> object:
+    assert isinstance(description, dict)
+    return {key: value for key, value in description.items() if key != "code"}
+
+
 @settings(max_examples=40, deadline=None)
 @given(PLAIN)
 def test_a_description_is_json_and_does_not_differ_from_itself(value: object) -> None:
@@ -60,15 +65,31 @@ def test_a_description_is_json_and_does_not_differ_from_itself(value: object) ->
         ((1, "two"), [1, "two"]),
         (np.array([[1, 2]]), [[1, 2]]),
         ({1: None}, {"1": None}),
-        (Part(2.0, _cache=9), {"type": "Part", "gain": 2.0}),
-        (Slotted(), {"type": "Slotted"}),
-        (Own(), {"type": "Own", "identity": 7}),
         (int, "builtins.int"),
         (np.linalg.norm, "numpy.linalg.norm"),
     ],
 )
 def test_values_are_described_by_what_identifies_them(value: object, expected: object) -> None:
     assert stored(value) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (Part(2.0, _cache=9), {"type": "Part", "gain": 2.0}),
+        (Slotted(), {"type": "Slotted"}),
+        (Own(), {"type": "Own", "identity": 7}),
+    ],
+)
+def test_objects_are_described_by_their_type_their_values_and_their_code(value: object, expected: object) -> None:
+    described = stored(value)
+    assert without_code(described) == expected
+    assert isinstance(described, dict)
+    assert [set(code) - {"uses"} for code in described["code"]] == [{"digest"}]
+
+
+def test_private_attributes_are_described_on_request() -> None:
+    assert describe(Part(2.0, _cache=9), private=True)["_cache"] == 9
 
 
 def test_a_partial_is_described_by_its_function_and_what_it_binds() -> None:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -11,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from ctxval import scratch as module
+from ctxval.locks import FileLock
 from ctxval.scratch import Scratch, scratch
 
 HOLD = """
@@ -107,10 +107,10 @@ def test_what_somebody_else_made_there_stays(tmp_path: Path) -> None:
 def test_without_locks_a_folder_is_made_and_removed_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(path: Path) -> sqlite3.Connection:
-        raise sqlite3.OperationalError("locking protocol")
+    def refused(path: Path) -> FileLock:
+        raise OSError("no locks available")
 
-    monkeypatch.setattr(module, "lock", refused)
+    monkeypatch.setattr(module, "FileLock", refused)
     with scratch() as folder:
         assert folder.is_dir()
     assert not list(tmp_path.iterdir())

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ctxval import Store, Trajectory, Trial
-from ctxval.errors import ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
-from ctxval.store import _MIGRATIONS
+from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
+from ctxval.store import _MIGRATIONS, Change
 
 TRAJECTORY = Trajectory(np.arange(4.0), np.random.default_rng(0).normal(size=(4, 2)), np.ones((3, 1)))
 
@@ -87,12 +87,18 @@ def test_two_writers_of_one_trial_collide_with_a_clear_error(tmp_path: Path) -> 
     assert len(second.trials()) == 1
 
 
-def test_another_experiment_is_refused_and_the_difference_named() -> None:
+def test_the_first_description_stays_until_a_change_is_stated() -> None:
     store = Store()
-    store.identify({"seed": 1, "validation": {"model": {"A": [1.0, 2.0]}}})
-    store.identify({"seed": 1, "validation": {"model": {"A": [1.0, 2.0 + 1e-9]}}})
-    with pytest.raises(StoreMismatchError, match=r"validation.model.A\[1\] was 2.0 and is now 2.1"):
-        store.identify({"seed": 1, "validation": {"model": {"A": [1.0, 2.1]}}})
+    assert store.describe_first({"seed": 1}) == {"seed": 1}
+    assert store.describe_first({"seed": 2}) == {"seed": 1}
+    store.keep_draws(7)
+    store.keep_draws(8)
+    store.describe_anew({"seed": 2}, Change("accepted", "new battery", {"differences": ["seed"]}))
+    assert store.description() == {"seed": 2}
+    assert store.draws() == 7
+    (change,) = store.history()
+    assert (change.what, change.why, change.content) == ("accepted", "new battery", {"differences": ["seed"]})
+    assert change.at
 
 
 def test_a_foreign_database_is_refused_and_left_alone(tmp_path: Path) -> None:
@@ -164,9 +170,8 @@ def test_settings_come_back_and_the_last_ones_count(tmp_path: Path) -> None:
 
 def test_settings_do_not_change_which_experiment_it_is() -> None:
     store = Store()
-    store.identify({"seed": 1})
+    store.describe_first({"seed": 1})
     store.keep_settings({"budget": 5})
-    store.identify({"seed": 1})
     assert store.description() == {"seed": 1}
 
 

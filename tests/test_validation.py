@@ -293,15 +293,15 @@ def stopped(whole: Trajectory) -> Trajectory:
         (lambda whole: Trajectory(whole.times, whole.states, whole.inputs * np.inf), "not finite"),
         (
             lambda whole: Trajectory(whole.times[:-2], whole.states[:-2], whole.inputs[:-2]),
-            r"states \(11, 2\) and inputs \(10, 1\) where \(13, 2\) and \(12, 1\) were expected",
+            r"must have 13 times, 12 steps of 0.05 s, got 11",
         ),
         (
             lambda whole: Trajectory(whole.times, whole.states[:, :1], whole.inputs),
-            r"states \(13, 1\) and inputs \(12, 1\) where \(13, 2\)",
+            r"must have states \(13, 2\) and inputs \(12, 1\), got \(13, 1\)",
         ),
         (
             lambda whole: Trajectory(whole.times, whole.states[None], whole.inputs[None]),
-            r"states \(1, 13, 2\)",
+            r"got \(1, 13, 2\)",
         ),
     ],
 )

@@ -13,7 +13,8 @@ import numpy as np
 from ctxval.certificates import RESOLUTION
 from ctxval.errors import CtxvalError, ExecutionError, InputError
 from ctxval.interrupts import Interrupts, kept_alive
-from ctxval.ledger import Ledger, OpenTrial, text_of
+from ctxval.ledger import Ledger, OpenTrial
+from ctxval.recording import text_of
 from ctxval.surrogate import Surrogate, fit_surrogate
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dis
 import functools
 import hashlib
 import inspect
@@ -72,7 +73,9 @@ def code_of(value: Any) -> Code | None:
     node = _class_node(value) if isinstance(value, type) else _function_node(value)
     if node is None:
         return None
-    return Code(hashlib.sha256(repr(_plain(node, top=True)).encode()).hexdigest()[:16], tuple(sorted(_names(node))))
+    digest = hashlib.sha256(repr(_plain(node, top=True)).encode()).hexdigest()[:16]
+    loaded = _loaded_by_class(value, node) if isinstance(value, type) else _loaded(value.__code__)
+    return Code(digest, tuple(sorted(name for name in _names(node) if name.partition(".")[0] in loaded)))
 
 
 def bytecode_digest(code: types.CodeType) -> str:
@@ -174,6 +177,31 @@ def _without_docstring(node: ast.AST, body: Any) -> Any:
     if documented and body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
         return body[1:]
     return body
+
+
+def _loaded(code: types.CodeType) -> set[str]:
+    """Return the global names that a function looks up, also by the functions in it."""
+    names = {step.argval for step in dis.get_instructions(code) if step.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
+    inner = (_loaded(item) for item in code.co_consts if isinstance(item, types.CodeType))
+    return names.union(*inner)
+
+
+def _loaded_by_class(cls: type, node: ast.AST) -> set[str]:
+    functions = [function_in(item) for item in vars(cls).values()]
+    methods = (_loaded(function.__code__) for function in functions if function is not None)
+    return _loaded_outside_functions(node).union(*methods)
+
+
+def _loaded_outside_functions(node: ast.AST) -> set[str]:
+    found = {node.id} if isinstance(node, ast.Name) else set()
+    inner = (_loaded_outside_functions(n) for n in ast.iter_child_nodes(node) if not isinstance(n, _Function))
+    return found.union(*inner)
+
+
+def function_in(item: Any) -> types.FunctionType | None:
+    """Return the Python function of an attribute of a class: a method, a property, a static or class method."""
+    function = getattr(item, "fget", None) or getattr(item, "__func__", item)
+    return function if isinstance(function, types.FunctionType) else None
 
 
 def _names(node: ast.AST) -> set[str]:

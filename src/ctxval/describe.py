@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import inspect
 import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -142,13 +143,9 @@ def _outer(value: Any, code: Code) -> list[tuple[str, Any]]:
 
 def _globals_of(value: Any) -> Mapping[str, Any]:
     if inspect.isfunction(value):
-        local = set(value.__code__.co_varnames) | set(value.__code__.co_cellvars) | set(value.__code__.co_freevars)
-        return {name: item for name, item in value.__globals__.items() if name not in local}
-    for item in vars(value).values() if isinstance(value, type) else ():
-        function = getattr(item, "fget", None) or getattr(item, "__func__", item)
-        if inspect.isfunction(function):
-            return function.__globals__
-    return {}
+        return value.__globals__
+    module = sys.modules.get(value.__module__)
+    return {} if module is None else vars(module)
 
 
 def _name(value: Any) -> str:

@@ -71,7 +71,7 @@ def identify(
     trials = store.trials()
     loop = _changed_loop(store, validation, trials)
     if loop is not None:
-        raise _mismatch(store, loop, _LOOP_CHANGED)
+        raise _mismatch(store, next((sentence for _, sentence in found), loop), _LOOP_CHANGED)
     others = [sentence for path, sentence in found if not path.startswith(_DISTANCE)]
     if others and accept is None:
         raise _mismatch(store, others[0], _OTHER_CHANGED)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,15 @@ from ctxval.distance import Distance
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError
 from ctxval.identity import description_of, digest_of_model, identify
 from ctxval.prediction import predict_distance
-from ctxval.recording import kept_beside, known_distance, require_one_result, same_run
+from ctxval.recording import (
+    known_distance,
+    measured_again,
+    outcome_of,
+    require_one_result,
+    rescued,
+    same_run,
+    text_of,
+)
 from ctxval.searches import GPUCB, Prediction, Search
 from ctxval.store import Change, Store
 from ctxval.trajectory import Trajectory
@@ -432,25 +440,12 @@ class Ledger:
         try:
             self.store.close_trial(ended, trajectory)
         except (StoreAccessError, InputError) as error:
-            self._rescue(ended, trajectory, error)
+            raise rescued(ended, trajectory, self.store.path, error) from error
         self._executing.discard(trial.number)
         self._trials[trial.number] = ended
         if distance is not None:
             self.search.tell(trial.unit_point[None], [distance])
         return ended
-
-    def _rescue(self, ended: Trial, trajectory: Trajectory | None, error: CtxvalError) -> NoReturn:
-        """Keep how an execution that was paid for ended, where its store does not take it."""
-        if not ended.executed:
-            raise error
-        path = kept_beside(ended, trajectory, self.store.path)
-        if path is None:
-            raise type(error)(f"{error} How trial {ended.number} ended could not be kept either.") from error
-        how = f"--npz {path}" if trajectory is not None else "--failed or --distance as it says"
-        raise type(error)(
-            f"{error} How trial {ended.number} ended is kept in {path}: once the store can take it, "
-            f"say `ctxval tell STORE {ended.number} {how}` before anything else."
-        ) from error
 
     # Measuring again
 
@@ -483,40 +478,12 @@ class Ledger:
         description = self._description()
         differing = differences(self.store.description(), description)
         other = any(path.startswith("validation.distance") for path, _ in differing)
-        now = [self._measured_again(trial, other) for trial in self._trials]
-        changed = [trial for trial, before in zip(now, self._trials, strict=True) if _ended(trial) != _ended(before)]
+        changed = measured_again(self.validation, self._trials, self.trajectories, redefined=other)
         if changed or other:
-            old = {str(trial.number): _ended(self._trials[trial.number]) for trial in changed}
+            old = {str(trial.number): outcome_of(self._trials[trial.number]) for trial in changed}
             why = "the distance has changed" if other else "asked for"
             self.store.remeasure(changed, description, Change("remeasured", why, {"before": old}))
         return changed
-
-    def _measured_again(self, trial: Trial, other: bool) -> Trial:
-        """Return a trial with its distance as it is measured now."""
-        if trial.state == "open" or not trial.executed:
-            return trial
-        model, system = self.trajectories(trial)
-        if model is None or system is None:
-            told = trial.distance is not None and other
-            return replace(trial, state="unmeasured", distance=None, failure=_TOLD) if told else trial
-        point = self.validation.space.from_unit(trial.unit_point)
-        try:
-            distance = self.validation.remeasure(point, model, system)
-        except DistanceError as error:
-            if trial.distance is not None:
-                raise DistanceError(
-                    f"trial {trial.number} cannot be measured anew, and nothing is changed: {error}"
-                ) from error
-            return replace(trial, state="unmeasured", failure=text_of(error))
-        return replace(trial, state="completed", distance=distance, failure=None)
-
-
-_TOLD = "its distance was told without a trajectory, and the distance has changed since."
-
-
-def _ended(trial: Trial) -> dict[str, Any]:
-    """Return what measuring again may change of a trial."""
-    return {"state": trial.state, "distance": trial.distance, "failure": trial.failure}
 
 
 def _as_told(trials: list[Trial]) -> list[Trial]:
@@ -538,8 +505,3 @@ def _as_told(trials: list[Trial]) -> list[Trial]:
 
 def _value(trial: Trial) -> float:
     return np.nan if trial.distance is None else trial.distance
-
-
-def text_of(reason: object) -> str:
-    """Return a reason as text that every file can hold; a serial line may have put anything into it."""
-    return str(reason).encode("utf-8", "backslashreplace").decode()

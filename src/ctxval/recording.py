@@ -6,15 +6,18 @@ import contextlib
 import json
 import os
 import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
 from ctxval.arrays import Array
-from ctxval.errors import InputError
+from ctxval.errors import CtxvalError, DistanceError, InputError
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
+from ctxval.validation import Validation
 
 
 def require_one_result(trajectory: Trajectory | None, distance: float | None, failed: str | None) -> None:
@@ -35,6 +38,77 @@ def same_run(trial: Trial, unit_point: Array, distance: float | None, failed: st
     """Return whether a trial is an execution that is told again."""
     ended = trial.distance == distance and trial.failure == failed and trial.state != "open"
     return ended and np.array_equal(trial.unit_point, unit_point)
+
+
+def text_of(reason: object) -> str:
+    """Return a reason as text that every file can hold; a serial line may have put anything into it."""
+    return str(reason).encode("utf-8", "backslashreplace").decode()
+
+
+# Measuring again
+
+_TOLD = "its distance was told without a trajectory, and the distance has changed since."
+
+
+def outcome_of(trial: Trial) -> dict[str, Any]:
+    """Return what measuring again may change of a trial."""
+    return {"state": trial.state, "distance": trial.distance, "failure": trial.failure}
+
+
+def measured_again(
+    validation: Validation,
+    trials: Sequence[Trial],
+    trajectories: Callable[[Trial], tuple[Trajectory | None, Trajectory | None]],
+    *,
+    redefined: bool,
+) -> list[Trial]:
+    """Return the trials that end otherwise once their distances are measured anew, as they end then.
+
+    Args:
+        validation: has the distance.
+        trials: of a store.
+        trajectories: returns those of the model and of the system of a trial.
+        redefined: whether the distance is another one than the stored values are of.
+
+    Raises:
+        DistanceError: the distance of a trial that had one cannot be measured any more.
+    """
+    now = [_measured_again(validation, trial, trajectories, redefined) for trial in trials]
+    return [trial for trial, before in zip(now, trials, strict=True) if outcome_of(trial) != outcome_of(before)]
+
+
+def _measured_again(validation: Validation, trial: Trial, trajectories: Any, redefined: bool) -> Trial:
+    if trial.state == "open" or not trial.executed:
+        return trial
+    model, system = trajectories(trial)
+    if model is None or system is None:
+        told = trial.distance is not None and redefined
+        return replace(trial, state="unmeasured", distance=None, failure=_TOLD) if told else trial
+    try:
+        distance = validation.remeasure(validation.space.from_unit(trial.unit_point), model, system)
+    except DistanceError as error:
+        if trial.distance is not None:
+            sentence = f"trial {trial.number} cannot be measured anew, and nothing is changed: {error}"
+            raise DistanceError(sentence) from error
+        return replace(trial, state="unmeasured", failure=text_of(error))
+    return replace(trial, state="completed", distance=distance, failure=None)
+
+
+# What a store does not take
+
+
+def rescued(ended: Trial, trajectory: Trajectory | None, store: Path | None, error: CtxvalError) -> CtxvalError:
+    """Keep how an execution ended that its store does not take; return the error that says where it is kept."""
+    if not ended.executed:
+        return error
+    path = kept_beside(ended, trajectory, store)
+    if path is None:
+        return type(error)(f"{error} How trial {ended.number} ended could not be kept either.")
+    how = f"--npz {path}" if trajectory is not None else "--failed or --distance as it says"
+    return type(error)(
+        f"{error} How trial {ended.number} ended is kept in {path}: once the store can take it, "
+        f"say `ctxval tell STORE {ended.number} {how}` before anything else."
+    )
 
 
 def kept_beside(trial: Trial, trajectory: Trajectory | None, store: Path | None) -> Path | None:

@@ -15,7 +15,17 @@ from typing import Any, Literal
 from ctxval.disks import on_network, warn_of_network
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
 from ctxval.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
-from ctxval.rows import COLUMNS, checksum_of, read_trajectory, read_trial, real, row_of, trial_checksum
+from ctxval.rows import (
+    COLUMNS,
+    ENDED,
+    checksum_of,
+    ended_row,
+    read_trajectory,
+    read_trial,
+    real,
+    row_of,
+    trial_checksum,
+)
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
 
@@ -58,27 +68,8 @@ _MIGRATIONS = (
     (
         "trials whose distance is not measured, why a task was executed again, and what was changed",
         """
-        CREATE TABLE trials_now (
-            number INTEGER PRIMARY KEY,
-            origin TEXT NOT NULL,
-            state TEXT NOT NULL CHECK (state IN ('open', 'completed', 'failed', 'unmeasured')),
-            unit_point TEXT NOT NULL,
-            parameters TEXT NOT NULL,
-            attempts INTEGER NOT NULL,
-            distance REAL,
-            failure TEXT,
-            executed INTEGER NOT NULL DEFAULT 0,
-            opened_at TEXT NOT NULL,
-            closed_at TEXT,
-            seconds REAL,
-            note TEXT,
-            checksum INTEGER,
-            because TEXT
-        );
-        INSERT INTO trials_now SELECT number, origin, state, unit_point, parameters, attempts, distance, failure,
-            executed, opened_at, closed_at, seconds, note, checksum, NULL FROM trials;
-        DROP TABLE trials;
-        ALTER TABLE trials_now RENAME TO trials;
+        ALTER TABLE trials ADD COLUMN because TEXT;
+        ALTER TABLE trials ADD COLUMN unmeasured INTEGER NOT NULL DEFAULT 0;
         CREATE TABLE history (
             number INTEGER PRIMARY KEY, at TEXT NOT NULL, what TEXT NOT NULL, why TEXT NOT NULL, content TEXT NOT NULL
         )
@@ -282,12 +273,8 @@ class Store:
         with self._transaction():
             for trial in trials:
                 self._connection.execute(
-                    "UPDATE trials SET state = ?, distance = ?, failure = ?, executed = ?, checksum = ? "
-                    "WHERE number = ?",
-                    (
-                        *(trial.state, real(trial.distance), trial.failure, int(trial.executed)),
-                        *(trial_checksum(row_of(trial)), trial.number),
-                    ),
+                    f"UPDATE trials SET {ENDED}, checksum = ? WHERE number = ?",
+                    (*ended_row(trial), trial_checksum(row_of(trial)), trial.number),
                 )
             self._write_description(description)
             self._insert_change(change)
@@ -344,11 +331,11 @@ class Store:
         """
         with self._transaction():
             changed = self._connection.execute(
-                "UPDATE trials SET state = ?, distance = ?, failure = ?, executed = ?, seconds = ?, closed_at = ?, "
-                "checksum = ? WHERE number = ? AND state = 'open' AND attempts = ?",
+                f"UPDATE trials SET {ENDED}, seconds = ?, closed_at = ?, checksum = ? "
+                "WHERE number = ? AND state = 'open' AND attempts = ?",
                 (
-                    *(trial.state, real(trial.distance), trial.failure, int(trial.executed), real(trial.seconds)),
-                    *(_now(), trial_checksum(row_of(trial)), trial.number, trial.attempts),
+                    *(*ended_row(trial), real(trial.seconds), _now(), trial_checksum(row_of(trial))),
+                    *(trial.number, trial.attempts),
                 ),
             ).rowcount
             if changed != 1:
