@@ -190,7 +190,8 @@ def _as_before(present: dict[str, Any], stored: dict[str, Any]) -> dict[str, Any
 
     That the code computes the same is seen in what is recomputed.
     """
-    space = {name: bound[:2] for name, bound in present["validation"]["space"].items()}
+    bounds = present["validation"]["space"].items()
+    space = {name: bound[:2] if isinstance(bound, list) else bound for name, bound in bounds}
     before = {**present, "validation": {**present["validation"], "space": space}}
     merged = _without_code({key: value for key, value in before.items() if key != "version"}, stored)
     assert isinstance(merged, dict)
