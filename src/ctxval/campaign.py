@@ -228,7 +228,7 @@ class Campaign(Ledger):
             if self._again:
                 return self._reopen(self._again.popleft())
             enough = sum(trial.origin == "iid" for trial in self._trials) >= draws
-            return None if enough else self._open((self._draw(), "iid"), attempts=1)
+            return None if enough else self._open((self._draws.point(self._trials), "iid"), attempts=1)
 
         return self._carry_out(wanted, self._crew(workers, executor, timeout), on_trial, _Patience())
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -214,32 +213,3 @@ def _without_code(present: Any, stored: Any) -> Any:
     if isinstance(stored, str) and isinstance(present, str) and stored.rpartition(".")[2] == present.rpartition(".")[2]:
         return stored
     return present
-
-
-# Randomness
-
-
-def digest_of_model(validation: Validation) -> int:
-    """Return a number that another model, one that was learned again for instance, does not share.
-
-    Independent draws of tasks depend on it, so that a model is never judged by tasks that the one before it was.
-    """
-    space = validation.space
-    loops: list[list[Any]] = []
-    for point in (space.low, 0.5 * (space.low + space.high), space.high):
-        try:
-            trajectory = validation.plan(point).model_trajectory
-            loops.append([trajectory.states.ravel().tolist(), trajectory.inputs.ravel().tolist()])
-        except CtxvalError as error:
-            loops.append([str(type(error).__name__)])
-    content = json.dumps(_rounded([describe(validation.model, private=True), loops]), sort_keys=True)
-    return int.from_bytes(hashlib.sha256(content.encode()).digest()[:8], "big")
-
-
-def _rounded(value: Any) -> Any:
-    """Return a description without the last digits of its numbers, in which machines differ."""
-    if isinstance(value, float):
-        return f"{value:.5g}" if abs(value) > 1e-12 else "0"
-    if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
-    return [_rounded(item) for item in value] if isinstance(value, list) else value

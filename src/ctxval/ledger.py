@@ -13,10 +13,12 @@ import numpy as np
 from ctxval.arrays import Array
 from ctxval.describe import differences
 from ctxval.distance import Distance
+from ctxval.draws import IndependentDraws
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError
-from ctxval.identity import description_of, digest_of_model, identify
+from ctxval.identity import description_of, identify
 from ctxval.prediction import predict_distance
 from ctxval.recording import (
+    as_told,
     known_distance,
     measured_again,
     outcome_of,
@@ -24,15 +26,13 @@ from ctxval.recording import (
     rescued,
     same_run,
     text_of,
+    told_value,
 )
 from ctxval.searches import GPUCB, Prediction, Search
 from ctxval.store import Change, Store
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Origin, State, Trial
 from ctxval.validation import Plan, Validation
-
-_AUDIT = 0x6175
-"""Marks the randomness of an audit's draws; searches mark streams of theirs with small numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +82,7 @@ class Ledger:
         self.name = name
         self.store = store if isinstance(store, Store) else Store(store)
         identify(self.store, validation, self._description(), accept_change, remeasure)
+        self._draws = IndependentDraws(self.store, validation, self.seed)
         self._executing: set[int] = set()
         self._replay()
         if remeasure:
@@ -94,27 +95,14 @@ class Ledger:
         """Bring the search to where the stored trials left it."""
         self._trials = self.store.trials()
         self._changes = len(self.store.history())
-        self.search.reset(self.validation.space.dimension, self._search_seed())
-        told = _as_told(self._trials)
+        iid = getattr(self.search, "iid", False)
+        seed = self._draws.search_seed(self._trials) if iid else self.seed
+        self.search.reset(self.validation.space.dimension, seed)
+        told = as_told(self._trials)
         if told:
-            self.search.tell(np.array([trial.unit_point for trial in told]), [_value(trial) for trial in told])
+            self.search.tell(np.array([trial.unit_point for trial in told]), [told_value(trial) for trial in told])
             if hasattr(self.search, "remember"):
                 self.search.remember([trial.note for trial in told])
-
-    def _search_seed(self) -> int:
-        """Return the search's seed; one of independent draws depends on the model too."""
-        if not getattr(self.search, "iid", False):
-            return self.seed
-        number = self._draws_number()
-        return self.seed if number is None else int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
-
-    def _draws_number(self) -> int | None:
-        """Return what independent draws depend on besides the seed: the model, so that another one has others."""
-        number = self.store.draws()
-        if number is None and not any(trial.origin == "iid" for trial in self._trials):
-            self.store.keep_draws(digest_of_model(self.validation))
-            number = self.store.draws()
-        return number
 
     # What is known
 
@@ -177,7 +165,7 @@ class Ledger:
             self._refresh()
             if parameters is not None:
                 return self._open((self._unit_point(parameters), "manual"), attempts=0, because=because)
-            return self._open((self._draw(), "iid") if draw else None, attempts=0)
+            return self._open((self._draws.point(self._trials), "iid") if draw else None, attempts=0)
 
     def reopen(self, number: int) -> OpenTrial:
         """Return an open trial again, with its task and controller.
@@ -191,13 +179,6 @@ class Ledger:
 
     def _unit_point(self, parameters: Mapping[str, Any]) -> Array:
         return self.validation.space.to_unit(self.validation.space.point(parameters))
-
-    def _draw(self) -> Array:
-        # Apart from the search's own randomness, which is that of [seed, number].
-        number = self._draws_number()
-        entropy = [self.seed, len(self._trials), _AUDIT, *([] if number is None else [number])]
-        rng = np.random.default_rng(np.random.SeedSequence(entropy))
-        return rng.random(self.validation.space.dimension)
 
     def _refresh(self) -> None:
         """Learn what other processes have stored meanwhile."""
@@ -484,24 +465,3 @@ class Ledger:
             why = "the distance has changed" if other else "asked for"
             self.store.remeasure(changed, description, Change("remeasured", why, {"before": old}))
         return changed
-
-
-def _as_told(trials: list[Trial]) -> list[Trial]:
-    """Return the trials as a search keeps them: of a point that waits for its value there is one."""
-    told: list[Trial] = []
-    waiting: dict[bytes, int] = {}
-    for trial in trials:
-        key = trial.unit_point.tobytes()
-        if key in waiting:
-            slot = waiting[key]
-            told[slot] = replace(trial, note=told[slot].note)
-        else:
-            slot = waiting[key] = len(told)
-            told.append(trial)
-        if trial.distance is not None:
-            del waiting[key]
-    return told
-
-
-def _value(trial: Trial) -> float:
-    return np.nan if trial.distance is None else trial.distance

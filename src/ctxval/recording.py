@@ -45,6 +45,28 @@ def text_of(reason: object) -> str:
     return str(reason).encode("utf-8", "backslashreplace").decode()
 
 
+def as_told(trials: list[Trial]) -> list[Trial]:
+    """Return the trials as a search keeps them: of a point that waits for its value there is one."""
+    told: list[Trial] = []
+    waiting: dict[bytes, int] = {}
+    for trial in trials:
+        key = trial.unit_point.tobytes()
+        if key in waiting:
+            slot = waiting[key]
+            told[slot] = replace(trial, note=told[slot].note)
+        else:
+            slot = waiting[key] = len(told)
+            told.append(trial)
+        if trial.distance is not None:
+            del waiting[key]
+    return told
+
+
+def told_value(trial: Trial) -> float:
+    """Return what a search is told of a trial: its distance, NaN if there is none."""
+    return np.nan if trial.distance is None else trial.distance
+
+
 # Measuring again
 
 _TOLD = "its distance was told without a trajectory, and the distance has changed since."
