@@ -52,7 +52,7 @@ def test_a_store_without_notes_is_migrated(tmp_path: Path, monkeypatch: pytest.M
         old = Store(tmp_path / "a.sqlite")
         old._connection.execute(
             "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, opened_at) "
-            "VALUES (0, 'iid', 'open', '[0.5]', '{}', 1, '')"
+            "VALUES (0, 'iid', 'open', '[0.5, 0.5]', '{}', 1, '')"
         )
         old.close()
     migrated = Store(tmp_path / "a.sqlite")
@@ -186,7 +186,7 @@ def test_a_store_of_any_older_version_is_brought_up_with_its_trials(tmp_path: Pa
     connection.execute(f"PRAGMA user_version = {version}")
     connection.execute(
         "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, distance, executed, opened_at) "
-        "VALUES (0, 'iid', 'completed', '[0.25]', '{\"a\": 1.5}', 1, 0.7, 1, 'then')"
+        "VALUES (0, 'iid', 'completed', '[0.25, 0.5]', '{\"a\": 1.5}', 1, 0.7, 1, 'then')"
     )
     connection.close()
     store = Store(path)

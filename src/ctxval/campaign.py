@@ -14,8 +14,8 @@ from ctxval.certificates import RESOLUTION
 from ctxval.errors import CtxvalError, ExecutionError, InputError
 from ctxval.interrupts import Interrupts, kept_alive
 from ctxval.ledger import Ledger, OpenTrial
-from ctxval.recording import text_of
 from ctxval.surrogate import Surrogate, fit_surrogate
+from ctxval.texts import text_of
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
 from ctxval.verdict import CONFIDENCE, Verdict, judge, require_threshold, standing

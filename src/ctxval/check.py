@@ -13,6 +13,7 @@ from ctxval.errors import ConformanceError, CtxvalError
 from ctxval.experiment import Experiment, labels_of
 from ctxval.task import Task
 from ctxval.testing import check_distance, check_model, check_synthesizer
+from ctxval.texts import reason_of
 from ctxval.trajectory import COMPLETE, Trajectory
 from ctxval.validation import Plan, Validation
 
@@ -75,7 +76,7 @@ def _guarded(name: str, check: Callable[[], Iterator[Finding]]) -> list[Finding]
         found.append(Finding(name, "failed", str(error)))
     except Exception as error:
         # A user's own part may raise anything.
-        found.append(Finding(name, "failed", f"{type(error).__name__}: {error}"))
+        found.append(Finding(name, "failed", reason_of(error)))
     return found
 
 

@@ -19,6 +19,7 @@ from ctxval.parts import argument, part, reference, require_types, space_of, tas
 from ctxval.searches import NAMES as SEARCHES
 from ctxval.searches import Search, by_name
 from ctxval.store import Store
+from ctxval.texts import reason_of
 from ctxval.validation import Validation
 from ctxval.verdict import CONFIDENCE
 
@@ -308,7 +309,7 @@ def _from_reference(text: str, seed: int, options: dict[str, Any]) -> Experiment
         except CtxvalError:
             raise
         except Exception as error:
-            raise InputError(f"{text} failed: {type(error).__name__}: {error}.") from error
+            raise InputError(f"{text} failed: {reason_of(error)}.") from error
     if isinstance(found, Validation):
         return Experiment(text.partition(":")[2], found)
     if not isinstance(found, Experiment):

@@ -17,6 +17,7 @@ from ctxval.errors import InputError
 from ctxval.exchange import write_controller, write_task
 from ctxval.experiment import Experiment, labels_of
 from ctxval.space import TaskSpace
+from ctxval.texts import unguarded
 from ctxval.trajectory import Trajectory
 from ctxval.validation import Plan
 
@@ -152,6 +153,7 @@ def _table(path: Path, space: TaskSpace) -> list[KnownRun]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
+            reader.fieldnames = [unguarded(name) for name in reader.fieldnames or ()]
             rows = [(reader.line_num, row) for row in reader]
             header = [name for name in reader.fieldnames or () if name]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -172,7 +174,7 @@ def _table(path: Path, space: TaskSpace) -> list[KnownRun]:
 def _run(path: Path, line: int, row: Mapping[str, str | None], space: TaskSpace) -> KnownRun:
     where = f"{path}, line {line}"
     point = [_number(where, name, row[name]) for name in space.names]
-    given = {name: (row.get(name) or "").strip() for name in _RESULTS}
+    given = {name: unguarded((row.get(name) or "").strip()) for name in _RESULTS}
     if sum(bool(text) for text in given.values()) != 1:
         raise InputError(f"{where}: exactly one of {', '.join(_RESULTS)} must be filled in.")
     parameters = space.describe_point(space.parameters(point).points)

@@ -25,11 +25,11 @@ from ctxval.recording import (
     require_one_result,
     rescued,
     same_run,
-    text_of,
     told_value,
 )
 from ctxval.searches import GPUCB, Prediction, Search
 from ctxval.store import Change, Store
+from ctxval.texts import text_of
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Origin, State, Trial
 from ctxval.validation import Plan, Validation

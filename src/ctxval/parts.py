@@ -21,6 +21,7 @@ from ctxval import controllers, distances, models, systems
 from ctxval.errors import CtxvalError, InputError, UnknownNameError
 from ctxval.space import Parameters, TaskSpace
 from ctxval.task import Task
+from ctxval.texts import reason_of
 from ctxval.trajectory import Trajectory, Transitions
 
 _ROOMS: dict[str, tuple[ModuleType, tuple[str, ...]]] = {
@@ -88,7 +89,7 @@ def made(what: str, build: Any, arguments: Mapping[str, Any]) -> Any:
     except CtxvalError:
         raise
     except Exception as error:
-        raise InputError(f"{what} cannot be made: {type(error).__name__}: {error}.") from error
+        raise InputError(f"{what} cannot be made: {reason_of(error)}.") from error
 
 
 def argument(value: Any) -> Any:
@@ -116,7 +117,7 @@ def reference(text: str) -> Any:
     except CtxvalError:
         raise
     except Exception as error:
-        raise InputError(f"{module_name} failed while it was loaded: {type(error).__name__}: {error}.") from error
+        raise InputError(f"{module_name} failed while it was loaded: {reason_of(error)}.") from error
 
 
 def recorded(files: Any) -> Transitions:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ctxval.arrays import Array
 from ctxval.errors import CtxvalError, DistanceError, InputError
+from ctxval.texts import text_of
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
 from ctxval.validation import Validation
@@ -38,11 +39,6 @@ def same_run(trial: Trial, unit_point: Array, distance: float | None, failed: st
     """Return whether a trial is an execution that is told again."""
     ended = trial.distance == distance and trial.failure == failed and trial.state != "open"
     return ended and np.array_equal(trial.unit_point, unit_point)
-
-
-def text_of(reason: object) -> str:
-    """Return a reason as text that every file can hold; a serial line may have put anything into it."""
-    return str(reason).encode("utf-8", "backslashreplace").decode()
 
 
 def as_told(trials: list[Trial]) -> list[Trial]:

@@ -4,21 +4,39 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import sqlite3
+import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from urllib.parse import quote
 
+from ctxval import schema
+from ctxval.describe import describe
 from ctxval.errors import CtxvalError, InputError, StoreAccessError
-from ctxval.rows import COLUMNS, read_trajectory, read_trial
+from ctxval.rows import CHECKED, COLUMNS, read_json, read_trajectory, read_trial, trial_checksum
+from ctxval.scratch import scratch
 from ctxval.store import Side, Store
+from ctxval.texts import guarded, shortened, visible
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
 
 _PROBED = 10_000
-"""Numbers of trials that are tried where the file does not say how many there are."""
+"""Numbers of rows that are tried where the file does not say how many there are."""
+
+_SMALLEST = 16
+"""Bytes that a row takes at least."""
+
+_LOOKS, _BETWEEN = 20, 0.05
+"""How often, and after how many seconds, it is looked whether a journal has gone."""
+
+_DEPTH = 100
+"""Levels of what is written as JSON: more than is ever read."""
+
+_TABLES = ("experiment", "settings", "history", "trials", "trajectories")
 
 _UNREADABLE = (sqlite3.Error, CtxvalError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
@@ -30,101 +48,176 @@ class Salvage:
     Attributes:
         trials: by number.
         trajectories: by number and side.
-        about: the tables experiment and settings.
+        about: the tables experiment, settings and history.
         damaged: a sentence for each thing that was not readable.
     """
 
     trials: dict[int, Trial] = field(default_factory=dict)
     trajectories: dict[tuple[int, Side], Trajectory] = field(default_factory=dict)
-    about: dict[str, dict[str, Any]] = field(default_factory=dict)
+    about: dict[str, Any] = field(default_factory=dict)
     damaged: list[str] = field(default_factory=list)
 
 
 def salvage(path: Path) -> Salvage:
-    """Read what is readable of a store; the file is not changed where it is damaged.
+    """Read what is readable of a store; the file is not changed where it is damaged, or has a journal.
 
     Raises:
-        StoreAccessError: there is no such file.
+        StoreAccessError: there is no such file, or it cannot be read at all.
     """
+    schema.require_file(path)
     if not path.is_file():
         raise StoreAccessError(f"there is no store at {path}.")
     found = Salvage()
-    try:
-        # A whole store may have a journal of a process that died, which opening it plays back.
-        Store.existing(path).close()
-    except CtxvalError as error:
-        found.damaged.append(str(error))
-    connection = sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)
-    try:
-        _read(connection, found)
-    finally:
-        connection.close()
+    with _played_back(path, found) as readable:
+        try:
+            uri = f"file:{quote(str(readable.absolute()))}?mode=ro&immutable=1"
+            connection = sqlite3.connect(uri, uri=True, factory=schema.Guarded)
+        except sqlite3.Error as error:
+            raise StoreAccessError(f"{path} cannot be read: {error}.") from error
+        try:
+            _read(connection, path.stat().st_size, found)
+        finally:
+            connection.close()
     return found
 
 
-def _read(connection: sqlite3.Connection, found: Salvage) -> None:
+@contextmanager
+def _played_back(path: Path, found: Salvage) -> Iterator[Path]:
+    """Give the file to read: the store, or a copy into which the journal of a process that died was played back."""
+    journals = _left_journals(path)
+    if not journals:
+        try:
+            Store.existing(path).close()
+        except CtxvalError as error:
+            found.damaged.append(str(error))
+        yield path
+        return
+    with scratch() as folder:
+        copy = folder / "store.sqlite"
+        try:
+            # In place it might destroy what is readable, should the journal be another database's.
+            for file, ending in journals.items():
+                shutil.copyfile(file, f"{copy}{ending}")
+            Store.existing(copy).close()
+        except (CtxvalError, OSError) as error:
+            found.damaged.append(str(error).replace(str(copy), str(path)))
+            copy = path
+        yield copy
+
+
+def _left_journals(path: Path) -> dict[Path, str]:
+    """Return the store and the journals beside it, with their endings; empty where there is none for long."""
+    for _ in range(_LOOKS):
+        journals = schema.beside(path)
+        if not journals:
+            return {}
+        time.sleep(_BETWEEN)  # it may be of a process that is writing
+    real = str(path.resolve())
+    return {path: ""} | {journal: str(journal).removeprefix(real) for journal in journals}
+
+
+def _read(connection: sqlite3.Connection, size: int, found: Salvage) -> None:
     try:
         # Or SQLite refuses a file that is shorter than it says.
         connection.execute("PRAGMA writable_schema = ON")
-        columns = {row[1] for row in connection.execute("PRAGMA table_info(trials)")}
-        kept = {row[1] for row in connection.execute("PRAGMA table_info(trajectories)")}
+        unchecked = connection.execute("PRAGMA user_version").fetchone()[0] < CHECKED
+        tables = schema.plain_tables(connection, _TABLES)
     except _UNREADABLE as error:
         found.damaged.append(f"nothing is readable: {error}")
         return
+    missing = [name for name in _TABLES if name not in tables and (name != "history" or not unchecked)]
+    found.damaged += [f"the table {name} is missing, or is no plain table" for name in missing]
+    reader = _Reader(connection, tables, size, unchecked, found)
     for table in ("experiment", "settings"):
-        found.about[table] = dict(_pairs(connection, table, found))
-    names = [name.strip() for name in COLUMNS.split(",")]
-    wanted = ", ".join(name if name in columns else f"NULL AS {name}" for name in (*names, "checksum"))
-    # Older versions have no checksums.
-    checksum = "checksum" if "checksum" in kept else "NULL"
-    for number in _numbers(connection, found):
-        _read_trial(connection, wanted, checksum, number, found)
+        found.about[table] = dict(reader.pairs(table))
+    found.about["history"] = list(reader.history())
+    for row in reader.rows("trials", [*(name.strip() for name in COLUMNS.split(",")), "checksum"]):
+        reader.take_trial(row)
+    for row in reader.rows("trajectories", ["trial", "side", "npz", "checksum"]):
+        reader.take_trajectory(*row)
 
 
-def _pairs(connection: sqlite3.Connection, table: str, found: Salvage) -> Iterator[tuple[str, Any]]:
-    try:
-        for key, value in connection.execute(f"SELECT key, value FROM {table} ORDER BY rowid"):
-            yield str(key), json.loads(value)
-    except _UNREADABLE as error:
-        found.damaged.append(f"the table {table}: {error}")
+@dataclass(eq=False)
+class _Reader:
+    """Reads tables row by row, each by its place, so that one row that is damaged does not hide the next."""
 
+    connection: sqlite3.Connection
+    tables: dict[str, set[str]]
+    size: int
+    unchecked: bool
+    found: Salvage
 
-def _numbers(connection: sqlite3.Connection, found: Salvage) -> range:
-    try:
-        last = connection.execute("SELECT max(number) FROM trials").fetchone()[0]
-    except sqlite3.Error:
-        found.damaged.append("how many trials there were")
-        return range(_PROBED)
-    return range(0 if not isinstance(last, int) else min(last, 10**7) + 1)
+    def pairs(self, table: str) -> Iterator[tuple[str, Any]]:
+        for key, value in self.rows(table, ["key", "value"]):
+            try:
+                yield str(key), read_json(value, finite=False)
+            except InputError as error:
+                self._note(f"the table {table}, {key}: {error}")
 
+    def history(self) -> Iterator[dict[str, Any]]:
+        """Return what was changed in the store; versions before it was kept have none."""
+        for at, what, why, content in self.rows("history", ["at", "what", "why", "content"]):
+            try:
+                yield {"at": str(at), "what": str(what), "why": str(why), "content": read_json(content, finite=False)}
+            except InputError as error:
+                self._note(f"the table history, {at}: {error}")
 
-def _read_trial(connection: sqlite3.Connection, wanted: str, checksum: str, number: int, found: Salvage) -> None:
-    try:
-        row = connection.execute(f"SELECT {wanted} FROM trials WHERE number = ?", (number,)).fetchone()
-    except _UNREADABLE as error:
-        found.damaged.append(f"trial {number}: {error}")
-        row = None
-    if row is not None:
-        trial = read_trial(tuple(row[:-1]), row[-1])
-        if trial is None:
-            found.damaged.append(f"trial {number}: its checksum does not fit")
+    def rows(self, table: str, columns: list[str]) -> Iterator[tuple[Any, ...]]:
+        """Return the readable rows of a table; columns that older versions have not are None."""
+        if table not in self.tables:
+            return
+        wanted = ", ".join(name if name in self.tables[table] else f"NULL AS {name}" for name in columns)
+        for place in self._places(table):
+            try:
+                row = self.connection.execute(f"SELECT {wanted} FROM {table} WHERE rowid = ?", (place,)).fetchone()
+            except _UNREADABLE as error:
+                self._note(f"the table {table}, row {place}: {error}")
+                continue
+            if row is not None:
+                yield row
+
+    def _places(self, table: str) -> list[int]:
+        places: set[int] = set()
+        try:
+            places.update(place for (place,) in self.connection.execute(f"SELECT rowid FROM {table} NOT INDEXED"))
+        except _UNREADABLE as error:
+            self._note(f"the table {table}: {error}")
+            # What is behind the damage is found by its number, of which a file has not more than it has room for.
+            places |= set(range(min(self._last(table) + 1, self.size // _SMALLEST)))
+        return sorted(places)
+
+    def _last(self, table: str) -> int:
+        try:
+            last = self.connection.execute(f"SELECT max(rowid) FROM {table}").fetchone()[0]
+        except _UNREADABLE:
+            return _PROBED
+        return int(last or 0)
+
+    def take_trial(self, row: tuple[Any, ...]) -> None:
+        number, *values, checksum = row
+        trial = read_trial((number, *values), checksum, unchecked=self.unchecked)
+        if trial is not None and trial.number not in self.found.trials:
+            self.found.trials[trial.number] = trial
+        elif trial is not None:
+            self._note(f"trial {number} is there more than once, and the first one is taken")
+        elif checksum is not None and trial_checksum((number, *values)) == checksum:
+            self._note(f"trial {number}: it holds what no trial can")
         else:
-            found.trials[number] = trial
-    for side in ("model", "system"):
-        _read_trajectory(connection, number, side, checksum, found)
+            self._note(f"trial {number}: its checksum does not fit")
 
+    def take_trajectory(self, number: Any, side: Any, npz: Any, checksum: Any) -> None:
+        name = f"the {side}'s trajectory of trial {number}"
+        if side not in get_args(Side) or not isinstance(number, int):
+            self._note(f"{name}: there is no such thing")
+        elif (number, side) in self.found.trajectories:
+            self._note(f"{name} is there more than once, and the first one is taken")
+        elif trajectory := read_trajectory(number, side, npz, checksum, unchecked=self.unchecked):
+            self.found.trajectories[number, side] = trajectory
+        else:
+            self._note(f"{name}: its checksum does not fit")
 
-def _read_trajectory(connection: sqlite3.Connection, number: int, side: Side, checksum: str, found: Salvage) -> None:
-    statement = f"SELECT npz, {checksum} FROM trajectories WHERE trial = ? AND side = ?"
-    try:
-        row = connection.execute(statement, (number, side)).fetchone()
-        trajectory = None if row is None else read_trajectory(number, side, *row)
-        if trajectory is not None:
-            found.trajectories[number, side] = trajectory
-        elif row is not None:
-            found.damaged.append(f"the {side}'s trajectory of trial {number}: its checksum does not fit")
-    except _UNREADABLE as error:
-        found.damaged.append(f"the {side}'s trajectory of trial {number}: {error}")
+    def _note(self, sentence: str) -> None:
+        self.found.damaged.append(shortened(sentence))
 
 
 def export(found: Salvage, folder: Path) -> list[Path]:
@@ -138,8 +231,8 @@ def export(found: Salvage, folder: Path) -> list[Path]:
         paths = [folder / "trials.csv", folder / "trials.json"]
         _write_table(paths[0], found)
         trials = [asdict(trial) | {"unit_point": trial.unit_point.tolist()} for trial in found.trials.values()]
-        content = {**found.about, "damaged": found.damaged, "trials": trials}
-        paths[1].write_text(json.dumps(content, indent=1), encoding="utf-8")
+        content = describe({**found.about, "damaged": found.damaged, "trials": trials}, _DEPTH)
+        paths[1].write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
         for (number, side), trajectory in found.trajectories.items():
             paths.append(folder / "trajectories" / f"{number}.{side}.csv")
             trajectory.to_csv(paths[-1])
@@ -152,9 +245,14 @@ def _write_table(path: Path, found: Salvage) -> None:
     rows = [_flat(trial) for trial in found.trials.values()]
     header = list(dict.fromkeys(name for row in rows for name in row))
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, header)
-        writer.writeheader()
-        writer.writerows(rows)
+        writer = csv.writer(file)
+        writer.writerow([_cell(name) for name in header])
+        writer.writerows([_cell(row.get(name)) for name in header] for row in rows)
+
+
+def _cell(value: Any) -> Any:
+    """Return a value as a cell; a text does nothing in a spreadsheet or in a terminal."""
+    return guarded(visible(value)) if isinstance(value, str) else value
 
 
 def _flat(trial: Trial) -> dict[str, Any]:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from ctxval import rows, schema
 from ctxval.disks import on_network, warn_of_network
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
 from ctxval.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
@@ -124,24 +126,30 @@ class Store:
             if self.path is not None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 warn_of_network(self.path)
-            self._connection = sqlite3.connect(self.path or ":memory:", isolation_level=None, timeout=10.0)
-            self._prepare()
+                schema.require_files(self.path)
+            self._connection = sqlite3.connect(
+                self.path or ":memory:", isolation_level=None, timeout=10.0, factory=schema.Guarded
+            )
+            try:
+                self._prepare()
+            except BaseException:
+                self._connection.close()
+                raise
 
     @classmethod
     def existing(cls, path: str | Path) -> Store:
         """Open a store that must exist already.
 
         Raises:
-            StoreAccessError: there is no such file.
+            StoreAccessError: there is no such file, or it is none that can be read.
         """
-        try:
-            with Path(path).open("rb") as file:
-                if not file.read(1):
-                    raise ForeignStoreError(f"{path} is an empty file, not a store.")
-        except FileNotFoundError:
-            raise StoreAccessError(f"there is no store at {path}.") from None
-        except OSError as error:
-            raise StoreAccessError(f"{path} cannot be read as a store: {error.strerror}.") from error
+        schema.require_files(Path(path))
+        if not os.path.exists(path):
+            raise StoreAccessError(f"there is no store at {path}.")
+        if not os.access(path, os.R_OK):
+            raise StoreAccessError(f"{path} cannot be read as a store: it is not readable for you.")
+        if not os.path.getsize(path):
+            raise ForeignStoreError(f"{path} is an empty file, not a store.")
         return cls(path)
 
     def close(self) -> None:
@@ -241,23 +249,27 @@ class Store:
         return self._pairs("settings")
 
     def _pairs(self, table: str) -> dict[str, Any]:
-        with self._translating():
-            rows = self._connection.execute(f"SELECT key, value FROM {table} ORDER BY rowid").fetchall()
-        try:
-            return {key: json.loads(value) for key, value in rows}
-        except (ValueError, TypeError, RecursionError) as error:
-            raise self._damaged(f"the {table} in it cannot be read") from error
+        with self._rows(f"SELECT key, value FROM {table} ORDER BY rowid") as found:
+            try:
+                return rows.read_pairs(found)
+            except InputError as error:
+                raise self._damaged(f"the {table} in it cannot be read") from error
+
+    @contextmanager
+    def _rows(self, statement: str) -> Iterator[sqlite3.Cursor]:
+        """Read rows one by one, as in a damaged file there may be no end of them."""
+        with self._translating(), closing(self._connection.execute(statement)) as cursor:
+            yield cursor
 
     # The history
 
     def history(self) -> list[Change]:
         """Return what was changed in the store after it was written, and why, in order."""
-        with self._translating():
-            rows = self._connection.execute("SELECT what, why, content, at FROM history ORDER BY number").fetchall()
-        try:
-            return [Change(str(what), str(why), json.loads(content), str(at)) for what, why, content, at in rows]
-        except (ValueError, TypeError, RecursionError) as error:
-            raise self._damaged("its history cannot be read") from error
+        with self._rows("SELECT what, why, content, at FROM history ORDER BY number") as found:
+            try:
+                return [Change(str(what), str(why), rows.read_json(told), str(at)) for what, why, told, at in found]
+            except InputError as error:
+                raise self._damaged("its history cannot be read") from error
 
     def _insert_change(self, change: Change) -> None:
         self._connection.execute(
@@ -354,14 +366,13 @@ class Store:
         Raises:
             ForeignStoreError: one of them is damaged.
         """
-        with self._translating():
-            rows = self._connection.execute(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number").fetchall()
-        found = []
-        for place, (*row, checksum) in enumerate(rows):
-            trial = read_trial(tuple(row), checksum)
-            if trial is None or trial.number != place:
-                raise self._damaged(f"its trial {place} cannot be read")
-            found.append(trial)
+        found: list[Trial] = []
+        with self._rows(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number") as cursor:
+            for *row, checksum in cursor:
+                trial = read_trial(tuple(row), checksum)
+                if trial is None or not rows.follows(trial, found):
+                    raise self._damaged(f"its trial {len(found)} cannot be read")
+                found.append(trial)
         return found
 
     def signature(self) -> tuple[int, int, int]:
@@ -406,22 +417,14 @@ class Store:
     # The file
 
     def _prepare(self) -> None:
-        # In this order: another process may be making the store, and what is not empty any more has its mark.
-        empty = self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
-        application = self._connection.execute("PRAGMA application_id").fetchone()[0]
-        version = self._connection.execute("PRAGMA user_version").fetchone()[0]
-        if not empty and application != _APPLICATION:
-            raise ForeignStoreError(f"{self._name} is a database, but not a ctxval store.")
-        if version > len(_MIGRATIONS):
-            raise ForeignStoreError(
-                f"{self._name} has schema version {version}, made by a newer ctxval; "
-                f"this one reads up to {len(_MIGRATIONS)}."
-            )
-        if (
-            self.path is not None
-            and self.path.stat().st_size % self._connection.execute("PRAGMA page_size").fetchone()[0]
-        ):
-            raise self._damaged("its end is missing")
+        with schema.snapshot(self._connection):
+            version = schema.version(self._connection, self._name, _APPLICATION, [sql for _, sql in _MIGRATIONS])
+            page = self._connection.execute("PRAGMA page_size").fetchone()[0]
+            if self.path is not None and self.path.stat().st_size % page:
+                raise self._damaged("its end is missing")
+        if self._connection.execute("PRAGMA journal_mode").fetchone()[0] == "wal":
+            # A store is one file.
+            self._connection.execute("PRAGMA journal_mode = DELETE")
         self._connection.execute("PRAGMA synchronous = FULL")
         for number in range(version, len(_MIGRATIONS)):
             self._migrate(number)
@@ -435,6 +438,8 @@ class Store:
                 self._connection.execute(f"PRAGMA application_id = {_APPLICATION}")
             for statement in script.split(";"):
                 self._connection.execute(statement)
+            if number + 1 == rows.CHECKED:
+                rows.write_checksums(self._connection)
             self._connection.execute("INSERT INTO migrations VALUES (?, ?, ?)", (number + 1, title, _now()))
             self._connection.execute(f"PRAGMA user_version = {number + 1}")
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from ctxval.arrays import Array, Mask, as_floats
 from ctxval.errors import InputError, ShapeError
+from ctxval.texts import guarded, unguarded, visible
 
 COMPLETE = "complete"
 
@@ -172,7 +173,7 @@ class Trajectory:
         header = ["t", *_column_names("x", states, n), *_column_names("u", inputs, m)]
         with open(path, "w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(header)
+            writer.writerow([guarded(visible(name)) for name in header])
             for k, (time, state) in enumerate(zip(self.times.tolist(), self.states.tolist(), strict=True)):
                 row = self.inputs[k].tolist() if k < self.horizon else [""] * m
                 writer.writerow([time, *state, *row])
@@ -272,6 +273,7 @@ def _read_csv(path: str | Path) -> tuple[list[int], list[dict[str, str]]]:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
+            reader.fieldnames = [unguarded(name) for name in reader.fieldnames or ()]
             numbered = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path} cannot be read as CSV: {error}.") from error

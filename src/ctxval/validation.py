@@ -27,6 +27,7 @@ from ctxval.rollout import rollout
 from ctxval.space import Parameters, TaskSpace
 from ctxval.system import System
 from ctxval.task import Task
+from ctxval.texts import reason_of
 from ctxval.trajectory import COMPLETE, Trajectory, require_times
 
 START = 0.05
@@ -349,11 +350,3 @@ def _is_share(value: object) -> bool:
 def _require(name: str, value: object, valid: bool, wanted: str) -> None:
     if not valid:
         raise InputError(f"{name} must be {wanted}, got {value!r}.")
-
-
-def reason_of(error: BaseException) -> str:
-    """Return what an exception says, and its type."""
-    try:
-        return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-    except Exception:
-        return type(error).__name__

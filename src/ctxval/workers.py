@@ -26,8 +26,9 @@ from ctxval.errors import CampaignError, InputError
 from ctxval.interrupts import kept_alive, raised_by_signal
 from ctxval.system import System
 from ctxval.task import Task
+from ctxval.texts import reason_of
 from ctxval.trajectory import Trajectory
-from ctxval.validation import Plan, reason_of
+from ctxval.validation import Plan
 
 _GRACE = 2.0
 """Seconds that a worker has to clean up before it is killed."""

@@ -2,10 +2,12 @@
 
 from ctxval.cli import certify, files, hand, paper, run, stores
 from ctxval.cli.base import app
+from ctxval.cli.screen import print_anything
 
 __all__ = ["app", "certify", "files", "hand", "main", "paper", "run", "stores"]
 
 
 def main() -> None:
     """Run the command line."""
+    print_anything()
     app()

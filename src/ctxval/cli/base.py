@@ -15,14 +15,15 @@ from dataclasses import asdict
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from ctxval.campaign import Campaign
+from ctxval.cli.screen import Commands, Screen, line
 from ctxval.describe import describe
 from ctxval.disks import StoreWarning
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
+from ctxval.texts import reason_of, shortened
 from ctxval.trial import Trial
 from ctxval.verdict import Verdict
 
@@ -31,12 +32,13 @@ _BAD = (InputError, StoreError, CertificateError)
 
 app = typer.Typer(
     name="ctxval",
+    cls=Commands,
     help="Decide whether a learned model of a robot can be trusted for the control tasks it is meant for.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-out = Console()
-err = Console(stderr=True)
+out = Screen()
+err = Screen(stderr=True)
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
@@ -56,13 +58,13 @@ def command(function: Callable[..., Any]) -> Callable[..., Any]:
         except (typer.Exit, typer.Abort):
             raise
         except KeyboardInterrupt:
-            err.print("stopped; what was executed is stored, run the same command to go on.")
+            err.say("stopped; what was executed is stored, run the same command to go on.")
             raise typer.Exit(INTERRUPTED) from None
-        except (Exception, SystemExit) as error:
+        except BaseException as error:  # users' code may raise anything
             if isinstance(error.__context__, BrokenPipeError):
                 raise typer.Exit(CUT_OFF) from None  # the reader of our output has gone, as in `| head`
             # Python's own exit status here would be 1, which says that a model is falsified.
-            say_error(f"{type(error).__name__}: {error}")
+            say_error(reason_of(error))
             raise typer.Exit(CANNOT_GO_ON) from None
 
     return wrapped
@@ -136,14 +138,14 @@ def hands(workers: int | None, dask: str | None, timeout: float | None) -> Itera
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: Any, **_: Any) -> None:
     if issubclass(category, StoreWarning):
-        err.print(f"[bold yellow]warning:[/] {escaped(str(message))}", highlight=False, soft_wrap=True)
+        err.say(("warning:", "bold yellow"), f" {message}")
     else:
-        err.print(warnings.formatwarning(message, category, *place[:2]), markup=False, highlight=False, end="")
+        err.say(warnings.formatwarning(message, category, *place[:2]).rstrip("\n"))
 
 
 def say_error(sentence: str) -> None:
     """Print what is wrong."""
-    err.print(f"[bold red]error:[/] {escaped(sentence)}", highlight=False, soft_wrap=True)
+    err.say(("error:", "bold red"), f" {sentence}")
 
 
 @contextmanager
@@ -190,7 +192,8 @@ def failures_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
     by_reason: dict[str, list[int]] = {}
     for trial in trials:
         if trial.state == "failed":
-            by_reason.setdefault(trial.failure or "for no stated reason", []).append(trial.number)
+            reason = shortened(trial.failure or "for no stated reason")
+            by_reason.setdefault(reason, []).append(trial.number)
     ordered = sorted(by_reason.items(), key=lambda item: -len(item[1]))
     return [{"reason": reason, "trials": numbers} for reason, numbers in ordered]
 
@@ -200,9 +203,9 @@ def print_failures(failures: list[dict[str, Any]]) -> None:
     for failure in failures[:_REASONS]:
         count = len(failure["trials"])
         which = f"trial {failure['trials'][0]}" if count == 1 else f"{count} trials"
-        err.print(f"[yellow]{which} failed[/]: {escaped(failure['reason'])}", highlight=False, soft_wrap=True)
+        err.say((f"{which} failed", "yellow"), f": {failure['reason']}")
     if len(failures) > _REASONS:
-        err.print(f"and {len(failures) - _REASONS} other reasons; ctxval export has them.", highlight=False)
+        err.say(f"and {len(failures) - _REASONS} other reasons; ctxval export has them.")
 
 
 _REASONS = 3
@@ -213,8 +216,8 @@ def print_table(rows: dict[str, Any], units: str = "") -> None:
     """Print names and values."""
     table = Table(show_header=False, box=None, pad_edge=False)
     for key, value in rows.items():
-        table.add_row(key.replace("_", " "), escaped(_text(value, units)))
-    out.print(table, highlight=False)
+        table.add_row(line(key.replace("_", " ")), line(_text(value, units)))
+    out.print(table)
 
 
 def _text(value: Any, units: str) -> str:
@@ -235,11 +238,6 @@ def _text(value: Any, units: str) -> str:
             return str(value)
 
 
-def escaped(text: str) -> str:
-    """Return a text that rich prints as it is."""
-    return text.replace("[", r"\[")
-
-
 def print_verdict(verdict: Verdict) -> None:
     """Print the answer and its reason."""
-    out.print(f"[bold]{verdict.answer}[/] against {verdict.threshold:g}: {escaped(verdict.reason)}", highlight=False)
+    out.say((verdict.answer, "bold"), f" against {verdict.threshold:g}: {verdict.reason}", wrap=True)

@@ -25,7 +25,6 @@ from ctxval.cli.base import (
     app,
     certificate_of,
     command,
-    escaped,
     out,
     print_table,
     print_verdict,
@@ -201,12 +200,12 @@ def _print_certificate(certificate: Certificate | None, verdict: Verdict | None,
     if verdict is not None:
         print_verdict(verdict)
     if certificate is None:
-        out.print(f"no certificate: {escaped(str(refusal))}", highlight=False)
+        out.say(f"no certificate: {refusal}", wrap=True)
         return
-    out.print(f"{certificate.kind}: {escaped(certificate.statement)}", highlight=False)
+    out.say(f"{certificate.kind}: {certificate.statement}", wrap=True)
     if certificate.doubt is not None:
-        out.print(f"[bold red]withdrawn[/]: {escaped(certificate.doubt)}.", highlight=False)
-    out.print("It assumes that", highlight=False)
+        out.say(("withdrawn", "bold red"), f": {certificate.doubt}.", wrap=True)
+    out.say("It assumes that")
     for assumption in certificate.assumptions:
-        out.print(f"- {escaped(assumption)};", highlight=False)
+        out.say(f"- {assumption};", wrap=True)
     print_table({**certificate.details, "trials": certificate.trials, "version": certificate.version})

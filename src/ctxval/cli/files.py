@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from ctxval.check import Finding, check_experiment
-from ctxval.cli.base import BAD_INPUT, AsJson, app, command, escaped, out
+from ctxval.cli.base import BAD_INPUT, AsJson, app, command, out
 from ctxval.config import read_settings
 from ctxval.errors import InputError
 
@@ -123,8 +123,9 @@ def init(
         raise InputError(f"{error.filename} cannot be written: {error.strerror}.") from error
     if not as_json:
         quoted = shlex.quote(str(file))
-        steps = f"next: ctxval check {quoted}\nthen: ctxval run {quoted} --until-decided"
-        out.print(escaped(f"{' and '.join(map(str, contents))}\n{steps}"), highlight=False, soft_wrap=True)
+        out.say(" and ".join(map(str, contents)))
+        out.say(f"next: ctxval check {quoted}")
+        out.say(f"then: ctxval run {quoted} --until-decided")
     return {"files": [str(path) for path in contents]}
 
 
@@ -150,5 +151,4 @@ def check(
 def _print_findings(findings: list[Finding]) -> None:
     colours = {"ok": "green", "noted": "yellow", "failed": "bold red", "skipped": "dim"}
     for finding in findings:
-        mark = f"[{colours[finding.state]}]{finding.state:<8}[/]"
-        out.print(f"{mark}{escaped(finding.check)}: {escaped(finding.text)}", highlight=False, soft_wrap=True)
+        out.say((f"{finding.state:<8}", colours[finding.state]), f"{finding.check}: {finding.text}")

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from ctxval.campaign import Campaign, OpenTrial
-from ctxval.cli.base import AsJson, app, command, escaped, out
+from ctxval.cli.base import AsJson, app, command, out
 from ctxval.config import Settings, read_settings, stored_settings
 from ctxval.errors import InputError
 from ctxval.experiment import Experiment
@@ -121,7 +121,7 @@ def tell(
     ended = opened.campaign.tell(trial, recording, distance=distance, failed=failed, start_tolerance=tolerance)
     report = _ended(ended, opened)
     if not as_json:
-        out.print(_sentence(ended, opened.experiment), highlight=False)
+        out.say(_sentence(ended, opened.experiment))
     return report
 
 
@@ -172,8 +172,8 @@ def import_runs(
     }
     if not as_json:
         for trial in new:
-            out.print(_sentence(trial, opened.experiment), highlight=False)
-        out.print(f"{len(new)} imported, {len(ended) - len(new)} were there already.", highlight=False)
+            out.say(_sentence(trial, opened.experiment))
+        out.say(f"{len(new)} imported, {len(ended) - len(new)} were there already.")
     return report
 
 
@@ -228,15 +228,15 @@ def _ended(trial: Trial, opened: _Opened) -> dict[str, Any]:
 
 def _sentence(trial: Trial, experiment: Experiment) -> str:
     if trial.distance is None:
-        return f"trial {trial.number} failed: {escaped(str(trial.failure))}"
-    return f"trial {trial.number} has the distance {trial.distance:.4g} {escaped(experiment.units)}".rstrip()
+        return f"trial {trial.number} failed: {trial.failure}"
+    return f"trial {trial.number} has the distance {trial.distance:.4g} {experiment.units}".rstrip()
 
 
 def _print_asked(report: dict[str, Any], opened: OpenTrial) -> None:
     task = ", ".join(f"{name} = {value}" for name, value in report["task"].items())
-    out.print(f"trial {opened.number}: {escaped(task)}", highlight=False, soft_wrap=True)
-    out.print(f"{', '.join(report['files'])} in {escaped(report['folder'])}", highlight=False, soft_wrap=True)
+    out.say(f"trial {opened.number}: {task}")
+    out.say(f"{', '.join(report['files'])} in {report['folder']}")
     if "controller.json" not in report["files"]:
-        out.print("its controller cannot be written to a file: only affine feedback, of LQR and iLQR, can.")
+        out.say("its controller cannot be written to a file: only affine feedback, of LQR and iLQR, can.")
     told = f"ctxval tell {shlex.quote(report['store'])} {opened.number} --trajectory run.csv"
-    out.print(f"afterwards: {escaped(told)}", highlight=False, soft_wrap=True)
+    out.say(f"afterwards: {told}")

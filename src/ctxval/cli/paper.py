@@ -45,4 +45,5 @@ def reproduce(
             on_start=lambda missing: progress.update(line, total=missing),
             on_done=lambda job: progress.update(line, advance=1, description=job.key),
         )
-    screen.print(f"table: {table}\nfigures and data: {out}", highlight=False)
+    screen.say(f"table: {table}")
+    screen.say(f"figures and data: {out}")

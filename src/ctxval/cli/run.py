@@ -22,7 +22,6 @@ from ctxval.cli.base import (
     certificate_of,
     command,
     err,
-    escaped,
     failures_of,
     hands,
     print_failures,
@@ -36,6 +35,7 @@ from ctxval.cli.certify import decide
 from ctxval.config import Settings, read_settings
 from ctxval.errors import InputError
 from ctxval.experiment import Experiment
+from ctxval.texts import reason_of
 from ctxval.truth import Truth
 from ctxval.verdict import Verdict, require_threshold
 
@@ -161,7 +161,7 @@ def _save_pictures(campaign: Campaign, experiment: Experiment, path: Path) -> li
         return _draw_pictures(campaign, experiment, path)
     except Exception as error:
         # A picture must not hide the verdict that was paid for.
-        err.print(f"no pictures: {escaped(f'{type(error).__name__}: {error}')}", highlight=False)
+        err.say(f"no pictures: {reason_of(error)}")
         return []
 
 

@@ -11,7 +11,6 @@ from ctxval.cli.base import (
     AsJson,
     app,
     command,
-    escaped,
     failures_of,
     out,
     print_failures,
@@ -21,6 +20,9 @@ from ctxval.cli.base import (
 from ctxval.errors import StoreAccessError
 from ctxval.salvage import export, salvage
 from ctxval.store import Store
+
+_SENTENCES = 20
+"""Sentences on what is damaged that are printed."""
 
 
 @app.command()
@@ -32,9 +34,10 @@ def status(
     """Say what a store holds; nothing is executed."""
     opened = Store.existing(store)
     description, trials = opened.description(), opened.trials()
-    report = {
+    search = description.get("search")
+    report: dict[str, Any] = {
         "case": description.get("name"),
-        "search": description.get("search", {}).get("type"),
+        "search": search.get("type") if isinstance(search, dict) else None,
         "seed": description.get("seed"),
         "executions": sum(trial.executed for trial in trials),
         "failed": sum(trial.state == "failed" for trial in trials),
@@ -71,8 +74,9 @@ def export_store(
         "folder": str(target),
     }
     if not as_json:
-        for sentence in found.damaged:
-            out.print(f"[yellow]not readable[/]: {escaped(sentence)}", highlight=False, soft_wrap=True)
-        what = f"{len(found.trials)} trials and {len(found.trajectories)} trajectories in {target}"
-        out.print(escaped(what), highlight=False, soft_wrap=True)
+        for sentence in found.damaged[:_SENTENCES]:
+            out.say(("not readable", "yellow"), f": {sentence}")
+        if len(found.damaged) > _SENTENCES:
+            out.say(f"and {len(found.damaged) - _SENTENCES} other things; trials.json names them.")
+        out.say(f"{len(found.trials)} trials and {len(found.trajectories)} trajectories in {target}")
     return report
