@@ -39,7 +39,7 @@ def assert_same(one: AffineFeedback, other: AffineFeedback) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("limits", [None, Limits.of(2.5, 1), Limits.of((-1 / 3, np.inf), 1)])
+@pytest.mark.parametrize("limits", [None, Limits.of(2.5, 1), Limits.of([[-1 / 3, np.inf]], 1)])
 def test_a_controller_comes_back_bit_for_bit(kind: str, limits: Limits | None, tmp_path: Path) -> None:
     path, controller = tmp_path / f"controller.{kind}", designed(limits)
     write_controller(path, controller, dt=TASK.dt, states={"angle": "rad", "rate": "rad/s"}, inputs={"torque": "N m"})
@@ -87,7 +87,7 @@ def test_a_file_says_by_itself_what_is_in_it(kind: str, tmp_path: Path) -> None:
 
 def test_json_is_json_also_with_infinite_limits(tmp_path: Path) -> None:
     path = tmp_path / "controller.json"
-    write_controller(path, designed(Limits.of((-np.inf, 1.0), 1)), dt=0.1)
+    write_controller(path, designed(Limits.of([(-np.inf, 1.0)], 1)), dt=0.1)
 
     def refuse(constant: str) -> None:
         raise AssertionError(constant)

@@ -20,7 +20,7 @@ from ctxval.check import check_experiment
 from ctxval.cli import app
 from ctxval.config import Settings, read_settings
 from ctxval.errors import CtxvalError, InputError
-from ctxval.parts import TaskTable, recorded
+from ctxval.parts import TaskTable, part, recorded
 from ctxval.testing import FaultyRig
 
 
@@ -341,3 +341,24 @@ def test_a_part_that_breaks_is_a_finding_and_no_traceback() -> None:
     assert findings(validation)["distance"][0] == "failed"
     broken = make_validation(model=lambda x, u: x * float("nan"))
     assert findings(broken)["tasks"][0] == "failed"
+
+
+@pytest.mark.parametrize(
+    ("limits", "low", "high"),
+    [
+        ("2.0", [-2, -2], [2, 2]),
+        ("{ low = 0.0, high = 8.0 }", [0, 0], [8, 8]),
+        ("{ low = [0.0, -inf], high = 8.0 }", [0, -np.inf], [8, 8]),
+        ("[[0.0, 8.0], [0.0, 8.0]]", [0, 0], [8, 8]),
+    ],
+)
+def test_limits_are_written_in_a_file_as_in_python(limits: str, low: list[float], high: list[float]) -> None:
+    table = tomllib.loads(f'type = "LQR"\nQ = [1.0]\nR = [1.0, 1.0]\nlimits = {limits}')
+    made = part("synthesizer", table)
+    assert (made.limits.low.tolist(), made.limits.high.tolist()) == (low, high)
+
+
+@pytest.mark.parametrize("kind", ["LQR", "ILQR", "StationaryLQR"])
+def test_a_flat_list_of_limits_in_a_file_is_refused(kind: str) -> None:
+    with pytest.raises(InputError, match=r"\[1\.0, 8\.0\] can be read in two ways: write \{ low = 1\.0, high = 8\.0"):
+        part("synthesizer", {"type": kind, "Q": [1.0], "R": [1.0, 1.0], "limits": [1.0, 8.0]})

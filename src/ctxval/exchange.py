@@ -89,7 +89,8 @@ def write_controller(
         "states": as_finite("the controller's states", controller.states[:horizon]),
     }
     if controller.limits is not None:
-        arrays |= {"low": controller.limits.low, "high": controller.limits.high}
+        limits = Limits.of(controller.limits, m)
+        arrays |= {"low": limits.low, "high": limits.high}
     _write(Path(path), about, arrays)
 
 
@@ -177,7 +178,7 @@ def _controller(content: Mapping[str, Any]) -> ControllerFile:
         raise InputError(f"it says that its horizon is {str(content['horizon'])[:40]}, its gains are {horizon}.")
     limits = None
     if content.get("low") is not None or content.get("high") is not None:
-        limits = Limits.of((_bound(content["low"], -np.inf), _bound(content["high"], np.inf)), m)
+        limits = Limits.of(Limits(_bound(content["low"], -np.inf), _bound(content["high"], np.inf)), m)
     return ControllerFile(
         AffineFeedback(gains, inputs, states, limits),
         _seconds(content["dt"]),

@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear, minimize
 
 from ctxval import Task, testing
 from ctxval.arrays import Array
-from ctxval.controllers import ILQR, LQR
+from ctxval.controllers import ILQR, LQR, Limits
 from ctxval.describe import describe
 from ctxval.errors import InputError
 from ctxval.models import Function, Linear
@@ -51,7 +51,7 @@ def test_ilqr_on_a_linear_model_finds_the_bounded_optimum(n: int, m: int, seed: 
     factor = rng.normal(size=(m, m))
     weights = np.eye(n), factor @ factor.T + 0.1 * np.eye(m), 3 * np.eye(n)
     low, high = -rng.uniform(0.05, 0.2, m), rng.uniform(0.05, 0.2, m)
-    solution = ILQR(*weights, limits=(low, high), iterations=200, tolerance=1e-13).solve(task, model)
+    solution = ILQR(*weights, limits=Limits(low, high), iterations=200, tolerance=1e-13).solve(task, model)
     best = bounded_optimum(model, task, weights, low, high)
     assert ((best == low) | (best == high)).any()
     assert solution.converged
@@ -85,7 +85,7 @@ def test_ilqr_on_a_nonlinear_model_is_no_worse_than_a_bounded_optimiser(start: f
     assert solution.cost == pytest.approx(cost(solution.controller.inputs, task))
 
 
-@pytest.mark.parametrize("synthesizer", [LQR(Q, R, Q_FINAL, limits=3.0), ILQR(Q, R, Q_FINAL, limits=(-3.0, 2.0))])
+@pytest.mark.parametrize("synthesizer", [LQR(Q, R, Q_FINAL, limits=3.0), ILQR(Q, R, Q_FINAL, limits=[[-3.0, 2.0]])])
 def test_inputs_stay_within_the_limits_on_model_and_system(synthesizer: Any) -> None:
     tasks = Task([np.linspace(-0.8, 0.8, 5), 0.3], goal=[0.0, 0.0], horizon=20, dt=0.05)
     testing.check_synthesizer(synthesizer, tasks, PENDULUM)
@@ -114,13 +114,13 @@ def test_the_controller_of_one_task_keeps_the_limits() -> None:
 
 def test_limits_that_exclude_zero_are_kept_from_the_first_iterate_on() -> None:
     task = Task([0.5, 0.0], horizon=15, dt=0.05)
-    inputs = ILQR(Q, R, limits=(0.5, 2.0)).solve(task, PENDULUM).controller.inputs
+    inputs = ILQR(Q, R, limits={"low": 0.5, "high": 2.0}).solve(task, PENDULUM).controller.inputs
     assert ((inputs >= 0.5) & (inputs <= 2.0)).all()
 
 
 @pytest.mark.parametrize("kind", [LQR, ILQR])
 def test_limits_are_checked_and_described(kind: Any) -> None:
     with pytest.raises(InputError, match="low < high"):
-        kind(Q, R, limits=(1.0, -1.0))
+        kind(Q, R, limits=[(1.0, -1.0)])
     assert describe(kind(Q, R, limits=2.0))["limits"]["high"] == [2.0]
     assert "limits" not in describe(kind(Q, R))

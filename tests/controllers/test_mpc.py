@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear, minimize
 
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, searches, systems
 from ctxval.arrays import Array
-from ctxval.controllers import LQR, MPC
+from ctxval.controllers import LQR, MPC, Limits
 from ctxval.errors import DesignError, InputError, ShapeError
 from ctxval.models import Function, Linear
 from ctxval.rollout import rollout
@@ -21,6 +21,7 @@ pytest.importorskip("casadi")
 
 CART = Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], [0.0, 0.01])
 TASK = Task([1.0, 0.0], goal=[0.0, 0.0], horizon=30, dt=0.1)
+SLOW = [[-np.inf, np.inf], [-0.4, 0.4]]
 WEIGHTS: tuple[Any, ...] = ([10.0, 1.0], [0.1], [50.0, 5.0])
 
 
@@ -82,7 +83,7 @@ def test_with_input_limits_it_is_the_bounded_optimum(limit: float) -> None:
 
 def test_state_limits_are_kept_and_cost_something() -> None:
     free = rollout(CART.step, MPC(*WEIGHTS, steps=20).design(TASK, CART), TASK)
-    kept = rollout(CART.step, MPC(*WEIGHTS, steps=20, state_limits=[np.inf, 0.4]).design(TASK, CART), TASK)
+    kept = rollout(CART.step, MPC(*WEIGHTS, steps=20, state_limits=SLOW).design(TASK, CART), TASK)
     assert free.states[:, 1].min() < -0.8
     assert kept.states[:, 1].min() >= -0.4 - 1e-9
     assert kept.states[:, 1].min() < -0.39  # the limit is used
@@ -90,11 +91,11 @@ def test_state_limits_are_kept_and_cost_something() -> None:
 
 
 def test_limits_that_cannot_be_kept_are_an_error_unless_soft() -> None:
-    hard = MPC(*WEIGHTS, steps=8, limits=1.0, state_limits=[np.inf, 0.4]).design(TASK, CART)
+    hard = MPC(*WEIGHTS, steps=8, limits=1.0, state_limits=SLOW).design(TASK, CART)
     fast = np.array([1.0, -2.0])
     with pytest.raises(DesignError, match=r"no inputs at step 3 that keep the prediction from \[1\.0, -2\.0\] within"):
         hard(3, fast)
-    soft = MPC(*WEIGHTS, steps=8, limits=1.0, state_limits=[np.inf, 0.4], violation_cost=1e4).design(TASK, CART)
+    soft = MPC(*WEIGHTS, steps=8, limits=1.0, state_limits=SLOW, violation_cost=1e4).design(TASK, CART)
     np.testing.assert_allclose(soft(3, fast), [1.0], atol=1e-9)  # brakes as hard as it can
     slow = np.array([0.3, -0.1])
     np.testing.assert_allclose(soft(3, slow), hard(3, slow), atol=1e-6)
@@ -117,7 +118,9 @@ def test_a_nonlinear_plan_is_a_bounded_optimum_of_the_model() -> None:
 
 def test_a_nonlinear_plan_keeps_state_limits() -> None:
     task = Task([0.6, 0.0], goal=[0.0, 0.0], horizon=20, dt=0.05)
-    controller = MPC(*WEIGHTS, steps=15, limits=8.0, state_limits=[np.inf, 0.9]).design(task, PENDULUM)
+    controller = MPC(*WEIGHTS, steps=15, limits=8.0, state_limits=[[-np.inf, np.inf], [-0.9, 0.9]]).design(
+        task, PENDULUM
+    )
     states = controller.plan(0, task.initial_state)[0]
     assert np.abs(states[:, 1]).max() <= 0.9 + 1e-6
     assert np.abs(rollout(PENDULUM.step, controller, task).states[:, 1]).max() <= 0.9 + 1e-6
@@ -155,7 +158,7 @@ def test_what_cannot_be_used_is_refused() -> None:
     with pytest.raises(InputError, match="violation_cost must be a positive number or None, got -1"):
         MPC(*WEIGHTS, steps=3, violation_cost=-1)
     with pytest.raises(ShapeError, match=r"limits must be numbers or have shape \(2,\)"):
-        MPC(*WEIGHTS, steps=3, state_limits=[1.0, 2.0, 3.0])
+        MPC(*WEIGHTS, steps=3, state_limits=[[-1, 1]] * 3)
     with pytest.raises(ShapeError, match="one task at a time"):
         MPC(*WEIGHTS, steps=3).design(Task(np.zeros((2, 2)), horizon=3, dt=0.1), CART)
     exploding = Function(lambda x, u: 1e200 * (x + 1) ** 2 + u, vectorized=True)

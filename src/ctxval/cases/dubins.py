@@ -185,7 +185,7 @@ def tracking(seed: int, settings: Settings, distance: distances.Distance) -> Val
         synthesizer=controllers.LQR(
             [1.0, 1.0, settings.heading_weight],
             [settings.input_weight] * 2,
-            limits=None if np.isinf(settings.limit) else ([-settings.limit] * 2, [settings.limit] * 2),
+            limits=None if np.isinf(settings.limit) else settings.limit,
         ),
         distance=distance,
     )

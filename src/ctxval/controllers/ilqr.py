@@ -56,11 +56,12 @@ class ILQR:
         Q_final: weight of the last state; Q by default.
         iterations: the most steps for one task.
         tolerance: stop where the next step would lower the cost by less than this share of it.
-        limits: of the inputs, ``(low, high)`` or ``high`` for ``(-high, high)``: numbers, or one each input.
+        limits: of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or rows
+            ``[low, high]``, one for each input.
 
     Raises:
         InputError: the weights are not positive semidefinite, R not positive definite, iterations or tolerance not
-            positive, or limits not low < high.
+            positive, or limits not low < high or ambiguous.
     """
 
     batched = True

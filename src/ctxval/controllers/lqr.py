@@ -26,10 +26,12 @@ class LQR:
         Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
         R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``.
         Q_final: weight of the last state; Q by default.
-        limits: of the inputs, ``(low, high)`` or ``high`` for ``(-high, high)``: numbers, or one each input.
+        limits: of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or rows
+            ``[low, high]``, one for each input.
 
     Raises:
-        InputError: the weights are not positive semidefinite, R not positive definite, or limits not low < high.
+        InputError: the weights are not positive semidefinite, R not positive definite, or the limits
+            are not low < high or ambiguous.
     """
 
     batched = True
@@ -67,10 +69,12 @@ class StationaryLQR:
     Args:
         Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
         R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``.
-        limits: of the inputs, ``(low, high)`` or ``high`` for ``(-high, high)``: numbers, or one each input.
+        limits: of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or rows
+            ``[low, high]``, one for each input.
 
     Raises:
-        InputError: the weights are not positive semidefinite, R not positive definite, or limits not low < high.
+        InputError: the weights are not positive semidefinite, R not positive definite, or the limits
+            are not low < high or ambiguous.
     """
 
     batched = True

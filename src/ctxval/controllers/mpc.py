@@ -38,7 +38,8 @@ class MPC:
         R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``.
         Q_final: weight of the last predicted state; Q by default.
         steps: how many steps it looks ahead.
-        limits: of the inputs, ``(low, high)`` or ``high`` for ``(-high, high)``: numbers, or one each input.
+        limits: of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or rows
+            ``[low, high]``, one for each input.
         state_limits: likewise; infinite where there are none.
         violation_cost: cost of exceeding the state limits by 1, for each predicted step; None where they are hard.
         iterations: quadratic programs for one input, at most.

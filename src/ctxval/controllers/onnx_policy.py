@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval.arrays import Array
-from ctxval.controller import Limits, LimitsLike
+from ctxval.controller import Limits, LimitsLike, describe_limits, given_limits
 from ctxval.errors import InputError
 from ctxval.model import Model
 from ctxval.onnx_network import OnnxNetwork
@@ -31,10 +31,11 @@ class OnnxPolicy:
             the states by default.
         scale: what the network's outputs are multiplied by, a number or ``(m,)``: a policy in ``[-1, 1]`` drives a
             motor of 5 N m with a scale of 5.
-        limits: inputs are clipped to ``(low, high)``, or to ``(-high, high)``: numbers, or one each input.
+        limits: inputs are clipped to them: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and
+            high, or rows ``[low, high]``, one for each input.
 
     Raises:
-        InputError: onnxruntime is not installed, or this is no network with one input.
+        InputError: onnxruntime is not installed, this is no network with one input, or the limits cannot be used.
     """
 
     batched = True
@@ -50,7 +51,7 @@ class OnnxPolicy:
         self.network = OnnxNetwork(source)
         self.observe = observe
         self.scale = scale
-        self.limits = limits
+        self.limits = given_limits(limits)
         if len(self.network.widths) != 1:
             raise InputError(
                 f"a policy must have one input, the observations; the network has {', '.join(self.network.names)}."
@@ -59,6 +60,11 @@ class OnnxPolicy:
     def design(self, task: Task, model: Model) -> BoundOnnxPolicy:
         """Return the policy bound to the task."""
         return BoundOnnxPolicy(self, task)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this synthesizer in a store."""
+        fields = {name: getattr(self, name) for name in ("network", "observe", "scale")}
+        return {**fields, "limits": describe_limits(self.limits)}
 
 
 @dataclass(frozen=True, eq=False)
