@@ -112,3 +112,27 @@ def test_algebra_is_bound_to_one_thread_and_released_again() -> None:
         with single_threaded():
             assert threads() == {1}
         assert threads() == before == {2}
+
+
+HALF = np.ma.masked_array([1.0, 2.0], mask=[False, True])
+
+
+@pytest.mark.parametrize("value", [HALF, [HALF, HALF], ([1.0], [HALF]), np.ma.masked, [1.0, np.ma.masked]])
+def test_what_is_masked_is_refused_and_not_taken_from_below_the_mask(value: object) -> None:
+    with pytest.raises(InputError, match=r"^x must have a number everywhere, and some are masked"):
+        as_floats("x", value)  # type: ignore[arg-type]
+
+
+def test_a_masked_array_without_a_masked_number_is_an_array() -> None:
+    assert as_floats("x", np.ma.masked_array([1.0, 2.0])).tolist() == [1, 2]
+    assert type(as_floats("x", np.ma.masked_array([1.0], mask=[False]))) is np.ndarray
+
+
+def test_messages_about_large_arrays_stay_short() -> None:
+    large = np.zeros((300, 300))
+    large[7, 3] = np.nan
+    with pytest.raises(InputError, match=r"^x must be finite, got nan at \[7, 3\]\.$"):
+        as_finite("x", large)
+    with pytest.raises(InputError) as caught:
+        as_floats("x", [["one"] * 10_000] * 100)
+    assert len(str(caught.value)) < 5000

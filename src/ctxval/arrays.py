@@ -6,6 +6,7 @@ Small dense algebra is slower on many BLAS threads, and its last bits then depen
 from __future__ import annotations
 
 import functools
+import reprlib
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -20,19 +21,37 @@ Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
 ArrayLike = npt.ArrayLike
 
+_LISTED = 100
+"""Numbers that a message lists."""
+
+_SHOWN = reprlib.Repr()
+_SHOWN.maxlist = _SHOWN.maxtuple = 20
+_SHOWN.maxstring = _SHOWN.maxother = 200
+
 
 def as_floats(name: str, value: ArrayLike) -> Array:
     """Return ``value`` as a float64 array.
 
     Raises:
-        InputError: it is not numeric.
+        InputError: it is not numeric, or some of it is masked.
     """
+    if _is_masked(value):
+        raise InputError(
+            f"{name} must have a number everywhere, and some are masked; fill them in, or write NaN for them."
+        )
     try:
         if np.iscomplexobj(value):
             raise TypeError
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be numbers, got {value!r}.") from error
+        raise InputError(f"{name} must be numbers, got {_SHOWN.repr(value)}.") from error
+
+
+def _is_masked(value: object) -> bool:
+    """Return whether numbers are masked, of which numpy would silently take what is below the mask."""
+    if isinstance(value, list | tuple):
+        return any(_is_masked(item) for item in value if isinstance(item, list | tuple | np.ma.MaskedArray))
+    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
 
 
 def as_finite(name: str, value: ArrayLike) -> Array:
@@ -42,8 +61,12 @@ def as_finite(name: str, value: ArrayLike) -> Array:
         InputError: it is not numeric, or not finite.
     """
     array = as_floats(name, value)
-    if not np.isfinite(array).all():
-        raise InputError(f"{name} must be finite, got {array.tolist()}.")
+    finite = np.isfinite(array)
+    if not finite.all():
+        if array.size <= _LISTED:
+            raise InputError(f"{name} must be finite, got {array.tolist()}.")
+        place = tuple(np.argwhere(~finite)[0].tolist())
+        raise InputError(f"{name} must be finite, got {array[place]} at {list(place)}.")
     return array
 
 

@@ -12,13 +12,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, get_type_hints
 
-import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
 
 from ctxval import controllers, distances, models, systems
-from ctxval.errors import CtxvalError, InputError, UnknownNameError
+from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
+from ctxval.files import read_bytes
+from ctxval.npz import Archive
 from ctxval.space import Parameters, TaskSpace
 from ctxval.task import Task
 from ctxval.texts import reason_of
@@ -136,14 +137,13 @@ def _transitions(path: Path) -> Transitions:
     if path.suffix != ".npz":
         return Trajectory.from_csv(path).transitions()
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            if "x_next" in arrays:
-                return Transitions(arrays["x"], arrays["u"], arrays["x_next"])
-    except InputError:
+        arrays = Archive(read_bytes(path))
+        if "x_next" in arrays:
+            return Transitions(*(arrays.numbers(name) for name in ("x", "u", "x_next")))
+    except ShapeError:
         raise
-    except Exception as error:
-        # What numpy and zipfile raise for damaged bytes is a long list.
-        raise InputError(f"{path} cannot be read as recorded data: {type(error).__name__}: {error}.") from error
+    except InputError as error:
+        raise InputError(f"{path} cannot be read as recorded data: {error}.") from error
     return Trajectory.from_npz(path).transitions()
 
 

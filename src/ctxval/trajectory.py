@@ -5,9 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import re
-import zipfile
-import zlib
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,12 +14,11 @@ import numpy as np
 
 from ctxval.arrays import Array, Mask, as_floats
 from ctxval.errors import InputError, ShapeError
+from ctxval.files import MOST_BYTES, csv_rows, read_bytes
+from ctxval.npz import Archive
 from ctxval.texts import guarded, unguarded, visible
 
 COMPLETE = "complete"
-
-_UNREADABLE = (OSError, EOFError, ValueError, TypeError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
-"""What numpy and zipfile raise for damaged or foreign bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,18 +80,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         for name in ("times", "states", "inputs"):
             object.__setattr__(self, name, as_floats(name, getattr(self, name)))
-        if (
-            self.times.ndim != 1
-            or self.states.ndim < 2
-            or self.inputs.ndim != self.states.ndim
-            or self.states.shape[:-2] != self.inputs.shape[:-2]
-            or self.states.shape[-2] != len(self.times)
-            or self.inputs.shape[-2] != len(self.times) - 1
-        ):
-            raise ShapeError(
-                "a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), "
-                f"got {self.times.shape}, {self.states.shape} and {self.inputs.shape}."
-            )
+        _require_fitting(self.times.shape, self.states.shape, self.inputs.shape)
 
     @property
     def horizon(self) -> int:
@@ -139,24 +126,37 @@ class Trajectory:
         return buffer.getvalue()
 
     @staticmethod
-    def from_npz(source: bytes | str | Path) -> Trajectory:
+    def from_npz(
+        source: bytes | str | Path, *, shape: tuple[int, int] | None = None, most: int = MOST_BYTES
+    ) -> Trajectory:
         """Read a trajectory from NPZ bytes or an NPZ file; no code in it is ever run.
 
+        Sizes are compared before any number is read.
+
+        Args:
+            source: the bytes, or a regular file.
+            shape: that the states of a complete trajectory must have, ``(H + 1, n)``; None for any.
+            most: bytes that the file, and the numbers in it, may have.
+
         Raises:
-            InputError: it is not such a file.
+            InputError: it is not such a file, or too large.
+            ShapeError: its arrays do not fit together, or to ``shape``.
         """
+        name = "these bytes" if isinstance(source, bytes) else str(source)
         try:
-            # Read here, as numpy leaves a damaged file open.
-            content = source if isinstance(source, bytes) else Path(source).read_bytes()
-            with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-                ended = str(arrays["ended"]) if "ended" in arrays else COMPLETE
-                return Trajectory(arrays["times"], arrays["states"], arrays["inputs"], ended)
-        except _UNREADABLE as error:
-            if isinstance(error, InputError):
-                raise
-            name = "these bytes" if isinstance(source, bytes) else str(source)
+            arrays = Archive(source if isinstance(source, bytes) else read_bytes(source, most), most)
+            ended = arrays.text("ended") if "ended" in arrays else COMPLETE
+            shapes = [arrays.shape(part) for part in _ARRAYS]
+            _require_fitting(*shapes)
+            if shape is not None and ended == COMPLETE and shapes[1] != shape:
+                raise ShapeError(f"the trajectory must have states of shape {shape}, got {shapes[1]}.")
+            times, states, inputs = (arrays.numbers(part) for part in _ARRAYS)
+            return Trajectory(times, states, inputs, ended)
+        except ShapeError:
+            raise
+        except InputError as error:
             raise InputError(
-                f"{name} cannot be read as a trajectory: an NPZ with times, states and inputs is needed."
+                f"{name} cannot be read as a trajectory: an NPZ with times, states and inputs is needed; {error}."
             ) from error
 
     def to_csv(
@@ -180,7 +180,11 @@ class Trajectory:
 
     @staticmethod
     def from_csv(
-        path: str | Path, *, states: Sequence[str] | None = None, inputs: Sequence[str] | None = None
+        path: str | Path,
+        *,
+        states: Sequence[str] | None = None,
+        inputs: Sequence[str] | None = None,
+        most_rows: int | None = None,
     ) -> Trajectory:
         """Read one trajectory from CSV with the columns ``t, x0.., u0..``, or with named ones.
 
@@ -191,27 +195,24 @@ class Trajectory:
             path: the file.
             states, inputs: names of the columns, with units or without; those that are numbered are taken where none of
                 the names is there.
+            most_rows: more rows than these are refused before they are read; None for as many as fit.
 
         Raises:
-            InputError: the file cannot be read, a column is missing or has another unit, or a cell is no number.
+            InputError: the file cannot be read, is no regular file or too large, a column is missing or has another
+                unit, or a cell is no number.
         """
-        lines, rows = _read_csv(path)
-        if len(rows) < 2:
-            raise InputError(f"{path} must have a header and at least two rows.")
-        columns = {_bare(name): name for name in rows[0] if name and _bare(name)}
+        rows = _csv_rows(path)
+        header = [unguarded(name) for name in next(rows, (0, []))[1]]
+        columns = {_bare(name): name for name in header if _bare(name)}
         # Time stands in its own column; a state may be called "time" all the same.
         time = columns.get("t") or columns.get("time")
         x, u = _chosen(path, columns, "x", states), _chosen(path, columns, "u", inputs)
-        if time is None or not x:
+        if header and (time is None or not x):
             raise InputError(
                 f"{path} must have the columns t, {', '.join(states or ('x0', '...'))}, "
-                f"{', '.join(inputs or ('u0', '...'))}; it has {', '.join(map(str, rows[0]))}."
+                f"{', '.join(inputs or ('u0', '...'))}; it has {_listed(header)}."
             )
-        return Trajectory(
-            _column_block(path, lines, rows, [time])[:, 0],
-            _column_block(path, lines, rows, x),
-            _column_block(path, lines, rows[:-1], u),
-        )
+        return _Columns(path, header, [time or "", *x], u).read(rows, most_rows)
 
     def resampled(self, times: Array) -> Trajectory:
         """Return one recorded trajectory at other times after its first: states between, inputs as last applied.
@@ -260,6 +261,25 @@ def require_times(trajectory: Trajectory, times: Array) -> None:
         )
 
 
+_ARRAYS = ("times", "states", "inputs")
+
+
+def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tuple[int, ...]) -> None:
+    """Check that the shapes are those of one trajectory."""
+    if (
+        len(times) != 1
+        or len(states) < 2
+        or len(inputs) != len(states)
+        or states[:-2] != inputs[:-2]
+        or states[-2] != times[0]
+        or inputs[-2] != times[0] - 1
+    ):
+        raise ShapeError(
+            "a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), "
+            f"got {times}, {states} and {inputs}."
+        )
+
+
 def _column_names(letter: str, names: Sequence[str] | None, count: int) -> list[str]:
     if names is None:
         return [f"{letter}{i}" for i in range(count)]
@@ -268,16 +288,58 @@ def _column_names(letter: str, names: Sequence[str] | None, count: int) -> list[
     return list(names)
 
 
-def _read_csv(path: str | Path) -> tuple[list[int], list[dict[str, str]]]:
-    """Return the rows, and the line of the file at which each ends."""
+def _csv_rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            reader.fieldnames = [unguarded(name) for name in reader.fieldnames or ()]
-            numbered = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        yield from csv_rows(path)
+    except InputError as error:
         raise InputError(f"{path} cannot be read as CSV: {error}.") from error
-    return [line for line, _ in numbered], [row for _, row in numbered]
+
+
+class _Columns:
+    """The columns of a file that are wanted, whose cells become numbers row by row.
+
+    Args:
+        path: for messages.
+        header: the names of all columns.
+        always: names of the columns that have a number in every row.
+        held: names of those that need none in the last row.
+    """
+
+    def __init__(self, path: str | Path, header: list[str], always: list[str], held: list[str]) -> None:
+        self.path, self.always, self.held = path, always, held
+        self.places = {name: place for place, name in enumerate(header)}
+
+    def read(self, rows: Iterator[tuple[int, list[str]]], most: int | None) -> Trajectory:
+        always, held, count = array("d"), array("d"), 0
+        before: tuple[int, list[str]] | None = None
+        for line, row in rows:
+            if before is not None:
+                held.extend(self._numbers(*before, self.held))
+            always.extend(self._numbers(line, row, self.always))
+            before, count = (line, row), count + 1
+            if most is not None and count > most:
+                raise InputError(f"{self.path} must have {most} rows below its header, and has more.")
+            if 8 * (len(always) + len(held)) > MOST_BYTES:
+                raise InputError(f"{self.path} has too many numbers: {MOST_BYTES} bytes may be read.")
+        if count < 2:
+            raise InputError(f"{self.path} must have a header and at least two rows.")
+        block = np.array(always).reshape(count, -1)
+        return Trajectory(block[:, 0], block[:, 1:], np.array(held).reshape(count - 1, len(self.held)))
+
+    def _numbers(self, line: int, row: list[str], names: list[str]) -> Iterator[float]:
+        for name in names:
+            place = self.places[name]
+            cell = row[place] if place < len(row) else None
+            try:
+                yield float(cell or "")
+            except ValueError:
+                shown = repr(cell if cell is None else cell[:60])
+                raise InputError(f"{self.path}, line {line}: {name} must be a number, got {shown}.") from None
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names for a message, not more of them than can be read."""
+    return ", ".join(name[:60] for name in names[:20]) + (", ..." if len(names) > 20 else "")
 
 
 def _bare(name: str) -> str:
@@ -292,7 +354,7 @@ def _chosen(path: str | Path, columns: dict[str, str], letter: str, names: Seque
         return [columns[name] for name in _numbered_columns(columns, letter)]
     missing = [name for name in named if name not in columns]
     if missing:
-        raise InputError(f"{path} has no column {missing[0]}; there are {', '.join(columns)}.")
+        raise InputError(f"{path} has no column {missing[0]}; there are {_listed(list(columns))}.")
     for wanted in names or ():
         _require_unit(path, columns[_bare(wanted)], wanted)
     return [columns[name] for name in named]
@@ -317,16 +379,5 @@ def _numbered_columns(columns: dict[str, str], letter: str) -> list[str]:
     names = [f"{letter}{i}" for i in range(len(found))]
     missing = [name for name in names if name not in columns]
     if missing:
-        raise InputError(f"the column {missing[0]} is missing; there are {', '.join(found)}.")
+        raise InputError(f"the column {missing[0]} is missing; there are {_listed(found)}.")
     return names
-
-
-def _column_block(path: str | Path, lines: list[int], rows: list[dict[str, str]], names: list[str]) -> Array:
-    block = np.empty((len(rows), len(names)))
-    for i, row in enumerate(rows):
-        for j, name in enumerate(names):
-            try:
-                block[i, j] = float(row[name])
-            except (TypeError, ValueError):
-                raise InputError(f"{path}, line {lines[i]}: {name} must be a number, got {row[name]!r}.") from None
-    return block

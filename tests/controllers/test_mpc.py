@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear, minimize
 
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, searches, systems
 from ctxval.arrays import Array
-from ctxval.controllers import LQR, MPC, Limits
+from ctxval.controllers import LQR, MPC
 from ctxval.errors import DesignError, InputError, ShapeError
 from ctxval.models import Function, Linear
 from ctxval.rollout import rollout
