@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import ctypes
 import os
 import shutil
 import subprocess
@@ -20,11 +21,13 @@ from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances
 from ctxval.arrays import Array
 from ctxval.controller import AffineFeedback
 from ctxval.errors import ExecutionError, InputError
-from ctxval.systems import Subprocess, guard
+from ctxval.systems import Subprocess, supervised
 from ctxval.systems import subprocess as adapter
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.05]])
 TASK = Task([1.0, -0.5], goal=[0.2, 0.0], horizon=20, dt=0.1)
+
+LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs a child subreaper")
 
 # A rig's program, with nothing of ctxval in it.
 RIG = """
@@ -125,7 +128,10 @@ def test_names_and_units_go_into_the_files_and_folders_can_be_kept(tmp_path: Pat
         ("import sys; sys.exit(7)", "ended with status 7: nothing on stderr$"),
         ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "ended by SIGKILL: nothing on stderr"),
         ("pass", r"wrote neither trajectory\.npz nor trajectory\.csv"),
-        ("import sys; open(sys.argv[-1] + '/trajectory.npz', 'w').write('junk')", "cannot be used: these bytes"),
+        (
+            "import sys; open(sys.argv[-1] + '/trajectory.npz', 'w').write('junk')",
+            r"cannot be used: .*trajectory\.npz cannot be read",
+        ),
         ("import sys; open(sys.argv[-1] + '/trajectory.csv', 'w').write('a,b\\n1,2\\n3,4\\n')", "columns t, x0"),
         (RIG.replace('task["horizon"]', "5"), r"states of shape \(21, 2\), got \(6, 2\)"),
         (RIG.replace('t * task["dt"]', "t * 0.2"), r"steps of 0\.1 s: time 20 must be 2 s after the first, got 4 s"),
@@ -148,7 +154,7 @@ def test_no_damage_of_a_trajectory_gives_anything_but_a_failed_execution(kind: s
             broken[position] = rng.integers(256)
         path.write_bytes(bytes(broken[: rng.integers(1, len(whole) + 1)] if rng.random() < 0.3 else broken))
         with contextlib.suppress(ExecutionError):
-            adapter._of_task(adapter._trajectory(tmp_path), TASK)
+            adapter._of_task(adapter._trajectory(tmp_path, TASK), TASK)
 
 
 def test_executions_run_side_by_side(tmp_path: Path) -> None:
@@ -200,16 +206,6 @@ def test_a_command_ends_with_a_campaign_that_is_killed(workers: int, tmp_path: P
     assert [trial.distance for trial in resumed.run(6).trials] == [trial.distance for trial in whole.trials]
 
 
-def test_a_guard_that_is_killed_is_replaced(tmp_path: Path) -> None:
-    system = python(tmp_path, RIG)
-    expected = system.execute(designed(), TASK).states
-    first = guard._guards[os.getpid()]
-    first.kill()
-    first.wait()
-    np.testing.assert_array_equal(system.execute(designed(), TASK).states, expected)
-    assert guard._guards[os.getpid()] is not first
-
-
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
 @pytest.mark.parametrize(
     ("end", "sentence"), [("time.sleep(60)", "did not end within 1 s and was killed"), ("sys.exit(3)", "status 3")]
@@ -222,20 +218,172 @@ def test_whatever_the_command_started_ends_with_it(end: str, sentence: str, tmp_
     assert gone(int((tmp_path / "pid").read_text()))
 
 
-def test_the_group_is_killed_when_we_are_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+# It leaves its session, so its group, and loses its parent; then it says who it is.
+ESCAPE = """
+import os, pathlib, sys, time
+if os.fork() == 0:
+    os.setsid()
+    if os.fork() == 0:
+        os.setsid()
+        mark = pathlib.Path(sys.argv[1]) / f"{os.getpid()}.escaped"
+        mark.touch()
+        time.sleep(60)
+    os._exit(0)
+os.wait()
+while not list(pathlib.Path(sys.argv[1]).glob("*.escaped")):
+    time.sleep(0.005)
+"""
+
+
+def escaped(folder: Path, count: int = 1) -> list[int]:
+    deadline = time.monotonic() + 30
+    while len(found := list(folder.glob("*.escaped"))) < count and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return [int(path.stem) for path in found]
+
+
+@LINUX
+@pytest.mark.parametrize("end", ["", "sys.exit(3)", "time.sleep(60)", "os.kill(os.getpid(), 9)"])
+def test_what_left_the_group_ends_with_the_command(end: str, tmp_path: Path) -> None:
+    with pytest.raises(ExecutionError, match=r"neither|status 3|not end within 1 s|SIGKILL"):
+        python(tmp_path, ESCAPE + end, str(tmp_path), timeout=1).execute(designed(), TASK)
+    (pid,) = escaped(tmp_path)
+    assert gone(pid)
+
+
+@LINUX
+def test_many_that_have_left_the_group_end_too(tmp_path: Path) -> None:
+    code = "import os, sys\nfor _ in range(3):\n    os.fork()\n" + ESCAPE + "time.sleep(60)"
+    with pytest.raises(ExecutionError, match="not end within 1 s"):
+        python(tmp_path, code, str(tmp_path), timeout=1).execute(designed(), TASK)
+    assert all(gone(pid) for pid in escaped(tmp_path, 8))
+
+
+CAMPAIGN = """
+import sys
+sys.path[:0] = {path!r}
+from pathlib import Path
+from test_subprocess import *
+python(Path({folder!r}), ESCAPE + "time.sleep(60)", {folder!r}).execute(designed(), TASK)
+"""
+
+
+@LINUX
+def test_what_left_the_group_ends_with_a_process_that_is_killed(tmp_path: Path) -> None:
+    code = CAMPAIGN.format(path=sys.path, folder=str(tmp_path))
+    campaign = subprocess.Popen([sys.executable, "-c", code], cwd=Path(__file__).parent)
+    (pid,) = escaped(tmp_path)
+    campaign.kill()
+    campaign.wait()
+    assert gone(pid)
+
+
+@LINUX
+def test_the_process_itself_adopts_nobody(tmp_path: Path) -> None:
+    python(tmp_path, RIG).execute(designed(), TASK)
+    adopts = ctypes.c_int(-1)
+    assert ctypes.CDLL(None).prctl(37, ctypes.byref(adopts), 0, 0, 0) == 0  # PR_GET_CHILD_SUBREAPER
+    assert adopts.value == 0
+
+
+@LINUX
+@pytest.mark.parametrize("signal_", ["SIGKILL", "SIGSTOP"])
+def test_a_supervisor_that_is_killed_or_stopped_takes_its_command_with_it(
+    signal_: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervised, "_PATIENCE", 0.2)
+    code = SPAWN + f"import os, signal; os.kill(os.getppid(), signal.{signal_}); time.sleep(60)"
+    with pytest.raises(ExecutionError, match=r"the process that watches the command was killed|did not end within 2 s"):
+        python(tmp_path, code, str(tmp_path), timeout=2).execute(designed(), TASK)
+    assert gone(int((tmp_path / "pid").read_text()))
+
+
+def test_all_is_killed_when_we_are_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pids = []
 
-    def interrupted(self: Any, timeout: Any = None) -> int:
-        if timeout is not None:
-            pids.append(self.pid)
-            raise KeyboardInterrupt
-        return original(self)
+    def interrupted(stdout: Any, timeout: float) -> bool:
+        while not (tmp_path / "pid").exists() or not (text := (tmp_path / "pid").read_text()):
+            time.sleep(0.005)
+        pids.append(int(text))
+        raise KeyboardInterrupt
 
-    original = subprocess.Popen.wait
-    monkeypatch.setattr(subprocess.Popen, "wait", interrupted)
+    monkeypatch.setattr(supervised, "_says_something", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        python(tmp_path, "import time; time.sleep(60)").execute(designed(), TASK)
+        python(tmp_path, SPAWN + "time.sleep(60)", str(tmp_path)).execute(designed(), TASK)
     assert gone(pids[0])
+
+
+@pytest.mark.skipif(shutil.which("false") is None, reason="no false")
+def test_the_status_of_the_shortest_command_is_never_lost() -> None:
+    system = Subprocess("false", timeout=30)
+    for _ in range(30):
+        with pytest.raises(ExecutionError, match="the command ended with status 1: nothing on stderr"):
+            system.execute(designed(), TASK)
+
+
+def test_a_program_that_cannot_be_started_any_more_is_a_failed_execution(tmp_path: Path) -> None:
+    program = tmp_path / "rig"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    system = Subprocess([str(program)], timeout=5)
+    program.unlink()
+    with pytest.raises(ExecutionError, match="the command cannot be started: No such file or directory"):
+        system.execute(designed(), TASK)
+
+
+def test_a_timeout_may_be_longer_than_the_system_can_wait(tmp_path: Path) -> None:
+    assert python(tmp_path, RIG, timeout=float("inf")).execute(designed(), TASK).ended == "complete"
+
+
+# What is no file
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs FIFOs and devices")
+@pytest.mark.parametrize("name", ["trajectory.npz", "trajectory.csv"])
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        ("os.mkfifo(path)", "it is a FIFO and not a regular file"),
+        ("os.symlink('/dev/zero', path)", "it is a device and not a regular file"),
+        ("os.symlink('/dev/tty', path)", "cannot be read"),
+        ("os.mkdir(path)", "it is a folder"),
+        ("os.symlink('nowhere', path)", "there is no such file"),
+        ("os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), 2**33)", "it has 8589934592 bytes, and at most"),
+    ],
+)
+def test_what_is_no_file_is_neither_waited_for_nor_read(make: str, reason: str, name: str, tmp_path: Path) -> None:
+    code = f"import os, sys; path = sys.argv[-1] + '/{name}'; {make}"
+    with pytest.raises(ExecutionError, match=f"the command's trajectory cannot be used: .*{reason}"):
+        python(tmp_path, code, timeout=5).execute(designed(), TASK)
+
+
+def test_a_trajectory_may_be_a_link_to_a_file(tmp_path: Path) -> None:
+    code = RIG + f"os = __import__('os'); os.replace(folder / 'trajectory.csv', {str(tmp_path / 'log')!r})\n"
+    code += f"os.symlink({str(tmp_path / 'log')!r}, folder / 'trajectory.csv')"
+    assert python(tmp_path, code).execute(designed(), TASK).ended == "complete"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs FIFOs")
+def test_a_fifo_in_place_of_what_the_command_wrote_on_stderr_is_not_waited_for(tmp_path: Path) -> None:
+    code = "import os, sys; p = sys.argv[-1] + '/stderr.txt'; os.unlink(p); os.mkfifo(p); sys.exit('the brake is on')"
+    with pytest.raises(ExecutionError, match="status 1: the brake is on"):
+        python(tmp_path, code).execute(designed(), TASK)
+
+
+def test_more_numbers_than_the_task_has_are_not_read(tmp_path: Path) -> None:
+    code = "import sys; open(sys.argv[-1] + '/trajectory.csv', 'w').write('t,x0,x1,u0\\n' + '0,1,2,3\\n' * 22)"
+    with pytest.raises(ExecutionError, match=r"trajectory\.csv must have 21 rows below its header, and has more"):
+        python(tmp_path, code).execute(designed(), TASK)
+
+
+def test_it_does_not_depend_on_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "rig.py").write_text(RIG)
+    monkeypatch.chdir(tmp_path)
+    system = Subprocess([sys.executable, "-S", "-E", "rig.py"], timeout=30, keep="kept")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert system.execute(designed(), TASK).ended == "complete"
+    assert len(list((tmp_path / "kept").iterdir())) == 1
 
 
 def test_a_controller_that_cannot_leave_the_process_is_refused(tmp_path: Path) -> None:

@@ -7,10 +7,10 @@ import os
 import shlex
 import shutil
 import signal
-import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from ctxval.errors import CtxvalError, ExecutionError, InputError
 from ctxval.exchange import write_controller, write_task
 from ctxval.scratch import scratch
 from ctxval.systems.episode import require_one
-from ctxval.systems.guard import guarded
+from ctxval.systems.supervised import run_supervised
 from ctxval.task import Task
 from ctxval.trajectory import COMPLETE, Trajectory
 
@@ -36,8 +36,10 @@ class Subprocess:
     Every execution has a fresh folder, with ``task.json`` and the controller as ``controller.json`` and
     ``controller.npz`` (see :mod:`ctxval.exchange`). The command is run with that folder as its last argument, and
     writes ``trajectory.npz`` (times, states, inputs, perhaps ended) or ``trajectory.csv`` (columns ``t, x0, ..., u0,
-    ...``, no inputs in the last row) into it. An exit status other than 0 is a failed execution, whose reason is the
-    last line of stderr. Whatever the command started is ended with it, and with this process, however that ends.
+    ...``, no inputs in the last row) into it, as a regular file. It runs in the folder that was the current one when
+    this object was made. An exit status other than 0 is a failed execution, whose reason is the
+    last line of stderr. Whatever the command started is ended with it, and with this process, however that ends; on
+    Linux also what left its process group.
 
     Args:
         command: the program and its arguments; a string is split as a shell would. No shell runs it.
@@ -66,7 +68,9 @@ class Subprocess:
         self.timeout = timeout
         self.states = None if states is None else dict(states)
         self.inputs = None if inputs is None else dict(inputs)
-        self.keep = None if keep is None else Path(keep)
+        # Absolute: what runs in this process may change the current folder.
+        self.keep = None if keep is None else Path(keep).absolute()
+        self._home = Path.cwd()
 
     def describe(self) -> dict[str, object]:
         """Return what identifies this system in a store."""
@@ -85,8 +89,9 @@ class Subprocess:
             for kind in ("json", "npz"):
                 path = folder / f"controller.{kind}"
                 write_controller(path, controller, dt=task.dt, states=self.states, inputs=self.inputs)
-            _run([*self.command, str(folder)], folder, self.timeout)
-            return _of_task(_trajectory(folder), task)
+            # On another machine it may not be there.
+            _run([*self.command, str(folder)], self._home if self._home.is_dir() else None, folder, self.timeout)
+            return _of_task(_trajectory(folder, task), task)
 
     @contextlib.contextmanager
     def _folder(self) -> Iterator[Path]:
@@ -98,36 +103,15 @@ class Subprocess:
             yield folder
 
 
-def _run(command: Sequence[str], folder: Path, timeout: float) -> None:
+def _run(command: Sequence[str], home: Path | None, folder: Path, timeout: float) -> None:
     # Output goes to files: a pipe that a grandchild keeps open would make us wait for it.
-    with (folder / "stdout.txt").open("wb") as stdout, (folder / "stderr.txt").open("wb") as stderr:
-        try:
-            process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr, start_new_session=True
-            )
-        except OSError as error:
-            raise ExecutionError(f"the command cannot be started: {error}") from error
-        try:
-            with guarded(process.pid):
-                status = process.wait(timeout)
-        except subprocess.TimeoutExpired:
-            raise ExecutionError(f"the command did not end within {timeout:g} s and was killed") from None
-        finally:
-            _kill_group(process)
-    if status:
-        how = f"was ended by {signal_name(-status)}" if status < 0 else f"ended with status {status}"
-        raise ExecutionError(f"the command {how}: {_last_line(folder / 'stderr.txt') or 'nothing on stderr'}")
-
-
-def _kill_group(process: subprocess.Popen[bytes]) -> None:
-    """Kill the command and its descendants, also those that outlived it."""
-    if hasattr(os, "killpg"):
-        # The command leads its own group; there is none left where nothing of it runs any more.
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
-    else:
-        process.kill()
-    process.wait()
+    with (folder / "stdout.txt").open("wb") as stdout, (folder / "stderr.txt").open("w+b") as stderr:
+        status = run_supervised(command, home, stdout, stderr, timeout)
+        if status is None:
+            raise ExecutionError(f"the command did not end within {timeout:g} s and was killed")
+        if status:
+            how = f"was ended by {signal_name(-status)}" if status < 0 else f"ended with status {status}"
+            raise ExecutionError(f"the command {how}: {_last_line(stderr) or 'nothing on stderr'}")
 
 
 def signal_name(number: int) -> str:
@@ -138,19 +122,20 @@ def signal_name(number: int) -> str:
         return f"signal {number}"
 
 
-def _last_line(path: Path) -> str:
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - _TAIL))
-        lines = [line.strip() for line in file.read().decode("utf-8", "replace").splitlines() if line.strip()]
+def _last_line(file: IO[bytes]) -> str:
+    """Return the last line of a file that is open: under its name there may be something else by now."""
+    file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
+    lines = [line.strip() for line in file.read().decode("utf-8", "replace").splitlines() if line.strip()]
     return lines[-1][:300] if lines else ""
 
 
-def _trajectory(folder: Path) -> Trajectory:
+def _trajectory(folder: Path, task: Task) -> Trajectory:
+    shape = task.horizon + 1, task.initial_state.size
     try:
-        if (folder / "trajectory.npz").exists():
-            return Trajectory.from_npz((folder / "trajectory.npz").read_bytes())
-        if (folder / "trajectory.csv").exists():
-            return Trajectory.from_csv(folder / "trajectory.csv")
+        if os.path.lexists(folder / "trajectory.npz"):
+            return Trajectory.from_npz(folder / "trajectory.npz", shape=shape)
+        if os.path.lexists(folder / "trajectory.csv"):
+            return Trajectory.from_csv(folder / "trajectory.csv", most_rows=shape[0])
     except (CtxvalError, OSError, MemoryError) as error:
         raise ExecutionError(f"the command's trajectory cannot be used: {error}") from error
     raise ExecutionError("the command ended well but wrote neither trajectory.npz nor trajectory.csv")

@@ -1,0 +1,137 @@
+# ruff: noqa: SIM105  -- contextlib takes as long to import as all the rest
+"""The process that runs one command and ends all that it started; :mod:`ctxval.systems.supervised` starts this file.
+
+A command may start processes that leave its group (``setsid``) or lose their parent. On Linux this process is their
+reaper: whoever loses its parent becomes its child, so that none can hide from it. It has no other children, which the
+process of a campaign may have. Nothing of ctxval is imported, and little else: it is started for every execution.
+
+Its arguments are the process that it works for, the descriptors of the command's stdout and stderr, and the command.
+It writes lines: the command's process, and when nothing of it runs any more its status, negative for a signal.
+Anything on stdin, or its end, means that the command must be ended.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import select
+import signal
+import sys
+import time
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any
+
+_LINUX = sys.platform.startswith("linux")
+_PR_SET_CHILD_SUBREAPER = 36
+
+_LOOK = 0.5
+"""Seconds between two looks whether the campaign is still there: a fork of it may hold our stdin open."""
+
+_WAIT = 0.005
+"""Seconds between two looks whether what was killed has gone."""
+
+_LOOKS = 200
+"""Looks that those are given who cannot be killed, as they belong to another user."""
+
+
+def main() -> None:
+    """Run the command, until it ends or must be ended."""
+    parent, stdout, stderr, *command = sys.argv[1:]
+    if _LINUX:
+        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    woken, wake = os.pipe()
+    os.set_blocking(wake, False)
+    signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+    signal.signal(signal.SIGCHLD, lambda _signal, _frame: None)
+    try:
+        child = _spawn(command, int(stdout), int(stderr))
+    except OSError as error:
+        _say(f"error {error.errno}")
+        return
+    _say(str(child))
+    statuses: dict[int, int] = {}
+    while not _reap(statuses) and child not in statuses and os.getppid() == int(parent):
+        if 0 in (ready := select.select([0, woken], [], [], _LOOK)[0]):
+            break
+        if ready:
+            os.read(woken, 4096)
+    _end(child, statuses)
+    _say(str(os.waitstatus_to_exitcode(statuses[child])) if child in statuses else "lost")
+
+
+def _spawn(command: list[str], stdout: int, stderr: int) -> int:
+    """Start the command in a group of its own; return its process."""
+    files: list[tuple[Any, ...]] = [(os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0)]
+    files += [(os.POSIX_SPAWN_DUP2, stdout, 1), (os.POSIX_SPAWN_DUP2, stderr, 2)]
+    files += [(os.POSIX_SPAWN_CLOSE, stdout), (os.POSIX_SPAWN_CLOSE, stderr)]
+    ignored_by_python = [signal.SIGPIPE, signal.SIGXFSZ]
+    return os.posix_spawnp(
+        command[0], command, os.environ, file_actions=files, setpgroup=0, setsigdef=ignored_by_python
+    )
+
+
+def _say(line: str) -> None:
+    try:
+        os.write(1, f"{line}\n".encode())
+    except OSError:
+        pass  # the campaign was killed
+
+
+def _reap(statuses: dict[int, int]) -> bool:
+    """Collect the children that have ended; return whether there are no others."""
+    try:
+        while True:
+            pid, status = os.waitpid(-1, os.WNOHANG)
+            if not pid:
+                return False
+            statuses[pid] = status
+    except ChildProcessError:
+        return True
+
+
+def _end(child: int, statuses: dict[int, int]) -> None:
+    """Kill all descendants, again and again: those of whoever dies become our children."""
+    spared: set[int] = set()
+    looks = _LOOKS
+    while not _reap(statuses) and looks:
+        found = _descendants(os.getpid()) if _LINUX else {-child}
+        looks -= found <= spared
+        for pid in found:
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                pass
+            except PermissionError:
+                spared.add(pid)
+        time.sleep(_WAIT)
+    if not _LINUX:
+        try:
+            os.killpg(child, signal.SIGKILL)
+        except OSError:
+            pass  # there is nothing left of it
+
+
+def _descendants(ancestor: int) -> set[int]:
+    """Return the descendants of a process."""
+    children: dict[int, list[int]] = {}
+    for name in filter(str.isdigit, os.listdir("/proc")):
+        try:
+            with open(f"/proc/{name}/stat", "rb") as file:
+                # After the name, which may have blanks and brackets in it: state, parent.
+                parent = int(file.read().rpartition(b")")[2].split()[1])
+        except OSError:
+            continue  # it has gone
+        children.setdefault(parent, []).append(int(name))
+    found: set[int] = set()
+    waiting = [ancestor]
+    while waiting:
+        new = set(children.get(waiting.pop(), ())) - found
+        found |= new
+        waiting.extend(new)
+    return found
+
+
+if __name__ == "__main__":
+    main()
