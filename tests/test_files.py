@@ -39,7 +39,7 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, monkeypatch:
             "zero": "it is a device and not a regular file",
             "socket": "No such device",
             ".": "it is a folder",
-            "nothing": "there is no such file",
+            "nothing": "No such file or directory",
             "no\0name": "null",
         }
         for name, reason in reasons.items():

@@ -60,8 +60,6 @@ def open_regular(path: str | Path, most: int = MOST_BYTES) -> BinaryIO:
 
 
 def _why_not_opened(path: str | Path, error: OSError | ValueError) -> str:
-    if isinstance(error, FileNotFoundError):
-        return "there is no such file"
     if os.path.isdir(path):  # Windows does not open folders
         return _KINDS[stat.S_IFDIR]
     return str(getattr(error, "strerror", None) or error)

@@ -10,8 +10,12 @@ import numpy as np
 
 from ctxval.arrays import Array
 from ctxval.errors import InputError, ModelError, ShapeError
+from ctxval.files import read_bytes
 
 _TYPES: dict[str, type[np.float32] | type[np.float64]] = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+
+_MOST_BYTES = 2**34
+"""Bytes of a network's weights: what is no regular file is refused, a large one is not."""
 
 Width = int | None
 """Numbers in one row; None where the file leaves it open."""
@@ -99,9 +103,9 @@ def _contents(path: Path) -> list[bytes]:
     """Return the bytes of the file, and of its weights if they stand beside it, as PyTorch may leave them."""
     weights = path.with_name(f"{path.name}.data")
     try:
-        return [file.read_bytes() for file in (path, weights) if file == path or file.exists()]
-    except OSError as error:
-        raise InputError(f"the ONNX file {path} cannot be read: {error.strerror}.") from error
+        return [read_bytes(file, most=_MOST_BYTES) for file in (path, weights) if file == path or file.exists()]
+    except InputError as error:
+        raise InputError(f"the ONNX file {path} cannot be read: {error}.") from error
 
 
 def _session(source: bytes | str) -> Any:

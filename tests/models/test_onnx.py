@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -159,6 +160,9 @@ def test_other_networks_and_files_are_refused(tmp_path: Path) -> None:
         Onnx(b"junk")
     with pytest.raises(InputError, match=r"none\.onnx cannot be read: No such file"):
         Onnx(tmp_path / "none.onnx")
+    os.mkfifo(tmp_path / "fifo.onnx")
+    with pytest.raises(InputError, match=r"fifo\.onnx cannot be read: it is a FIFO and not a regular file"):
+        Onnx(tmp_path / "fifo.onnx")
     content = onnx.load_from_string(network(two_inputs=True))
     content.graph.input.append(helper.make_tensor_value_info("extra", DOUBLE, ["N", 1]))
     with pytest.raises(InputError, match="as one or two inputs, the network has x, u, extra"):

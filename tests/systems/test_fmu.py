@@ -457,6 +457,22 @@ def test_other_files_are_refused(tmp_path: Path, fmi2: Path) -> None:
         FMU(hollow, **NAMES)
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs FIFOs")
+def test_a_fifo_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.fmu")
+    with pytest.raises(InputError, match=r"a\.fmu cannot be read as an FMU: it is a FIFO and not a regular file"):
+        FMU(tmp_path / "a.fmu", **NAMES)
+
+
+def test_an_archive_that_cannot_be_unpacked_is_refused(tmp_path: Path, fmi2: Path) -> None:
+    path = tmp_path / "odd.fmu"
+    with zipfile.ZipFile(fmi2) as whole, zipfile.ZipFile(path, "w") as odd:
+        odd.writestr("modelDescription.xml", whole.read("modelDescription.xml"))
+        odd.writestr("C:/driver.dll", b"")
+    with pytest.raises(InputError, match=r"odd\.fmu cannot be unpacked: Illegal path C:/driver\.dll"):
+        FMU(path, **NAMES)
+
+
 def test_without_fmpy_the_extra_is_named(fmi2: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = builtins.__import__
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import concurrent.futures
 import pickle
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -243,3 +244,34 @@ def test_a_model_learned_from_an_environment_is_validated_on_it(name: str, Q: li
     campaign = Campaign(validation, search=searches.Random()).run(4)
     assert not campaign.failed
     assert 0 < max(trial.distance for trial in campaign.trials) < 1.5
+
+
+def test_a_model_file_is_found_from_every_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asset = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "inverted_pendulum.xml"
+    (tmp_path / "mine.xml").write_text(asset.read_text())
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    system = Gymnasium("InvertedPendulum-v5", xml_file="./mine.xml", ignore_termination=True)
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    task = Task([0.0, 0.01, 0.0, 0.0], horizon=3, dt=system.dt)
+    with pytest.raises(ZeroDivisionError):
+        system.execute(lambda t, x: 1 / 0, task)  # the environment is not used again
+    assert system.execute(lambda t, x: np.zeros(1), task).ended == "complete"
+    assert pickle.loads(pickle.dumps(system)).execute(lambda t, x: np.zeros(1), task).ended == "complete"
+    assert describe(system)["options"] == {"xml_file": "./mine.xml"}
+
+
+def test_an_environment_that_cannot_be_closed_hides_no_reason() -> None:
+    class Stuck(gymnasium.Env[Any, Any]):
+        action_space = gymnasium.spaces.Box(-1, 1, (1,))
+        dt = 0.1
+
+        def reset(self, **options: Any) -> Any:
+            raise RuntimeError("the motor is off")
+
+        def close(self) -> None:
+            raise OSError("the port is gone")
+
+    system = Gymnasium(Stuck, get_state=lambda environment: [0.0], set_state=lambda environment, x: None)
+    with pytest.raises(RuntimeError, match="the motor is off"):
+        system.execute(lambda t, x: np.zeros(1), Task([0.0], horizon=1, dt=0.1))

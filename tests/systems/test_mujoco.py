@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -275,6 +276,9 @@ def test_models_come_from_text_and_from_files(tmp_path: Path) -> None:
         assert first_difference(describe(systems.MuJoCo(source)), describe(systems.MuJoCo(ARM))) is None
     with pytest.raises(InputError, match=r"no\.xml.*cannot be read"):
         systems.MuJoCo(tmp_path / "no.xml")
+    os.mkfifo(tmp_path / "fifo.xml")
+    with pytest.raises(InputError, match=r"fifo\.xml' cannot be read: it is a FIFO and not a regular file"):
+        systems.MuJoCo(tmp_path / "fifo.xml")
     with pytest.raises(InputError, match="cannot compile"):
         systems.MuJoCo("<mujoco><worldbody><body/></mujoco>")
     with pytest.raises(InputError, match="cannot compile"):

@@ -347,7 +347,7 @@ def test_a_timeout_may_be_longer_than_the_system_can_wait(tmp_path: Path) -> Non
         ("os.symlink('/dev/zero', path)", "it is a device and not a regular file"),
         ("os.symlink('/dev/tty', path)", "cannot be read"),
         ("os.mkdir(path)", "it is a folder"),
-        ("os.symlink('nowhere', path)", "there is no such file"),
+        ("os.symlink('nowhere', path)", "No such file or directory"),
         ("os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), 2**33)", "it has 8589934592 bytes, and at most"),
     ],
 )

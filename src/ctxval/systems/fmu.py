@@ -18,6 +18,7 @@ import numpy as np
 from ctxval.arrays import Array
 from ctxval.controller import Controller
 from ctxval.errors import ExecutionError, InputError, UnknownNameError
+from ctxval.files import require_regular_file
 from ctxval.scratch import Scratch
 from ctxval.systems.episode import require_one, require_started, run_episode
 from ctxval.systems.subprocess import signal_name
@@ -240,6 +241,7 @@ def _unpacked(path: Path) -> tuple[Any, Scratch]:
     except ImportError as error:
         raise InputError('FMPy is not installed: pip install "ctxval[fmu]".') from error
     try:
+        require_regular_file(path)
         description = fmpy.read_model_description(str(path))
     except Exception as error:  # of many kinds: no file, no zip, no XML, not after the schema
         raise InputError(f"{path} cannot be read as an FMU: {error}") from error
@@ -249,7 +251,11 @@ def _unpacked(path: Path) -> tuple[Any, Scratch]:
             f"{'' if description.coSimulation else ' without co-simulation'}."
         )
     folder = Scratch()
-    fmpy.extract(str(path), str(folder.path))
+    try:
+        fmpy.extract(str(path), str(folder.path))
+    except Exception as error:
+        folder.remove()
+        raise InputError(f"{path} cannot be unpacked: {error}") from error
     return description, folder
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -57,6 +59,8 @@ class Gymnasium:
     ) -> None:
         self.environment = environment
         self.options = options
+        # Environments are made again later, when the current folder may be another.
+        self._files = {name: os.path.abspath(value) for name, value in options.items() if _is_relative_file(value)}
         self.get_state, self.set_state = get_state, set_state
         self.seed = seed
         self.ignore_termination = ignore_termination
@@ -97,7 +101,8 @@ class Gymnasium:
             self._start(environment, task)
             trajectory = run_episode(lambda u: self._advance(environment, u), controller, task, self.inputs)
         except BaseException:
-            environment.close()  # nobody knows what state it is in
+            with contextlib.suppress(Exception):  # what failed first is the reason
+                environment.close()  # nobody knows what state it is in
             raise
         self._idle.append(environment)
         return trajectory
@@ -113,10 +118,10 @@ class Gymnasium:
         except ImportError as error:
             raise InputError('gymnasium is not installed: pip install "ctxval[mujoco]".') from error
         if not isinstance(self.environment, str):
-            return self.environment(**self.options)
+            return self.environment(**{**self.options, **self._files})
         try:
             # The passive checker warns of actions beyond the action space, which the environment is asked to clip.
-            return gymnasium.make(self.environment, **{"disable_env_checker": True, **self.options})
+            return gymnasium.make(self.environment, **{"disable_env_checker": True, **self.options, **self._files})
         except (gymnasium.error.Error, ImportError, TypeError, AttributeError) as error:
             raise InputError(f"the environment {self.environment!r} cannot be made: {error}") from error
 
@@ -150,6 +155,11 @@ class Gymnasium:
     def __getstate__(self) -> dict[str, Any]:
         # Environments do not go to other processes; they are made there again.
         return {**vars(self), "_idle": []}
+
+
+def _is_relative_file(value: object) -> bool:
+    """Return whether an option is a file as seen from the current folder; gymnasium has models of its own by name."""
+    return isinstance(value, str) and value.startswith(("./", "../")) and os.path.exists(value)
 
 
 def _is_mujoco(bare: Any) -> bool:

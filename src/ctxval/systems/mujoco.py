@@ -12,6 +12,7 @@ import numpy as np
 from ctxval.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
 from ctxval.controller import Controller
 from ctxval.errors import InputError, ShapeError, UnknownNameError
+from ctxval.files import read_bytes
 from ctxval.rollout import rollout
 from ctxval.task import Task
 from ctxval.trajectory import Trajectory
@@ -277,9 +278,9 @@ def _compiled(mjcf: str | Path) -> tuple[str, Any]:
         raise InputError('MuJoCo is not installed: pip install "ctxval[mujoco]".') from error
     is_text = isinstance(mjcf, str) and "<" in mjcf
     try:
-        text = str(mjcf) if is_text else Path(mjcf).read_text(encoding="utf-8")
+        text = str(mjcf) if is_text else read_bytes(mjcf).decode("utf-8")
         model = mujoco.MjModel.from_xml_string(text) if is_text else mujoco.MjModel.from_xml_path(str(mjcf))
-    except (OSError, UnicodeDecodeError) as error:
+    except (InputError, UnicodeDecodeError) as error:
         raise InputError(f"the MuJoCo model {str(mjcf)!r} cannot be read: {error}.") from error
     except ValueError as error:
         raise InputError(f"MuJoCo cannot compile the model: {error}") from error
