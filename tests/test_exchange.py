@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import pickle
 import zipfile
 from pathlib import Path
@@ -228,3 +229,32 @@ def test_no_damage_gives_anything_but_an_error_of_ours(kind: str, tmp_path: Path
         path.write_bytes(bytes(broken[: rng.integers(1, len(whole) + 1)] if rng.random() < 0.3 else broken))
         with contextlib.suppress(CtxvalError):
             read_controller(path)
+
+
+def test_an_archive_that_unpacks_to_much_is_refused_before_it_does(tmp_path: Path) -> None:
+    path = tmp_path / "controller.npz"
+    write_controller(path, designed(), dt=0.1)
+    with np.load(path, allow_pickle=False) as whole:
+        content = dict(whole)
+    header = np.lib.format.header_data_from_array_1_0(np.zeros(1)) | {"shape": (2**40, 1, 1)}
+    huge = io.BytesIO()
+    np.lib.format.write_array_header_1_0(huge, header)
+    np.savez(path, **{name: array for name, array in content.items() if name != "gains"})
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("gains.npy", huge.getvalue())
+    with pytest.raises(InputError, match=r"cannot be read as a ctxval controller: its array gains .* is too large"):
+        read_controller(path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fifo_is_no_file(kind: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / f"controller.{kind}")
+    with pytest.raises(InputError, match="it is a FIFO and not a regular file"):
+        read_controller(tmp_path / f"controller.{kind}")
+
+
+@pytest.mark.parametrize("content", ["[1, 2]", "3", '"text"', "null"])
+def test_json_that_is_no_object_is_refused(content: str, tmp_path: Path) -> None:
+    (tmp_path / "task.json").write_text(content)
+    with pytest.raises(InputError, match=r"cannot be read as a ctxval task: it must be an object with names"):
+        read_task(tmp_path / "task.json")

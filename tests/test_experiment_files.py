@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 import tomllib
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -362,3 +364,17 @@ def test_limits_are_written_in_a_file_as_in_python(limits: str, low: list[float]
 def test_a_flat_list_of_limits_in_a_file_is_refused(kind: str) -> None:
     with pytest.raises(InputError, match=r"\[1\.0, 8\.0\] can be read in two ways: write \{ low = 1\.0, high = 8\.0"):
         part("synthesizer", {"type": kind, "Q": [1.0], "R": [1.0, 1.0], "limits": [1.0, 8.0]})
+
+
+def test_recorded_data_is_read_with_bounds(tmp_path: Path) -> None:
+    path = tmp_path / "steps.npz"
+    np.savez(path, x=np.zeros((3, 2)), u=np.zeros((3, 1)), x_next=np.ones((3, 2)))
+    assert recorded(str(path)).x_next.tolist() == [[1, 1]] * 3
+    header = np.lib.format.header_data_from_array_1_0(np.zeros(1)) | {"shape": (2**40, 2)}
+    huge = io.BytesIO()
+    np.lib.format.write_array_header_1_0(huge, header)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("x_next.npy", huge.getvalue())
+        archive.writestr("x.npy", huge.getvalue())
+    with pytest.raises(InputError, match=r"steps\.npz cannot be read as recorded data: its array x .* is too large"):
+        recorded(str(path))

@@ -222,6 +222,25 @@ def test_a_missing_npz_is_refused_by_name(tmp_path: Path) -> None:
         Trajectory.from_npz(tmp_path / "nothing.npz")
 
 
+@pytest.mark.parametrize("name", ["times", "states", "inputs"])
+def test_a_masked_array_is_no_part_of_a_trajectory(walk: Trajectory, name: str) -> None:
+    content = {part: getattr(walk, part) for part in ("times", "states", "inputs")}
+    content[name] = np.ma.masked_array(
+        content[name], mask=np.arange(content[name].size).reshape(content[name].shape) == 1
+    )
+    with pytest.raises(InputError, match=f"{name} must have a number everywhere, and some are masked"):
+        Trajectory(**content)
+
+
+def test_npz_of_another_shape_than_a_plan_has_is_refused(walk: Trajectory) -> None:
+    assert same_bits(Trajectory.from_npz(walk.to_npz(), shape=walk.states.shape), walk)  # type: ignore[arg-type]
+    with pytest.raises(ShapeError, match=r"must have states of shape \(9, 2\), got \(4, 2\)"):
+        Trajectory.from_npz(walk.to_npz(), shape=(9, 2))
+    # One that stopped early says why, however short it is.
+    short = Trajectory(walk.times, walk.states, walk.inputs, ended="the operator stopped it")
+    assert Trajectory.from_npz(short.to_npz(), shape=(9, 2)).ended == "the operator stopped it"
+
+
 # CSV
 
 

@@ -55,7 +55,11 @@ def test_a_trajectory_is_passed_on_as_it_is() -> None:
 
 
 @pytest.mark.parametrize(
-    "returned", [None, 3, np.zeros((9, 2)), (np.zeros((9, 2)),), (np.zeros((5, 2)), np.zeros((4, 1))), ("a", "b")]
+    "returned",
+    [
+        *(None, 3, np.zeros((9, 2)), (np.zeros((9, 2)),), (np.zeros((5, 2)), np.zeros((4, 1))), ("a", "b")),
+        (np.ma.masked_equal(np.zeros((9, 2)), 0), np.zeros((8, 1))),
+    ],
 )
 def test_anything_else_is_a_failed_execution(returned: Any) -> None:
     with pytest.raises(ExecutionError, match=r"must return a Trajectory, or states .* with H = 8: "):
