@@ -372,7 +372,7 @@ STATEMENT = st.one_of(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(statements=st.lists(STATEMENT, min_size=1, max_size=5))
 def test_any_database_is_read_or_refused(whole: Path, statements: list[str]) -> None:
     path = whole.with_name("fuzzed.sqlite")
