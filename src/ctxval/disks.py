@@ -1,7 +1,9 @@
-"""Which disks a store is safe on."""
+"""Which disks a store is safe on, and folders that a power cut does not take back."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import warnings
 from pathlib import Path
 
@@ -43,3 +45,21 @@ def warn_of_network(path: Path) -> None:
             StoreWarning,
             stacklevel=4,
         )
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those that it is in, where there is none yet; a power cut does not take it back."""
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for place in missing:
+        sync_folder(place.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Write the names in a folder to the disk, where the operating system can."""
+    with contextlib.suppress(OSError):
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)

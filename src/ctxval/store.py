@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ctxval import rows, schema
-from ctxval.disks import on_network, warn_of_network
+from ctxval.disks import make_folder, on_network, warn_of_network
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
 from ctxval.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
 from ctxval.rows import (
@@ -124,7 +124,7 @@ class Store:
         self._locked = False
         with self._translating():
             if self.path is not None:
-                self.path.parent.mkdir(parents=True, exist_ok=True)
+                make_folder(self.path.parent)
                 warn_of_network(self.path)
                 schema.require_files(self.path)
             self._connection = sqlite3.connect(
