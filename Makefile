@@ -7,7 +7,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test check reliability bench bench-peers study reproduce search calibrate pictures clean
+.PHONY: demo test check reliability crash-states attack bench bench-peers study reproduce search calibrate pictures clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -22,6 +22,11 @@ check: .venv/.test
 
 reliability: .venv/.test  ## kill -9 and resume, KILLS times
 	$(BIN)/python -m pytest tests/test_kill.py --kills $(KILLS)
+
+crash-states: .venv/.test  ## power cuts, thousands of them; needs strace; writes docs/reliability.md
+	$(BIN)/python benchmarks/crash_states.py
+	$(BIN)/python benchmarks/crash_states.py --synchronous FULL
+	$(BIN)/python benchmarks/reliability.py
 
 bench: .venv/.test  ## speed, as ratios measured in one run
 	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
