@@ -1,8 +1,8 @@
 """How much of a campaign a power cut can take: every disk that it could leave is opened again, thousands of them.
 
-``python benchmarks/crash_states.py --states 12000`` records the campaigns of `crash/campaigns.py` with strace, plays their
-writes and syncs on the model of a disk in `crash/disk.py`, cuts the power after each of them in many ways, and opens the
-store of what is left. Writes the counts of benchmarks/results/crash_states.json; `benchmarks/reliability.py` makes the page.
+``python benchmarks/crash_states.py --each 8`` records the campaigns of `crash/campaigns.py` with strace, plays their
+writes and syncs on the model of a disk in `crash/disk.py`, cuts the power after each of them in many ways, and opens
+the store of what is left. Writes benchmarks/results/crash_states.json; `benchmarks/reliability.py` makes the page.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import contextlib
 import hashlib
 import json
 import os
-import shutil
 import sqlite3
 import sys
 import tempfile

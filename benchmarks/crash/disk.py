@@ -1,9 +1,9 @@
 """What a power cut leaves on a disk.
 
-A file is what it was when it was last synced, and of the writes since then each is there, or a part of it, or not, in any
-order. The names in a folder are those that it had when it was last synced, and of the changes since then
+A file is what it was when it was last synced, and of the writes since then each is there, or a part of it, or not, in
+any order. The names in a folder are those that it had when it was last synced, and of the changes since then
 
-* ``ordered``: the first few, as journalling file systems write them (ext4, xfs, btrfs); there, syncing a file that is new
+* ``ordered``: the first few, as journalling file systems write them (ext4, xfs, btrfs); there, syncing a new file
   writes the names too,
 * ``strict``: any, name by name, as POSIX allows.
 """
@@ -141,7 +141,7 @@ class Disk:
         return len(self._namings) + sum(len(file.changes) for file in files.values())
 
     def corner(self, *, writes: bool, names: bool) -> Files:
-        """Return what is left where all changes since the last syncs of files, of folders, or none of them, are kept."""
+        """Return what is left where the changes since the last sync, of files and of folders, all stay or all go."""
         return self._left(
             self._namings if names else [], lambda changes, _: changes if writes else [], np.random.default_rng(0), None
         )
