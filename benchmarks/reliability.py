@@ -16,6 +16,8 @@ import signal
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -23,10 +25,11 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
 
 import rig_cluster  # noqa: E402
 import rig_command  # noqa: E402
+from attack import FAMILIES  # noqa: E402
 from conftest import make_validation  # noqa: E402
 from ctxval import Campaign, Store, searches  # noqa: E402
 from ctxval.salvage import salvage  # noqa: E402
@@ -37,6 +40,8 @@ from test_workers import start as start_workers  # noqa: E402
 from test_workers import until  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "results" / "reliability.json"
+CRASHES = RESULTS.with_name("crash_states.json")
+ATTACK = RESULTS.with_name("attack.json")
 PAGE = ROOT / "docs" / "reliability.md"
 
 FAULTS = {
@@ -47,6 +52,21 @@ FAULTS = {
     "kill command": "`kill -9` of the process of a `Subprocess` system, whose failures are repeated once",
     "flip": "1 to 3 bytes of the store changed",
     "cut": "the store cut at a random byte",
+}
+SYNCHRONOUS = {"own": "as they are", "FULL": "with `synchronous = FULL`"}
+CRASH_COLUMNS = ("resumed", "lost", "changed", "twice", "refused")
+ATTACK_COLUMNS = {
+    "inputs": ("inputs",),
+    "apart": ("apart",),
+    "ended well": ("status 0", "status 1"),
+    "refused": ("status 2", "status 3"),
+    "traceback": ("traceback",),
+    "hang": ("hang",),
+    "memory": ("memory",),
+    "status": ("status",),
+    "code": ("code",),
+    "elsewhere": ("wrote elsewhere",),
+    "output": ("escape", "flood", "no JSON", "silent"),
 }
 COLUMNS = ("inflicted", "midway", "lost", "twice", "same end", "noticed", "harmless", "silent")
 
@@ -208,14 +228,64 @@ Faults inflicted on real processes and files, and what came of them. Written by 
 
 """
 
-TAIL = """
+POWER = """
+## Power cuts
+
+A power cut takes the page cache too: what was written and not synced may be on the disk, in part, in any order, or not
+at all. `make crash-states` runs campaigns (random search, failures, two workers, by hand in many processes, killed and
+resumed, a distance that raises) under `strace`, which sees what the package and Python's own SQLite write and sync.
+After each of these acts the power is cut, in many ways: writes dropped, torn at sectors of 512 bytes or at any byte,
+reordered, holes full of old data; names in folders as journalling file systems keep them (*ordered*: the first few
+changes since the last sync), or each at will as POSIX allows (*strict*). Every disk that is left is opened: the store
+must hold all that was acknowledged before the cut, and at most the one transaction more that was being written.
+"""
+
+POWER_TAIL = """
+- *cuts* counts what was tried, *disks* those that differ; *resumed* are campaigns that went on to the end of their
+  budget.
+- *lost*: an acknowledged transaction was not there; *changed*: something was there that had never been written;
+  *twice*: the resumed campaign executed again what had ended; *refused*: the store could not be opened.
+- With `synchronous = FULL`, SQLite's default, a removed journal may come back, and takes the last transaction with it.
+  Stores use `EXTRA`, and new folders are synced into those that they are in.
+"""
+
+HOSTILE = """
+## Hostile input
+
+`make attack` makes each input from a seed and runs its command line, each in a process of its own: what `ctxval` prints
+and how it ends is looked at, its memory and time are bounded, and an audit hook sees whether it runs or writes what it
+should not. A share goes through interpreters of their own, as a shell starts them.
+"""
+
+HOSTILE_TAIL = """
+- *traceback*: an exception reached the top; *hang*: more than 12 s of processor time; *memory*: more than 700 MB beyond
+  the interpreter with the package; *status*: an exit status that the README does not list, or a signal.
+- *code*: something of the input ran, where the input is data; *elsewhere*: a file outside of the folder was written.
+- *output*: control characters, more than 200 kB, no JSON where `--json` promised it, or a failure without a word.
+- *largest*: the most memory of one process, the interpreter with the package included.
+"""
+
+PROCESSORS = """
+## Other processors
+
+A campaign is repeated bit for bit on one kind of processor. The kernels of another one round otherwise in linear
+algebra: distances differ in their last digits, and what a search chooses by what an optimiser makes of that. A campaign
+that is moved goes on with all of its trials: `tests/test_processors.py` runs one with the kernels of one processor and
+resumes it with those of another.
+
+## Everything else
+"""
+
+COUNTED = """
 - *midway*: some executions had been stored, and not all. The instants of the first row are drawn over the time that the
   unbroken campaign takes, so that some fall before the first execution is stored, or after the last.
 - *lost*: a stored execution was gone or changed after the fault; *twice*: one was counted twice.
 - *same end*: the resumed campaign ended as the unbroken one did, bit for bit.
 - *noticed*: reading the store gave an error that says so; *harmless*: every trial and every trajectory was read as it
   had been written; *silent*: something was read that had never been written.
+"""
 
+TAIL = """
 The tests inflict each of them too, fewer times, and besides: a store on a full disk and in a read-only folder, a clock
 that is set back, executions that hang, raise, return NaN, the wrong shape or a part of a trajectory, Ctrl-C once and
 twice, a Dask worker killed in a campaign, an FMU that crashes or hangs, several terminals at once, random sequences of
@@ -224,13 +294,55 @@ asking, telling, running and dying against a model of the store, and random byte
 """
 
 
-def page(results: dict[str, dict[str, int]]) -> str:
+def page(results: dict[str, dict[str, int]], crashes: dict[str, Any], attack: dict[str, Any]) -> str:
     """Return the document."""
-    rows = [["fault", *COLUMNS], ["---"] * (1 + len(COLUMNS))]
-    for fault, title in FAULTS.items():
-        if fault in results:
-            rows.append([title, *(str(results[fault].get(column, "")) for column in COLUMNS)])
-    return HEAD + "".join(f"| {' | '.join(row)} |\n" for row in rows) + TAIL
+    faults = [
+        [title, *(results[fault].get(column, "") for column in COLUMNS)]
+        for fault, title in FAULTS.items()
+        if fault in results
+    ]
+    parts = [HEAD, _table(["fault", *COLUMNS], faults), COUNTED, POWER, _crashes(crashes), POWER_TAIL]
+    return "".join([*parts, HOSTILE, _attack(attack), HOSTILE_TAIL, PROCESSORS, TAIL])
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
+
+
+def _crashes(crashes: dict[str, Any]) -> str:
+    columns = {"cuts": "states", "disks": "distinct", **{name: name for name in CRASH_COLUMNS}}
+    rows = [
+        [f"{SYNCHRONOUS[pragma]}, {mode}", *(f"{counts[key]:,}" for key in columns.values())]
+        for pragma, modes in crashes.items()
+        for mode, counts in modes.items()
+    ]
+    return _table(["stores", *columns], rows)
+
+
+def _attack(attack: dict[str, Any]) -> str:
+    rows = [
+        [_title(name), *(_hostile(counts, keys) for keys in ATTACK_COLUMNS.values()), f"{counts['megabytes']} MB"]
+        for name, counts in attack["families"].items()
+    ]
+    sums: Counter[str] = Counter()
+    for counts in attack["families"].values():
+        sums.update({key: value for key, value in counts.items() if key != "megabytes"})
+    most = max((counts["megabytes"] for counts in attack["families"].values()), default=0)
+    total = ["together", *(_hostile(sums, keys) for keys in ATTACK_COLUMNS.values()), f"{most} MB"]
+    return _table(["input", *ATTACK_COLUMNS, "largest"], [*rows, total])
+
+
+def _title(family: str) -> str:
+    return FAMILIES[family].title
+
+
+def _hostile(counts: Mapping[str, int], keys: tuple[str, ...]) -> str:
+    return f"{sum(counts.get(key, 0) for key in keys):,}"
+
+
+def _stored(path: Path) -> Any:
+    return json.loads(path.read_text()) if path.exists() else {}
 
 
 def main() -> None:
@@ -238,7 +350,7 @@ def main() -> None:
     for name in ("kills", "worker-kills", "scheduler-kills", "command-kills", "flips", "cuts"):
         parser.add_argument(f"--{name}", type=int, default=0)
     given = parser.parse_args()
-    results: dict[str, dict[str, int]] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    results: dict[str, dict[str, int]] = _stored(RESULTS)
     seed = sum(counts["inflicted"] for counts in results.values())
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -256,7 +368,7 @@ def main() -> None:
                 new = inflict(count)
                 results[fault] = {key: results.get(fault, {}).get(key, 0) + value for key, value in new.items()}
                 RESULTS.write_text(json.dumps(results, indent=1) + "\n")
-    PAGE.write_text(page(results))
+    PAGE.write_text(page(results, _stored(CRASHES), _stored(ATTACK)))
 
 
 if __name__ == "__main__":

@@ -425,7 +425,9 @@ class Store:
         if self._connection.execute("PRAGMA journal_mode").fetchone()[0] == "wal":
             # A store is one file.
             self._connection.execute("PRAGMA journal_mode = DELETE")
-        self._connection.execute("PRAGMA synchronous = FULL")
+        # FULL does not sync the folder after a journal is removed: a power cut may bring the journal back, and SQLite
+        # then takes back the last transaction.
+        self._connection.execute("PRAGMA synchronous = EXTRA")
         for number in range(version, len(_MIGRATIONS)):
             self._migrate(number)
 

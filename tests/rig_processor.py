@@ -1,0 +1,25 @@
+"""A campaign on the processor that the environment names: ``python rig_processor.py STORE SEARCH BUDGET``.
+
+``OPENBLAS_CORETYPE`` chooses the kernels of linear algebra as another processor would.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import threadpoolctl
+
+from conftest import make_validation
+from ctxval import Campaign, searches
+
+
+def kernels() -> str:
+    """Return for which processors the linear algebra of this process is."""
+    return ", ".join(sorted({str(info.get("architecture")) for info in threadpoolctl.threadpool_info()}))
+
+
+if __name__ == "__main__":
+    store, search, budget = sys.argv[1:]
+    campaign = Campaign(make_validation(), search=searches.by_name(search), store=store, seed=1, name="processors")
+    campaign.run(int(budget))
+    print(kernels())
