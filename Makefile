@@ -28,6 +28,10 @@ crash-states: .venv/.test  ## power cuts, thousands of them; needs strace; write
 	$(BIN)/python benchmarks/crash_states.py --synchronous FULL
 	$(BIN)/python benchmarks/reliability.py
 
+attack: .venv/.test  ## hostile input, thousands of command lines; writes docs/reliability.md, and resumes
+	$(BIN)/python benchmarks/attack.py
+	$(BIN)/python benchmarks/reliability.py
+
 bench: .venv/.test  ## speed, as ratios measured in one run
 	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
 
