@@ -18,7 +18,7 @@ from typing import Any
 STATUSES = {0, 1, 2, 3, 130, 141}
 """Those that the README lists."""
 
-WALL, CPU = 150, 12
+WALL, CPU = 60, 12
 """Seconds after which a command hangs: of the clock, as the machine may be busy, and of the processor."""
 
 MEMORY = 700 * 2**20
