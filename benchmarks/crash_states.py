@@ -27,7 +27,7 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
 
-from crash.campaigns import BUDGET, SCRIPTS, STORE, campaign, content, rig_of  # noqa: E402
+from crash.campaigns import BUDGET, SCRIPTS, STORE, campaign, content, digest, rig_of  # noqa: E402
 from crash.disk import Disk, Files, Mode  # noqa: E402
 from crash.recorder import Event, record  # noqa: E402
 from ctxval import Store  # noqa: E402
@@ -46,7 +46,7 @@ class Recording:
     Attributes:
         name: of the campaign.
         events: in order.
-        said: digest of the store after each transaction.
+        said: digests of the store after each transaction.
     """
 
     name: str
@@ -61,15 +61,17 @@ class State:
     Attributes:
         files: of the campaign's folder.
         acknowledged: how many transactions had been.
+        kept: what had been said to be kept beside the store, by the digests of these files.
     """
 
     files: Files
     acknowledged: int
+    kept: dict[str, str]
 
     @property
     def key(self) -> str:
         """Tells apart states that differ."""
-        return hashlib.sha256(repr((self.acknowledged, sorted(self.files.items()))).encode()).hexdigest()
+        return hashlib.sha256(repr((self.acknowledged, self.kept, sorted(self.files.items()))).encode()).hexdigest()
 
 
 def recorded(name: str, folder: Path, synchronous: str | None = None) -> Recording:
@@ -79,22 +81,25 @@ def recorded(name: str, folder: Path, synchronous: str | None = None) -> Recordi
     script = [sys.executable, "-m", "crash.campaigns", name, str(place), str(marks)]
     with contextlib.chdir(ROOT / "benchmarks"):
         events = record([*script, *([] if synchronous is None else [synchronous])], place, marks, folder / "log")
-    return Recording(name, events, [event.mark for event in events if event.kind == "mark"])
+    return Recording(name, events, [event.mark for event in events if isinstance(event.mark, str)])
 
 
 def states(recording: Recording, mode: Mode, each: int, seed: int) -> Iterator[State]:
     """Cut the power after each event: at the four corners of what may be left, and in so many other ways."""
     disk, acknowledged = Disk(mode), 0
+    kept: dict[str, str] = {}
     rng = np.random.default_rng([seed, MODES.index(mode)])
     for event in recording.events:
-        if event.kind == "mark":
+        if isinstance(event.mark, str):
             acknowledged += 1
+        elif event.kind == "mark":
+            kept = {**kept, event.mark["kept"]: event.mark["digest"]}
         disk.tell(event)
         for writes in (True, False):
             for names in (True, False):
-                yield State(disk.corner(writes=writes, names=names), acknowledged)
+                yield State(disk.corner(writes=writes, names=names), acknowledged, kept)
         for _ in range(each if disk.loose else 0):
-            yield State(disk.cut(rng), acknowledged)
+            yield State(disk.cut(rng), acknowledged, kept)
 
 
 def examine(recording: Recording, state: State, *, resume: bool) -> Counter[str]:
@@ -118,20 +123,22 @@ def examine(recording: Recording, state: State, *, resume: bool) -> Counter[str]
 
 def _held(recording: Recording, state: State, path: Path) -> str:
     """Return whether a store holds what was acknowledged, and perhaps what was being written."""
+    if any(digest(state.files.get(name, b"")) != known for name, known in state.kept.items()):
+        return "lost"
     if state.acknowledged == 0:
         return "opened"
     if not path.exists():
         return "lost"
     connection = sqlite3.connect(path)
     try:
-        digest = content(connection)
+        found = content(connection)
     except sqlite3.DatabaseError:
         return "changed"
     finally:
         connection.close()
-    if digest in recording.said[state.acknowledged - 1 : state.acknowledged + 1]:
+    if found in recording.said[state.acknowledged - 1 : state.acknowledged + 1]:
         return "opened"
-    return "lost" if digest in recording.said or digest == _EMPTY else "changed"
+    return "lost" if found in recording.said or found == _EMPTY else "changed"
 
 
 def _open(recording: Recording, state: State, path: Path, found: Counter[str], *, resume: bool) -> None:
@@ -147,8 +154,10 @@ def _open(recording: Recording, state: State, path: Path, found: Counter[str], *
 
 def _gone_on(recording: Recording, store: Store) -> str:
     """Resume a campaign to the end of its budget; return whether what had ended was left alone."""
-    ended = {trial.number: trial for trial in store.trials() if trial.state != "open"}
-    executed = sum(trial.executed for trial in ended.values())
+    trials = store.trials()
+    # What has no distance yet is measured by whoever goes on.
+    ended = {trial.number: trial for trial in trials if trial.state in ("completed", "failed")}
+    executed = sum(trial.executed for trial in trials)
     rig = rig_of(recording.name)
     running = campaign(recording.name, store, rig, mended=True).run(BUDGET)
     if any(_facts(running.trials[number]) != _facts(trial) for number, trial in ended.items()):

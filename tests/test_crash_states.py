@@ -82,7 +82,7 @@ def test_a_renamed_file_has_one_of_its_names() -> None:
 
 
 @needs_strace
-@pytest.mark.parametrize("name", ["run", "hand"])
+@pytest.mark.parametrize("name", ["hand", "full"])
 def test_no_acknowledged_execution_is_lost_or_doubled(name: str, tmp_path: Path) -> None:
     recording = recorded(name, tmp_path)
     counts: Counter[str] = Counter()

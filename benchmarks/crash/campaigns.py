@@ -21,8 +21,9 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
 from conftest import make_validation  # noqa: E402
 from ctxval import Campaign, Store, Trajectory, searches  # noqa: E402
 from ctxval.controller import Controller  # noqa: E402
-from ctxval.errors import CtxvalError, DistanceError, ExecutionError  # noqa: E402
+from ctxval.errors import CtxvalError, DistanceError, ExecutionError, StoreAccessError  # noqa: E402
 from ctxval.task import Task  # noqa: E402
+from ctxval.trial import Trial  # noqa: E402
 
 STORE = "runs/a.sqlite"
 BUDGET = 6
@@ -74,7 +75,20 @@ class Marked(Store):
     def _transaction(self) -> Iterator[None]:
         with super()._transaction():
             yield
-        os.write(self.marks, json.dumps(content(self._connection)).encode() + b"\n")
+        self.say(content(self._connection))
+
+    def say(self, what: object) -> None:
+        """Acknowledge something."""
+        os.write(self.marks, json.dumps(what).encode() + b"\n")
+
+
+class Full(Marked):
+    """A store whose disk is full when the third execution has ended."""
+
+    def close_trial(self, trial: Trial, system_trajectory: Trajectory | None) -> None:
+        if trial.number == 2:
+            raise StoreAccessError(f"{self.path} cannot be written: the disk is full.")
+        super().close_trial(trial, system_trajectory)
 
 
 def content(connection: sqlite3.Connection) -> str:
@@ -82,7 +96,12 @@ def content(connection: sqlite3.Connection) -> str:
     tables = [row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name")]
     rows = {table: connection.execute(f"SELECT * FROM {table} ORDER BY rowid").fetchall() for table in tables}
     version = connection.execute("PRAGMA user_version").fetchone()
-    return hashlib.sha256(repr((version, rows)).encode()).hexdigest()[:24]
+    return digest(repr((version, rows)).encode())
+
+
+def digest(data: bytes) -> str:
+    """Tell apart contents that differ."""
+    return hashlib.sha256(data).hexdigest()[:24]
 
 
 def rig_of(name: str) -> Counting:
@@ -97,22 +116,23 @@ def campaign(name: str, store: Store | Path, system: Counting | None = None, *, 
     return Campaign(validation, search=searches.Random(), store=store, seed=3, name="power")
 
 
-Script = Callable[[Callable[[], Store]], None]
+Opened = Callable[..., Marked]
+Script = Callable[[Opened], None]
 
 
-def _run(opened: Callable[[], Store]) -> None:
+def _run(opened: Opened) -> None:
     campaign("run", opened()).run(BUDGET)
 
 
-def _failures(opened: Callable[[], Store]) -> None:
+def _failures(opened: Opened) -> None:
     campaign("failures", opened()).run(BUDGET)
 
 
-def _workers(opened: Callable[[], Store]) -> None:
+def _workers(opened: Opened) -> None:
     campaign("workers", opened()).run(BUDGET, workers=2)
 
 
-def _hand(opened: Callable[[], Store]) -> None:
+def _hand(opened: Opened) -> None:
     """Ask and tell each trial in a process of its own, as several terminals do."""
     told = ({"distance": 0.25}, {"failed": "the motor cut out"}, {})
     for number in range(3):
@@ -129,7 +149,7 @@ def _hand(opened: Callable[[], Store]) -> None:
     running.ask({"goal": -1.0})
 
 
-def _resumed(opened: Callable[[], Store]) -> None:
+def _resumed(opened: Opened) -> None:
     """Be killed in an execution, twice; then resume, and audit."""
     for _ in range(2):
         child = os.fork()
@@ -140,7 +160,7 @@ def _resumed(opened: Callable[[], Store]) -> None:
     campaign("resumed", opened()).run(BUDGET - 1).audit(BUDGET)
 
 
-def _distance(opened: Callable[[], Store]) -> None:
+def _distance(opened: Opened) -> None:
     """Go on behind trials whose distance raises; mend it, and measure again."""
     running = campaign("distance", opened())
     for _ in range(BUDGET):
@@ -154,6 +174,21 @@ def _distance(opened: Callable[[], Store]) -> None:
         campaign("distance", opened(), mended=True).remeasure()
 
 
+def _full(opened: Opened) -> None:
+    """Keep an execution beside its store, tell it, and go on."""
+    running = campaign("full", opened(Full))
+    with contextlib.suppress(StoreAccessError):
+        running.run(BUDGET)
+    assert isinstance(running.store, Marked)
+    assert running.store.path is not None
+    (kept,) = running.store.path.parent.glob("*.trial-2.npz")
+    running.store.say({"kept": str(Path(STORE).parent / kept.name), "digest": digest(kept.read_bytes())})
+    running.store.close()
+    running = campaign("full", opened())
+    running.tell(2, Trajectory.from_npz(kept))
+    running.run(BUDGET)
+
+
 SCRIPTS: dict[str, Script] = {
     "run": _run,
     "failures": _failures,
@@ -161,12 +196,13 @@ SCRIPTS: dict[str, Script] = {
     "hand": _hand,
     "resumed": _resumed,
     "distance": _distance,
+    "full": _full,
 }
 
 
 def main(name: str, folder: str, marks: str, synchronous: str | None = None) -> None:
     """Run a campaign."""
-    SCRIPTS[name](lambda: Marked(Path(folder) / STORE, Path(marks), synchronous))
+    SCRIPTS[name](lambda kind=Marked: kind(Path(folder) / STORE, Path(marks), synchronous))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from typing import IO, Any
 import numpy as np
 
 from ctxval.arrays import Array
+from ctxval.disks import sync_folder
 from ctxval.errors import CtxvalError, DistanceError, InputError
 from ctxval.texts import text_of
 from ctxval.trajectory import Trajectory
@@ -151,6 +152,7 @@ def kept_beside(trial: Trial, trajectory: Trajectory | None, store: Path | None)
             except OSError:
                 break
             if _flushed(file, content):
+                sync_folder(folder)
                 return path
             with contextlib.suppress(OSError):
                 path.unlink()
