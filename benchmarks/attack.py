@@ -18,7 +18,7 @@ import sys
 import tempfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
@@ -290,12 +290,14 @@ def _some(given: tuple[str, int, int, int, str, int]) -> tuple[str, int, Counter
     return name, last, counts, found
 
 
-def _chunks(inputs: int, done: dict[str, Any], seed: int, base: Path, apart: int, only: list[str]) -> Iterator[Any]:
+def _chunks(inputs: int, done: dict[str, Any], seed: int, base: Path, apart: int, only: list[str]) -> list[Any]:
+    """Return what is to be done, all families side by side."""
+    found = []
     for name in only:
         target = round(FAMILIES[name].share * inputs)
-        first = done.get(name, {}).get("inputs", 0)
-        for begin in range(first, target, 40):
-            yield name, begin, min(begin + 40, target), seed, str(base), apart
+        for begin in range(done.get(name, {}).get("inputs", 0), target, CHUNK):
+            found.append((begin / target, (name, begin, min(begin + CHUNK, target), seed, str(base), apart)))
+    return [job for _, job in sorted(found, key=lambda item: item[0])]
 
 
 def attack(
@@ -312,7 +314,7 @@ def attack(
     """Inflict inputs; return counts of each family, and what went wrong."""
     counts = {name: Counter(kept) for name, kept in done.items()}
     wrong: list[dict[str, Any]] = []
-    jobs = list(_chunks(inputs, done, seed, base, apart, list(FAMILIES) if only is None else only))
+    jobs = _chunks(inputs, done, seed, base, apart, list(FAMILIES) if only is None else only)
     with ProcessPoolExecutor(workers, mp_context=get_context("fork"), initializer=_warm) as pool:
         for name, _, new, found in pool.map(_some, jobs):
             kept = counts.setdefault(name, Counter())
@@ -346,6 +348,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", nargs="*", choices=list(FAMILIES), default=list(FAMILIES))
+    parser.add_argument("--anew", action="store_true", help="begin with the first input again, after a change of code")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--findings", type=Path, help="file for what went wrong, one JSON object a line")
     parser.add_argument("--repeat", nargs=2, metavar=("FAMILY", "NUMBER"))
@@ -356,7 +359,7 @@ def main() -> None:
         if given.repeat:
             print(inflict(given.repeat[0], int(given.repeat[1]), given.seed, base, given.keep))
             return
-        kept = json.loads(given.results.read_text()) if given.results.exists() else {}
+        kept = json.loads(given.results.read_text()) if given.results.exists() and not given.anew else {}
         done = kept["families"] if kept.get("seed") == given.seed else {}
 
         def on_chunk(counts: dict[str, Any], found: list[dict[str, Any]]) -> None:
