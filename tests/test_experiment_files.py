@@ -304,9 +304,9 @@ def test_a_start_that_is_not_the_tasks_is_found() -> None:
     class Elsewhere:
         def execute(self, controller: Any, task: Task) -> Trajectory:
             whole = plain.system.execute(controller, task)
-            return Trajectory(whole.times, whole.states + 0.25, whole.inputs)
+            return Trajectory(whole.times, whole.states + 0.125, whole.inputs)
 
-    assert "starts 0.25 away" in findings(make_validation(system=Elsewhere()), execute=True)["execution"][1]
+    assert "starts 0.125 away" in findings(make_validation(system=Elsewhere()), execute=True)["execution"][1]
 
 
 def test_a_model_whose_batches_differ_is_found() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from ctxval.locks import FileLock
 
 _PREFIX = "ctxval-"
-_OWNED = "owned"
+_OWNED = "lock"
 """The file that is locked as long as the process lives that made the folder."""
 
 
