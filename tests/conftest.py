@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
+from pathlib import Path
 from typing import Any
 
 # Before numpy is imported: small algebra is faster on one thread.
@@ -23,6 +25,17 @@ settings.load_profile("ctxval")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--kills", type=int, default=10, help="how many campaigns are killed and resumed")
+
+
+STATE = "LOCALAPPDATA" if os.name == "nt" else "XDG_STATE_HOME"
+"""The variable that says where the user's key is."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep the user's key out of the real home, also in processes whose environment is taken before a test begins."""
+    folder = tempfile.TemporaryDirectory()
+    os.environ[STATE] = folder.name
+    config.add_cleanup(folder.cleanup)
 
 
 def make_validation(
@@ -46,6 +59,14 @@ def interrupt_at_once() -> None:
     """Do what a person does who presses Ctrl-C twice."""
     signal.raise_signal(signal.SIGINT)
     signal.raise_signal(signal.SIGINT)
+
+
+@pytest.fixture(autouse=True)
+def state_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give each test a user who has no key yet."""
+    folder = tmp_path_factory.mktemp("state")
+    monkeypatch.setenv(STATE, str(folder))
+    return folder
 
 
 @pytest.fixture

@@ -150,7 +150,7 @@ def test_an_experiment_file_runs_and_the_command_line_wins(invoke) -> None:  # t
         (["run", "rig:experiment", "--dim", "3"], "callable with a seed and its options"),
         (["run", "pendulum", "--dim", "3"], "no option of the case 'pendulum' is called 'dim'"),
         (["run", "rig:crashing"], "rig:crashing failed: KeyError"),
-        (["run", "none.toml"], "cannot be read"),
+        (["run", "none.toml"], "there is no experiment file none.toml; `ctxval init none.toml` writes one"),
         (["run", "rig:validation", "--truth"], "truth of 'validation' is not known"),
         (["run", "rig:experiment", "--store", "/proc/none/x.sqlite"], "cannot be used as a store"),
         (["run", "rig:experiment", "--store", "rig.py"], "cannot be read as a store"),

@@ -39,7 +39,8 @@ def test_the_search_of_the_contributing_guide_conforms() -> None:
 
 
 @pytest.mark.parametrize(
-    "document", ["README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/theory.md", "docs/search.md"]
+    "document",
+    ["README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/theory.md", "docs/search.md", "docs/security.md"],
 )
 def test_links_lead_somewhere(document: str) -> None:
     path = ROOT / document

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from ctxval import Campaign, Store, Trajectory, searches
+from ctxval import Campaign, Store, TaskSpace, Trajectory, searches
 from ctxval.certificates import Sample
 from ctxval.cli import app
 from ctxval.controllers import read_controller
@@ -197,8 +197,61 @@ def test_a_manual_system_is_not_run(invoke: Any) -> None:
     assert len(Store("a.sqlite").trials()) == 1
 
 
-def test_parameters_of_a_vector_are_parted_by_commas() -> None:
-    assert parameters_from(["goal=1.5", "amplitudes=1,2,3"]) == {"goal": 1.5, "amplitudes": [1.0, 2.0, 3.0]}
+SPACE = TaskSpace(goal=([0.0, 0.0], [2.0, 2.0], "rad"), load=(0.0, 1.0, "m/s^2"), bare=(-1.0, 1.0))
+WHOLE = {"goal": [1.5, 0.5], "load": 0.2, "bare": -0.001}
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [
+        ["goal=1.5,0.5", "load=0.2", "bare=-1e-3"],
+        ["goal=[1.5, 0.5]", "load = 0.2", "bare=-.001"],
+        ["goal = [1.5, 0.5] rad", "load=0.2 m/s^2", "bare=-0.001"],
+        ["goal=1.5 rad, 0.5 rad", "load=0.2 [m/s^2]", "bare=-0.001"],
+        ["goal[0]=1.5", "goal[1]=0.5 rad", "load=.2", "bare=-0.001"],
+        ["goal[1] = 0.5, goal[0] = 1.5, load = 0.2, bare = -0.001"],
+        ["goal = 1.5, 0.5, load = 0.2, bare = -0.001"],
+        ["goal = [1.5, 0.5], load = 0.2", "bare = -0.001"],
+    ],
+)
+def test_parameters_are_taken_in_every_form_in_which_they_are_printed(texts: list[str]) -> None:
+    assert parameters_from(texts, SPACE) == WHOLE
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("goal[0]=1.5", "goal must be given whole, goal[1] is missing"),
+        ("goal[0]=1, goal[1]=1, goal=1,1", "goal is given once, whole or by its components"),
+        ("goal[2]=1", "did you mean"),
+        ("load[0]=1", "did you mean 'load'"),
+        ("load=0.2 rad", "load must be in m/s^2, got '0.2 rad'"),
+        ("load=0.2 deg/s", "load must be in m/s^2"),
+        ("goal=[1.5 deg, 0.5]", "goal must be in rad"),
+        ("bare=1 m", "bare must be a number without a unit, got '1 m'"),
+        ("goal=[1.5, 0.5", "goal must be a list such as [1.5, 0.5], got '[1.5, 0.5'"),
+        ("load=one", "load must be a number, got 'one'"),
+        ("load=", "load must be a number, got ''"),
+        ("load=1,,2", "load must be a number, got ''"),
+        ("load", "as name=value, got 'load'"),
+        ("=1", "as name=value, got '=1'"),
+        ("", "as name=value, got ''"),
+        ("load=1, load=2", "given once"),
+    ],
+)
+def test_parameters_that_cannot_be_used_are_named(text: str, sentence: str) -> None:
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        SPACE.point(parameters_from([text], SPACE))
+
+
+def test_what_a_person_types_comes_back_as_it_was_typed(invoke: Any) -> None:
+    new(invoke)
+    for number, typed in enumerate(("0.7", "1.1", "1.9 m", "0.9000001"), 1):
+        report = asked(invoke, "a.sqlite", "--set", f"goal={typed}")
+        value = float(typed.removesuffix(" m"))
+        assert report["task"] == {"goal": value}
+        assert read_task(Path(report["folder"]) / "task.json").goal[0] == value
+        assert report["trial"] == number
 
 
 # Telling

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -211,6 +212,7 @@ def old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for file in DATA.glob("*"):
         shutil.copy(file, tmp_path / file.name)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "cart_system", raising=False)
     return tmp_path
 
 

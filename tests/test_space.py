@@ -65,6 +65,28 @@ def test_a_described_point_is_found_again_from_its_json(given_: tuple[TaskSpace,
     np.testing.assert_array_equal(space.point(json.loads(json.dumps(space.describe_point(point)))), point)
 
 
+@given(st.integers(-300, 300), st.integers(1, 600), st.integers(0, 10**9), st.sampled_from([1e-6, 1e-3, 1.0, 1e3, 1e9]))
+def test_a_typed_number_comes_back_as_it_was_typed(low: int, width: int, share: int, scale: float) -> None:
+    space = TaskSpace(p=(low * scale, (low + width) * scale))
+    typed = float(f"{(low + width * share / 10**9) * scale:.9g}")
+    if space.low[0] <= typed <= space.high[0]:
+        unit = space.to_unit([typed])
+        assert space.from_unit(unit)[0] == typed
+        assert space.to_unit(space.from_unit(unit))[0] == unit[0]
+
+
+def test_a_number_with_a_longer_neighbour_comes_back_short() -> None:
+    space = TaskSpace(p=(0.0, 3.0), q=(-0.7, 0.4))
+    assert space.describe_point(space.from_unit(space.to_unit([0.2, -0.0]))) == {"p": 0.2, "q": 0.0}
+    assert 0.0 + (0.2 / 3.0) * 3.0 != 0.2 or 0.1 * 3.0 != 0.3  # without the short form they would not
+    unit = np.random.default_rng(0).random((1000, 2))
+    np.testing.assert_allclose(space.from_unit(unit), space.low + unit * (space.high - space.low), rtol=0, atol=1e-15)
+
+
+def test_units_are_known_by_name() -> None:
+    assert TaskSpace(goal=(0, 1, "rad"), load=([0, 0], [1, 1])).units == {"goal": "rad", "load": ""}
+
+
 def test_points_outside_the_unit_cube_are_clipped_to_the_box(space: TaskSpace) -> None:
     np.testing.assert_array_equal(space.from_unit([-1.0, 2.0, 0.5, 3.0]), [-3, 1, 15, 2])
 

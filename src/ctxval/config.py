@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import shlex
 import tomllib
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,13 @@ from ctxval.campaign import Campaign
 from ctxval.certificates import KINDS, RESOLUTION, USES, require_use
 from ctxval.errors import CertificateError, CtxvalError, InputError, UnknownNameError
 from ctxval.experiment import Experiment, labels_of
-from ctxval.parts import argument, part, reference, require_types, space_of, task_function
+from ctxval.parts import argument, part, require_types, space_of, task_function
+from ctxval.references import accepts, is_function, reference
 from ctxval.searches import NAMES as SEARCHES
 from ctxval.searches import Search, by_name
 from ctxval.store import Store
 from ctxval.texts import reason_of
+from ctxval.trust import code_named, signed, unsigned, verifies
 from ctxval.validation import Validation
 from ctxval.verdict import CONFIDENCE
 
@@ -39,14 +43,14 @@ class SearchTable(BaseModel):
     name: str = DEFAULT_SEARCH
     repeats: int = Field(default=1, ge=1)
 
-    def build(self) -> Search:
-        """Return the search.
+    def build(self, folder: Path | None = None) -> Search:
+        """Return the search; modules that its options name are sought in the folder, the current one by default.
 
         Raises:
             UnknownNameError: there is no such search.
             InputError: it does not take these options.
         """
-        options = {key: argument(value) for key, value in (self.model_extra or {}).items()}
+        options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
         if self.name in SEARCHES:
             options = require_types(f"search {self.name!r}", SEARCHES[self.name], options)
         return by_name(self.name, repeats=self.repeats, **options)
@@ -117,6 +121,7 @@ class Settings(BaseModel):
         confidence: of a validation.
         certificate: what a validation rests on.
         search: which search, and its options.
+        folder: where modules and files are sought, that of the experiment file; the current one if it is not known.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -140,6 +145,7 @@ class Settings(BaseModel):
     seed: int = Field(default=0, ge=0)
     store: Path | None = None
     search: SearchTable = Field(default_factory=SearchTable)
+    folder: Path | None = None
 
     def load(self) -> Experiment:
         """Return the experiment.
@@ -157,7 +163,7 @@ class Settings(BaseModel):
         if "seed" in self.options:
             raise InputError("the seed stands beside [options], not in it.")
         if ":" in self.experiment:
-            return _from_reference(self.experiment, self.seed, self.options)
+            return _from_reference(self.experiment, self.seed, self.options, self.folder)
         return _case(self.experiment, self.seed, self.options)
 
     def _described(self) -> Experiment:
@@ -169,14 +175,14 @@ class Settings(BaseModel):
             )
         if self.options:
             raise InputError("[options] are for an experiment that is made elsewhere; this file describes its own.")
-        space, system = space_of(self.space or {}), part("system", self.system or {})
+        space, system = space_of(self.space or {}), part("system", self.system or {}, self.folder)
         validation = Validation(
             space=space,
-            task=task_function(self.task or {}, space, system),
+            task=task_function(self.task or {}, space, system, self.folder),
             system=system,
-            model=part("model", self.model or {}),
-            synthesizer=part("synthesizer", self.synthesizer or {}),
-            distance=part("distance", self.distance or "FinalState"),
+            model=part("model", self.model or {}, self.folder),
+            synthesizer=part("synthesizer", self.synthesizer or {}, self.folder),
+            distance=part("distance", self.distance or "FinalState", self.folder),
         )
         return Experiment(
             self.name or "experiment",
@@ -189,13 +195,18 @@ class Settings(BaseModel):
     def campaign(self, experiment: Experiment, store: Store | Path) -> Campaign:
         """Return the campaign of what :meth:`load` gave, into a store that then knows how it was made.
 
+        What the store is told is signed by this user, so that its code is run again without a question.
+
         Raises:
             StoreError: the store cannot be used, or was made by another experiment.
-            InputError: there is no such search.
+            InputError: there is no such search, or the key of this user is damaged.
         """
-        search = self.search.build()
+        search = self.search.build(self.folder)
         campaign = Campaign(experiment.validation, search=search, store=store, seed=self.seed, name=experiment.name)
-        campaign.store.keep_settings(self.model_dump(mode="json", exclude={"store"}))
+        plain = self.model_dump(mode="json", exclude={"store"})
+        if self.folder is None and code_named(plain):
+            plain["folder"] = str(Path().resolve())  # from where it is just now
+        campaign.store.keep_settings(signed(plain, campaign.store.settings()))
         return campaign
 
     def certified_as(self, stated: dict[str, Any]) -> Settings:
@@ -228,7 +239,10 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
     Raises:
         InputError: the file cannot be read, or a value in it is not allowed; the message names it.
     """
-    content = _read_toml(Path(target)) if target.endswith(".toml") else {"experiment": target}
+    is_file = target.endswith(".toml")
+    content = _read_toml(Path(target)) if is_file else {"experiment": target}
+    if "folder" in content:
+        raise InputError(f"{target}: no setting is called 'folder'; what the file names is sought beside it.")
     if "experiment" not in content and not any(key in content for key in _WHOLE):
         raise InputError(
             f"{target} must say what to run: experiment = 'pendulum', or 'module:attr', or the whole of it."
@@ -239,27 +253,81 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
     named = given.pop("search", None)
     if named is not None and named != search.get("name", DEFAULT_SEARCH):
         search = {"name": named}  # the options in the file were those of another search
+    whole = {**content, **given, "options": options, "search": search}
+    if is_file or ":" in target:
+        whole["folder"] = (Path(target).parent if is_file else Path()).resolve()
     try:
-        return Settings.model_validate({**content, **given, "options": options, "search": search})
+        return Settings.model_validate(whole)
     except ValidationError as error:
         raise InputError(_sentence(target, error)) from error
 
 
 def stored_settings(store: Store) -> Settings:
-    """Return what was run into a store.
+    """Return what was run into a store, whoever wrote it; its code may be built only by :func:`trusted_settings`.
 
     Raises:
         InputError: the store does not say it, or what it says is not allowed.
     """
-    kept = store.settings()
+    return _of_store(store.settings())
+
+
+def _of_store(kept: dict[str, Any]) -> Settings:
     if not kept:
         raise InputError(
-            "the store does not say what was run into it; only one made by a command can be gone on with by its name."
+            "the store does not say what was run into it, as it was not made by a command; name its experiment where a "
+            "command needs it: --experiment FILE.toml."
         )
     try:
-        return Settings.model_validate(kept)
+        return Settings.model_validate(unsigned(kept))
     except ValidationError as error:
         raise InputError(_sentence("the store's settings", error)) from error
+
+
+def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool = False) -> Settings:
+    """Return the settings from which a store's experiment may be built.
+
+    Args:
+        store: the store; if its settings name code, this user must have signed them.
+        experiment: a case, a file or ``module:attr`` that the user names instead. The seed remains the store's, and so
+            does the search if it names no code.
+        trust: take the store's settings whoever wrote them.
+
+    Raises:
+        InputError: the settings name code, and nobody says that they may; the message shows what would be run.
+    """
+    kept = store.settings()
+    if experiment is not None:
+        return _named_again(kept, experiment)
+    settings, code = _of_store(kept), code_named(kept)
+    if not code or (settings.folder is not None and verifies(kept)):
+        return settings
+    folder = settings.folder or Path().resolve()
+    if trust:
+        return settings.model_copy(update={"folder": folder})
+    more = f" and {len(code) - _SHOWN} more" if len(code) > _SHOWN else ""
+    raise InputError(
+        f"{store.path} would import or run code: {'; '.join(code[:_SHOWN])}{more}, sought in "
+        f"{ascii(str(folder))[:200]}. You did not make the store on this computer, or it was changed since, or an older "
+        "version made it. If you know what "
+        "it is of, say so by --experiment FILE.toml (or module:attr); if you trust what it names, say --trust. The "
+        "store is then signed for you, and you are not asked again."
+    )
+
+
+_SHOWN = 8
+"""Things that would be imported or run which are shown: as many as a message has room for."""
+
+
+def _named_again(kept: dict[str, Any], experiment: str) -> Settings:
+    settings = read_settings(experiment, {})
+    try:
+        stored = _of_store(kept)
+    except InputError:
+        return settings
+    same: dict[str, Any] = {"seed": stored.seed}
+    if not code_named({"search": kept.get("search", {})}):
+        same["search"] = stored.search
+    return settings.model_copy(update=same)
 
 
 def _table(content: dict[str, Any], key: str) -> dict[str, Any]:
@@ -273,6 +341,11 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
             return tomllib.load(file)
+    except FileNotFoundError:
+        name = shlex.quote(str(path))
+        raise InputError(
+            f"there is no experiment file {path}; `ctxval init {name}` writes one to begin with."
+        ) from None
     except OSError as error:
         raise InputError(f"the experiment file {path} cannot be read: {error.strerror}.") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -298,20 +371,28 @@ def _case(name: str, seed: int, options: dict[str, Any]) -> Experiment:
     return cases.by_name(name, seed, **options)
 
 
-def _from_reference(text: str, seed: int, options: dict[str, Any]) -> Experiment:
+def _from_reference(text: str, seed: int, options: dict[str, Any], folder: Path | None) -> Experiment:
     """Return what ``module:attr`` names or makes; this runs the module's code."""
-    found = reference(text)
-    if callable(found) and not isinstance(found, Validation | Experiment):
-        try:
-            found = found(seed, **options)
-        except TypeError as error:
-            raise InputError(f"{text} must be callable with a seed and its options: {error}.") from error
-        except CtxvalError:
-            raise
-        except Exception as error:
-            raise InputError(f"{text} failed: {reason_of(error)}.") from error
+    found = reference(text, folder)
+    if is_function(found) and not isinstance(found, Validation | Experiment):
+        found = _called(text, found, seed, options)
     if isinstance(found, Validation):
         return Experiment(text.partition(":")[2], found)
     if not isinstance(found, Experiment):
-        raise InputError(f"{text} must be an Experiment or a Validation, got {type(found).__name__}.")
+        raise InputError(
+            f"{text} must be an Experiment or a Validation, or a function of a seed that makes one, "
+            f"got {type(found).__name__}."
+        )
     return found
+
+
+def _called(text: str, make: Any, seed: int, options: dict[str, Any]) -> Any:
+    if not accepts(make, 1, **options):
+        given = f" {', '.join(options)}" if options else ""
+        raise InputError(f"{text} must be callable with a seed and its options{given}; it takes {signature(make)}.")
+    try:
+        return make(seed, **options)
+    except CtxvalError:
+        raise
+    except Exception as error:
+        raise InputError(f"{text} failed: {reason_of(error)}.") from error

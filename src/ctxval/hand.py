@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -192,18 +193,82 @@ def _number(where: str, name: str, text: str | None) -> float:
         raise InputError(f"{where}: {name} must be a number, got {text!r}.") from None
 
 
-def parameters_from(settings: Sequence[str]) -> dict[str, Any]:
-    """Return task parameters from texts ``name=value``; the values of a vector are parted by commas.
+_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)", re.DOTALL)
+
+
+def parameters_from(settings: Sequence[str], space: TaskSpace) -> dict[str, Any]:
+    """Return task parameters from texts, in every form in which the command line prints them.
+
+    ``goal=1.5``, ``goal = 1.5 rad``, ``goal=[1.5, 0.5]``, ``goal=1.5,0.5``, ``goal[0]=1.5`` with every other component,
+    and several in one text: ``goal = 1.5, load = 0.2``.
 
     Raises:
-        InputError: a text is no such thing, or a name is there twice.
+        UnknownNameError: there is no such parameter.
+        InputError: a text is no such thing, a unit is not the parameter's, a component is missing or given twice.
     """
     found: dict[str, Any] = {}
     for text in settings:
-        name, equals, value = text.partition("=")
-        name = name.strip()
-        if not equals or not name or name in found:
+        for name, value in _assignments(text):
+            if name in found:
+                raise InputError(f"a task parameter is given once, as name=value, got {text!r}.")
+            found[name] = _value(name, value, space)
+    return _whole(found, space)
+
+
+def _assignments(text: str) -> Iterator[tuple[str, str]]:
+    """Yield names and values; what follows a comma without a name is a further value."""
+    open_name, values = "", list[str]()
+    for part in text.split(","):
+        name, equals, value = part.partition("=")
+        if equals and open_name:
+            yield open_name, ",".join(values)
+        if equals:
+            open_name, values = name.strip(), [value]
+        else:
+            values.append(part)
+        if not open_name:
             raise InputError(f"a task parameter is given once, as name=value, got {text!r}.")
-        numbers = [_number("--set", name, part) for part in value.split(",")]
-        found[name] = numbers if "," in value else numbers[0]
+    yield open_name, ",".join(values)
+
+
+def _value(name: str, text: str, space: TaskSpace) -> float | list[float]:
+    """Return a number or several, with the parameter's unit or without."""
+    base = name if name in space.units else name.partition("[")[0]
+    listed = text.strip()
+    if listed.startswith("["):
+        inside, bracket, unit = listed[1:].partition("]")
+        if not bracket:
+            raise InputError(f"{name} must be a list such as [1.5, 0.5], got {listed!r}.")
+        return [_quantity(name, f"{number} {unit}", space.units.get(base, "")) for number in inside.split(",")]
+    numbers = [_quantity(name, number, space.units.get(base, "")) for number in listed.split(",")]
+    return numbers if len(numbers) > 1 else numbers[0]
+
+
+def _quantity(name: str, text: str, unit: str) -> float:
+    matched = _NUMBER.fullmatch(text)
+    if matched is None:
+        return _number("--set", name, text.strip())  # NaN and infinity are refused elsewhere
+    given = matched[2].strip().removeprefix("[").removesuffix("]").strip()
+    if given and given != unit:
+        declared = f"in {unit}" if unit else "a number without a unit"
+        raise InputError(f"--set: {name} must be {declared}, got {text.strip()!r}.")
+    return float(matched[1])
+
+
+def _whole(given: Mapping[str, Any], space: TaskSpace) -> dict[str, Any]:
+    """Return values by parameter, vectors of which single components were given put together.
+
+    Raises:
+        InputError: a component is missing, or its vector is given too.
+    """
+    found = {name: value for name, value in given.items() if name in space.units or name not in space.names}
+    for name in {name.partition("[")[0]: None for name in given if name not in found}:
+        columns = space.columns(name)
+        components = space.names[columns] if isinstance(columns, slice) else ()
+        missing = [component for component in components if component not in given]
+        if name in found:
+            raise InputError(f"--set: {name} is given once, whole or by its components.")
+        if missing:
+            raise InputError(f"--set: {name} must be given whole, {', '.join(missing)} is missing.")
+        found[name] = [given[component] for component in components]
     return found

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
-import os
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +16,9 @@ from pydantic_core import SchemaError
 from ctxval import controllers, distances, models, systems
 from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
 from ctxval.files import read_bytes
+from ctxval.model import Model
 from ctxval.npz import Archive
+from ctxval.references import accepts, is_function, reference, require_function, require_part
 from ctxval.space import Parameters, TaskSpace
 from ctxval.task import Task
 from ctxval.texts import reason_of
@@ -32,8 +31,29 @@ _ROOMS: dict[str, tuple[ModuleType, tuple[str, ...]]] = {
     "distance": (distances, ("FinalState", "GoalError", "MeanDeviation", "WholeTrajectory")),
 }
 
+DATA_ONLY: dict[str, tuple[str, ...]] = {
+    "system": ("Function", "Manual", "MuJoCo", "Simulated"),
+    "model": _ROOMS["model"][1],
+    "synthesizer": _ROOMS["synthesizer"][1],
+    "distance": _ROOMS["distance"][1],
+}
+"""Parts that run no code but what ``{ref = "module:attr"}`` gives them; the others run programs or foreign code."""
 
-def part(kind: str, given: str | Mapping[str, Any]) -> Any:
+_FILES = {"FMU": "path", "MuJoCo": "mjcf", "Onnx": "source", "OnnxPolicy": "source"}
+"""Arguments that are files, by part."""
+
+_FUNCTIONS = {
+    "step": (2, "(x, u) -> x_next"),
+    "execute": (2, "(controller, task) -> trajectory"),
+    "get_state": (1, "environment -> x"),
+    "set_state": (2, "(environment, x)"),
+    "observe": (3, "(t, x, task) -> observations"),
+    "policy": (3, "(t, x, task) -> u"),
+}
+"""Arguments of built-in parts that are functions: of how many arguments, and which."""
+
+
+def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) -> Any:
     """Return a system, model, synthesizer or distance.
 
     Args:
@@ -41,6 +61,7 @@ def part(kind: str, given: str | Mapping[str, Any]) -> Any:
         given: ``module:attr``; or a table with ``type``, a built-in name or ``module:attr``, and its arguments. An
             argument ``{ref = "module:attr"}`` is what that names. A model with ``data``, files of trajectories, is
             learned from them.
+        folder: where files and modules are sought; the current folder by default.
 
     Raises:
         UnknownNameError: there is no such part, or it takes no such argument.
@@ -50,27 +71,55 @@ def part(kind: str, given: str | Mapping[str, Any]) -> Any:
     name = table.pop("type", None)
     if not isinstance(name, str):
         raise InputError(f"[{kind}] needs a type, such as {_ROOMS[kind][1][0]!r} or 'module:attr'.")
-    arguments = {key: argument(value) for key, value in table.items()}
-    build = _named(kind, name)
-    if ":" in name and not isinstance(build, type) and not _is_maker(build, arguments):
-        return build
-    if kind == "model" and "data" in arguments and hasattr(build, "fit"):
-        build, arguments = build.fit, {**arguments, "data": recorded(arguments["data"])}
-    return made(f"the {kind} {name}", build, arguments)
-
-
-def _is_maker(found: Any, arguments: Mapping[str, Any]) -> bool:
-    """Return whether what a reference names makes the part, and is not the part itself."""
-    return inspect.isfunction(found) and bool(arguments)
-
-
-def _named(kind: str, name: str) -> Any:
-    room, names = _ROOMS[kind]
+    what = f"the {kind} {name}"
     if ":" in name:
-        return reference(name)
+        arguments = {key: argument(value, folder) for key, value in table.items()}
+        return _own(kind, what, reference(name, folder), arguments, folder)
+    room, names = _ROOMS[kind]
     if name not in names:
         raise UnknownNameError.among(kind, name, names)
-    return getattr(room, name)
+    arguments = {key: argument(value, folder) for key, value in _beside(name, table, folder).items()}
+    for key, value in arguments.items():
+        if key in _FUNCTIONS and isinstance(table[key], Mapping) and not isinstance(value, Model):
+            require_function(f"{key} of {what}", value, *_FUNCTIONS[key])
+    return _built(kind, what, getattr(room, name), arguments, folder)
+
+
+def _own(kind: str, what: str, found: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
+    """Return the part that a reference names: an object, or what a class or a function makes; checked before a call."""
+    if isinstance(found, type):
+        return require_part(kind, what, _built(kind, what, require_part(kind, what, found), arguments, folder))
+    if inspect.isfunction(found) and (arguments or not _is_part(kind, found)):
+        if not arguments and not accepts(found, 0):
+            require_part(kind, what, found)  # says what is wrong
+        return require_part(kind, what, _built(kind, what, found, arguments, folder))
+    if arguments:
+        raise InputError(f"{what} is an object already, so it takes no arguments, got {', '.join(arguments)}.")
+    return require_part(kind, what, found)
+
+
+def _is_part(kind: str, found: Any) -> bool:
+    """Return whether a function is a part itself, and does not make one."""
+    return kind in ("model", "distance") and is_function(found) and accepts(found, 2 if kind == "model" else 3)
+
+
+def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
+    if kind == "model" and "data" in arguments and hasattr(build, "fit"):
+        build, arguments = build.fit, {**arguments, "data": recorded(arguments["data"], folder)}
+    return made(what, build, arguments)
+
+
+def _beside(name: str, table: Mapping[str, Any], folder: Path | None) -> dict[str, Any]:
+    """Return a built-in part's arguments, with the files that it names in the folder."""
+    found = dict(table)
+    if folder is None:
+        return found
+    if name == "Subprocess":
+        found["folder"] = str(folder / str(found.get("folder", "")))
+    file = found.get(_FILES.get(name, ""))
+    if isinstance(file, str) and "<" not in file:  # which begins a model of MuJoCo as text
+        found[_FILES[name]] = str(folder / file)
+    return found
 
 
 def made(what: str, build: Any, arguments: Mapping[str, Any]) -> Any:
@@ -93,36 +142,32 @@ def made(what: str, build: Any, arguments: Mapping[str, Any]) -> Any:
         raise InputError(f"{what} cannot be made: {reason_of(error)}.") from error
 
 
-def argument(value: Any) -> Any:
-    """Return an argument as it is, or what ``{ref = "module:attr"}`` names."""
+def argument(value: Any, folder: Path | None = None) -> Any:
+    """Return an argument as it is, or what ``{ref = "module:attr"}`` names.
+
+    Raises:
+        InputError: what is named cannot be loaded, or is a builtin function, a method or a module.
+    """
     if isinstance(value, Mapping):
         if set(value) == {"ref"}:
-            return reference(str(value["ref"]))
-        return {key: argument(item) for key, item in value.items()}
+            return _referred(str(value["ref"]), folder)
+        return {key: argument(item, folder) for key, item in value.items()}
     return value
 
 
-def reference(text: str) -> Any:
-    """Import ``module:attr``; this runs the module's code.
-
-    Raises:
-        InputError: it cannot be loaded.
-    """
-    module_name, _, attribute = text.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    try:
-        return getattr(importlib.import_module(module_name), attribute)
-    except (ImportError, AttributeError, ValueError, TypeError) as error:
-        raise InputError(f"{text} cannot be loaded: {error}.") from error
-    except CtxvalError:
-        raise
-    except Exception as error:
-        raise InputError(f"{module_name} failed while it was loaded: {reason_of(error)}.") from error
+def _referred(text: str, folder: Path | None) -> Any:
+    found = reference(text, folder)
+    if inspect.ismodule(found) or (inspect.isroutine(found) and not inspect.isfunction(found)):
+        raise InputError(f"{text} must be an object, a class or a function written in Python, got {found!r}.")
+    return found
 
 
-def recorded(files: Any) -> Transitions:
+def recorded(files: Any, folder: Path | None = None) -> Transitions:
     """Return the transitions in recorded trajectories, CSV or NPZ, or in an NPZ file with x, u and x_next.
+
+    Args:
+        files: one or several.
+        folder: where they are sought; the current folder by default.
 
     Raises:
         InputError: a file cannot be read.
@@ -130,7 +175,7 @@ def recorded(files: Any) -> Transitions:
     paths = [files] if isinstance(files, str) else files
     if not isinstance(paths, list) or not paths or not all(isinstance(path, str) for path in paths):
         raise InputError(f"data must be files of recorded trajectories, got {files!r}.")
-    return Transitions.joined([_transitions(Path(path)) for path in paths])
+    return Transitions.joined([_transitions(Path(folder or "", path)) for path in paths])
 
 
 def _transitions(path: Path) -> Transitions:
@@ -185,14 +230,14 @@ def _component(entry: float | str, p: Parameters) -> Any:
 _TASK_KEYS = ("initial_state", "goal", "horizon", "dt")
 
 
-def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any) -> Any:
+def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any, folder: Path | None = None) -> Any:
     """Return the map p -> task of an experiment file: ``module:attr``, or a table.
 
     Raises:
         InputError: the table misses something, or names what is no task parameter.
     """
     if isinstance(given, str):
-        return reference(given)
+        return require_function(f"the task {given}", reference(given, folder), 1, "p -> Task")
     for key in given:
         if key not in _TASK_KEYS:
             raise UnknownNameError.among("entry of [task]", key, _TASK_KEYS)

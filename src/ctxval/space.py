@@ -80,11 +80,17 @@ class TaskSpace:
         self.names: tuple[str, ...] = tuple(names)
         self.low: Array = np.concatenate(lows)
         self.high: Array = np.concatenate(highs)
+        self._decimals = _decimals(self.low, self.high)
 
     @property
     def dimension(self) -> int:
         """The number of scalar parameters, the paper's |P|."""
         return len(self.names)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The unit of each parameter by its name, empty if it has none."""
+        return dict(self._units)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -125,9 +131,12 @@ class TaskSpace:
         return (rows - self.low) / (self.high - self.low)
 
     def from_unit(self, unit: ArrayLike) -> Array:
-        """Map points ``(..., d)`` of the unit cube to the space."""
+        """Map points ``(..., d)`` of the unit cube to the space; of numbers that are one point there, the shortest."""
         rows = require_shape("points", as_floats("points", unit), (self.dimension,))
-        return np.clip(self.low + rows * (self.high - self.low), self.low, self.high)
+        points = np.clip(self.low + rows * (self.high - self.low), self.low, self.high)
+        # What a person typed as 0.2 comes back as 0.2, and not as 0.19999999999999996.
+        short = np.clip(np.rint(points * self._decimals) / self._decimals + 0.0, self.low, self.high)
+        return np.where((short - self.low) / (self.high - self.low) == rows, short, points)
 
     def parameters(self, points: ArrayLike) -> Parameters:
         """Return points ``(..., d)`` of the space as named parameters.
@@ -204,6 +213,12 @@ class TaskSpace:
     def _grid_axes(self, per_axis: int) -> Iterator[Array]:
         axes = [np.linspace(low, high, per_axis) for low, high in zip(self.low, self.high, strict=True)]
         return iter(np.meshgrid(*axes, indexing="ij"))
+
+
+def _decimals(low: Array, high: Array) -> Array:
+    """Return, for each column, the power of ten whose multiples have twelve digits; it is exact as a float."""
+    digits = np.ceil(np.log10(np.maximum(np.abs(low), np.abs(high))))
+    return np.asarray(10.0 ** np.clip(12 - digits, 0, 22))
 
 
 def _bounds(name: str, bound: Any) -> tuple[Array, Array, str]:

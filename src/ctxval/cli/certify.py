@@ -30,6 +30,7 @@ from ctxval.cli.base import (
     print_verdict,
     progress,
 )
+from ctxval.cli.trust import Named, Trust, open_store, settings_of
 from ctxval.config import CertificateTable, Settings, stored_settings
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 from ctxval.store import Store
@@ -60,6 +61,8 @@ def certify_store(
         float | None,
         typer.Option(help="posterior: how far from every trial a task may be, in diagonals of the task space."),
     ] = None,
+    experiment: Named = None,
+    trust: Trust = False,
     as_json: AsJson = False,
 ) -> Any:
     """Say what the trials of a store prove, and with what confidence; nothing is executed but for an audit.
@@ -69,7 +72,9 @@ def certify_store(
     given = {"discard": discard, "constant": constant, "theorem": theorem, "volume": volume}
     given |= {"stochastic": stochastic, "resolution": resolution}
     opened = Store.existing(store)
-    planned = _planned(opened)
+    if audit is None and (trust or experiment is not None):
+        raise InputError("--trust and --experiment are for an --audit; nothing is imported or run without one.")
+    planned = _planned(opened) if audit is None else settings_of(opened, experiment, trust)
     confidence = _first(confidence, planned.confidence)
     table = planned.certificate
     volume = _first(volume, table.volume)
@@ -90,7 +95,7 @@ def certify_store(
     _require_together(given, limit)
     if audit is not None:
         require_possible([trial.origin for trial in opened.trials()], chosen, options)
-        _run_audit(opened, audit, show=not as_json)
+        _run_audit(open_store(opened, store, experiment, trust).campaign, audit, show=not as_json)
     trials = opened.trials()
     found = None if limit is None else counterexample(trials, limit)
     verdict: Verdict | None
@@ -176,9 +181,7 @@ def _certificate(
         return None, str(error)
 
 
-def _run_audit(store: Store, draws: int, *, show: bool) -> None:
-    settings = stored_settings(store)
-    campaign = settings.campaign(settings.load(), store)
+def _run_audit(campaign: Campaign, draws: int, *, show: bool) -> None:
     _require_closed(campaign)
     drawn = sum(trial.origin == "iid" for trial in campaign.trials)
     with progress(campaign, campaign.executions + max(0, draws - drawn), show=show) as on_trial:

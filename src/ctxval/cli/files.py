@@ -56,7 +56,7 @@ step = {{ ref = "{module}:step" }}
 #   type = "my_module:MySystem"
 
 [model]                 # the learned one
-type = "Linear"         # or Onnx, with path = "model.onnx"; or my_module:my_model
+type = "Linear"         # or Onnx, with source = "model.onnx"; or my_module:my_model
 A = [[1.0, 0.05], [0.0, 1.0]]
 B = [[0.0], [0.05]]
 # Learned from recorded trajectories instead of A and B: data = ["run1.csv", "run2.npz"]
@@ -139,7 +139,7 @@ def check(
     """Check an experiment and its parts against each other; nothing is executed unless you say so."""
     settings = read_settings(target, {})
     experiment = settings.load()
-    settings.search.build()
+    settings.search.build(settings.folder)
     findings = check_experiment(experiment, execute=execute, seed=settings.seed)
     if not as_json:
         _print_findings(findings)

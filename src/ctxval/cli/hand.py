@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import shlex
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +11,8 @@ import typer
 
 from ctxval.campaign import Campaign, OpenTrial
 from ctxval.cli.base import AsJson, app, command, out
-from ctxval.config import Settings, read_settings, stored_settings
+from ctxval.cli.trust import Named, Opened, Trust, open_store
+from ctxval.config import read_settings
 from ctxval.errors import InputError
 from ctxval.experiment import Experiment
 from ctxval.hand import parameters_from, read_recording, read_runs, write_files
@@ -32,7 +32,14 @@ Resample = Annotated[
 StartTolerance = Annotated[
     float | None, typer.Option(help="By how much a recording may start elsewhere, as a share of what the model covers.")
 ]
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="A task parameter; once for each.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="A task parameter, once for each: goal=1.5, goal='1.5 rad', goal=[1.5, 0.5] or goal[0]=1.5.",
+    ),
+]
 StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials.")]
 
 
@@ -55,16 +62,19 @@ def ask(
     trial: Annotated[int | None, typer.Option(help="Write the files of this open trial again.")] = None,
     search: Annotated[str | None, typer.Option(help="How tasks are chosen, for a new store.")] = None,
     seed: Annotated[int | None, typer.Option(help="For a new store.")] = None,
+    experiment: Named = None,
+    trust: Trust = False,
     as_json: AsJson = False,
 ) -> Any:
     """Open the next trial and write its task and its controller, for a rig that people operate."""
     if sum((bool(parameters), draw, again is not None, trial is not None)) > 1:
         raise InputError("of --set, --draw, --again and --trial only one can be given.")
-    opened = _opened(target, {"store": store, "search": search, "seed": seed})
+    opened = _opened(target, {"store": store, "search": search, "seed": seed}, experiment, trust)
     if trial is not None:
         found = opened.campaign.reopen(trial)
     else:
-        chosen = parameters_from(parameters) if parameters else _parameters_of(opened.campaign, again)
+        space = opened.experiment.validation.space
+        chosen = parameters_from(parameters, space) if parameters else _parameters_of(opened.campaign, again)
         found = opened.campaign.ask(chosen, draw=draw, wait=_WAIT)
     folder = opened.path.with_suffix(".trials") / str(found.number) if out_folder is None else out_folder
     report = {
@@ -101,6 +111,8 @@ def tell(
     failed: Annotated[str | None, typer.Option(help="Why there is no result.")] = None,
     resample: Resample = False,
     start_tolerance: StartTolerance = None,
+    experiment: Named = None,
+    trust: Trust = False,
     as_json: AsJson = False,
 ) -> Any:
     """Say how an open trial ended."""
@@ -112,7 +124,7 @@ def tell(
     if trajectory is None and npz is None and (resample or start_tolerance is not None):
         raise InputError("--resample and --start-tolerance are for a recording, and there is none.")
     tolerance = _tolerance(start_tolerance)
-    opened = _of_store(store)
+    opened = open_store(Store.existing(store), store, experiment, trust)
     recording = None
     path = trajectory or npz
     if path is not None:
@@ -140,12 +152,15 @@ def import_runs(
     parameters: Set = None,
     resample: Resample = False,
     start_tolerance: StartTolerance = None,
+    experiment: Named = None,
+    trust: Trust = False,
     as_json: AsJson = False,
 ) -> Any:
     """Take in executions that were made before; each counts as one, and none is taken in twice."""
     tolerance = _tolerance(start_tolerance)
-    opened = _of_store(store)
-    runs = read_runs(files, parameters_from(parameters) if parameters else None, opened.experiment.validation.space)
+    opened = open_store(Store.existing(store), store, experiment, trust)
+    space = opened.experiment.validation.space
+    runs = read_runs(files, parameters_from(parameters, space) if parameters else None, space)
     checked = []
     for run in runs:
         # All of it before any is stored.
@@ -183,38 +198,23 @@ def _tolerance(given: float | None) -> float:
     return START if given is None else given
 
 
-@dataclass(frozen=True, eq=False)
-class _Opened:
-    """A store with what was run into it."""
-
-    settings: Settings
-    experiment: Experiment
-    campaign: Campaign
-    path: Path
-
-
-def _opened(target: str, overrides: dict[str, Any]) -> _Opened:
+def _opened(target: str, overrides: dict[str, Any], experiment: str | None, trust: bool) -> Opened:
     path = Path(target)
     if path.suffix != ".toml" and path.is_file():
         if any(value is not None for value in overrides.values()):
             raise InputError(f"{target} is a store, which knows its search and its seed; give no other.")
-        return _of_store(path)
+        return open_store(Store.existing(path), path, experiment, trust)
     if path.suffix in _STORES:
         raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` makes one.")
+    if experiment is not None or trust:
+        raise InputError(f"--experiment and --trust are for a store, and {target} is what a store is of.")
     settings = read_settings(target, overrides)
-    experiment = settings.load()
-    where = settings.store_path(experiment.name)
-    return _Opened(settings, experiment, settings.campaign(experiment, where), where)
+    made = settings.load()
+    where = settings.store_path(made.name)
+    return Opened(settings, made, settings.campaign(made, where), where)
 
 
-def _of_store(path: Path) -> _Opened:
-    store = Store.existing(path)
-    settings = stored_settings(store)
-    experiment = settings.load()
-    return _Opened(settings, experiment, settings.campaign(experiment, store), path)
-
-
-def _ended(trial: Trial, opened: _Opened) -> dict[str, Any]:
+def _ended(trial: Trial, opened: Opened) -> dict[str, Any]:
     return {
         "trial": trial.number,
         "task": trial.parameters,

@@ -46,6 +46,7 @@ class Subprocess:
         timeout: seconds after which the command and all that it started are killed.
         states, inputs: names and units for the files.
         keep: a folder in which the folders of all executions stay, for a look at what went wrong.
+        folder: where files that the command names are sought; the current folder if they are not there, or by default.
 
     Raises:
         InputError: the program does not exist, or the timeout is not positive.
@@ -59,9 +60,11 @@ class Subprocess:
         states: Mapping[str, str] | None = None,
         inputs: Mapping[str, str] | None = None,
         keep: str | Path | None = None,
+        folder: str | Path | None = None,
     ) -> None:
         self.command = shlex.split(command) if isinstance(command, str) else [str(part) for part in command]
-        if not self.command or shutil.which(self.command[0]) is None:
+        self._located = self.command if folder is None else _located(self.command, Path(folder).absolute())
+        if not self.command or shutil.which(self._located[0]) is None:
             raise InputError(f"the command must begin with a program that can be run, got {self.command}.")
         if not (isinstance(timeout, int | float) and timeout > 0):
             raise InputError(f"timeout must be a positive number of seconds, got {timeout!r}.")
@@ -90,7 +93,7 @@ class Subprocess:
                 path = folder / f"controller.{kind}"
                 write_controller(path, controller, dt=task.dt, states=self.states, inputs=self.inputs)
             # On another machine it may not be there.
-            _run([*self.command, str(folder)], self._home if self._home.is_dir() else None, folder, self.timeout)
+            _run([*self._located, str(folder)], self._home if self._home.is_dir() else None, folder, self.timeout)
             return _of_task(_trajectory(folder, task), task)
 
     @contextlib.contextmanager
@@ -101,6 +104,14 @@ class Subprocess:
             return
         with scratch() as folder:
             yield folder
+
+
+def _located(command: Sequence[str], folder: Path) -> list[str]:
+    """Return a command with the whole paths of files in the folder; a program by its name alone stays as it is."""
+    return [
+        str(folder / part) if (i or os.path.dirname(part)) and (folder / part).is_file() else part
+        for i, part in enumerate(command)
+    ]
 
 
 def _run(command: Sequence[str], home: Path | None, folder: Path, timeout: float) -> None:

@@ -1,0 +1,93 @@
+"""Building the experiment that a store names, if its user may be taken to know what that is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ctxval.campaign import Campaign
+from ctxval.cli.base import err
+from ctxval.config import Settings, trusted_settings
+from ctxval.errors import InputError
+from ctxval.experiment import Experiment
+from ctxval.store import Store
+from ctxval.trust import code_named, verifies, why_no_key
+
+Trust = Annotated[
+    bool,
+    typer.Option("--trust", help="Import and run the code that the store names, although you did not make the store."),
+]
+Named = Annotated[
+    str | None,
+    typer.Option(
+        "--experiment",
+        metavar="CASE|FILE.toml|module:attr",
+        help="The store's experiment, if what the store itself names is not to be trusted.",
+    ),
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A store with what was run into it."""
+
+    settings: Settings
+    experiment: Experiment
+    campaign: Campaign
+    path: Path
+
+
+def settings_of(store: Store, experiment: str | None, trust: bool) -> Settings:
+    """Return the settings that the experiment of a store may be built from.
+
+    Raises:
+        InputError: they name code, and nobody says that it may be run.
+    """
+    if experiment is not None and trust:
+        raise InputError("of --trust and --experiment only one can be given.")
+    return trusted_settings(store, experiment=experiment, trust=trust)
+
+
+def open_store(store: Store, path: Path, experiment: str | None, trust: bool) -> Opened:
+    """Build the experiment of a store, and its campaign.
+
+    Args:
+        store: the store.
+        path: of its file, as it was typed.
+        experiment: what the user names instead of what the store names.
+        trust: whether the user trusts what the store names.
+
+    Raises:
+        InputError: it names code, and nobody says that it may be run.
+        StoreError: it was made by another experiment.
+    """
+    settings = settings_of(store, experiment, trust)
+    asked = (trust or experiment is not None) and not verifies(store.settings())
+    made = _load(settings)
+    opened = Opened(settings, made, settings.campaign(made, store), path)
+    if asked and code_named(store.settings()):
+        _say_signed(opened)
+    return opened
+
+
+def _load(settings: Settings) -> Experiment:
+    try:
+        return settings.load()
+    except InputError as error:
+        if settings.folder is None or settings.folder.is_dir():
+            raise
+        raise InputError(
+            f"{error} It is to be sought in {str(settings.folder)!a}, which is no folder any more: name the experiment "
+            "where it is now, --experiment FILE.toml or module:attr."
+        ) from error
+
+
+def _say_signed(opened: Opened) -> None:
+    reason = why_no_key()
+    sentence = f"{opened.path} is signed for you now, and you are not asked again."
+    if reason is not None:
+        sentence = f"{opened.path} cannot be signed for you, and you will be asked again: {reason}."
+    err.say(sentence)
