@@ -192,8 +192,20 @@ class Settings(BaseModel):
             inputs=labels_of(self.inputs),
         )
 
-    def campaign(self, experiment: Experiment, store: Store | Path) -> Campaign:
+    def campaign(
+        self,
+        experiment: Experiment,
+        store: Store | Path,
+        *,
+        accept_change: str | None = None,
+        remeasure: bool = False,
+    ) -> Campaign:
         """Return the campaign of what :meth:`load` gave, into a store that then knows how it was made.
+
+        Args:
+            experiment: of these settings.
+            store: the store, or where it is.
+            accept_change, remeasure: as :class:`ctxval.Campaign` takes them.
 
         What the store is told is signed by this user, so that its code is run again without a question.
 
@@ -202,7 +214,15 @@ class Settings(BaseModel):
             InputError: there is no such search, or the key of this user is damaged.
         """
         search = self.search.build(self.folder)
-        campaign = Campaign(experiment.validation, search=search, store=store, seed=self.seed, name=experiment.name)
+        campaign = Campaign(
+            experiment.validation,
+            search=search,
+            store=store,
+            seed=self.seed,
+            name=experiment.name,
+            accept_change=accept_change,
+            remeasure=remeasure,
+        )
         plain = self.model_dump(mode="json", exclude={"store"})
         if self.folder is None and code_named(plain):
             plain["folder"] = str(Path().resolve())  # from where it is just now
@@ -307,10 +327,9 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
     more = f" and {len(code) - _SHOWN} more" if len(code) > _SHOWN else ""
     raise InputError(
         f"{store.path} would import or run code: {'; '.join(code[:_SHOWN])}{more}, sought in "
-        f"{ascii(str(folder))[:200]}. You did not make the store on this computer, or it was changed since, or an older "
-        "version made it. If you know what "
-        "it is of, say so by --experiment FILE.toml (or module:attr); if you trust what it names, say --trust. The "
-        "store is then signed for you, and you are not asked again."
+        f"{ascii(str(folder))[:200]}. You did not make the store on this computer, or it was changed since, or an "
+        "older version made it. If you know what it is of, say so by --experiment FILE.toml (or module:attr); if you "
+        "trust what it names, say --trust. The store is then signed for you, and you are not asked again."
     )
 
 

@@ -97,7 +97,8 @@ _OTHER_CHANGED = (
     'give the reason: --accept-change "WHY" (accept_change= in Python); otherwise use another store'
 )
 _DISTANCE_CHANGED = (
-    "`ctxval remeasure STORE` (remeasure=True in Python) computes it anew for what was executed, without an execution"
+    "`ctxval remeasure STORE --experiment FILE.toml`, or whatever names the experiment (remeasure=True in Python), "
+    "computes it anew for what was executed, without an execution"
 )
 
 

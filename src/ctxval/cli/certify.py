@@ -30,7 +30,7 @@ from ctxval.cli.base import (
     print_verdict,
     progress,
 )
-from ctxval.cli.trust import Named, Trust, open_store, settings_of
+from ctxval.cli.trust import AcceptChange, Named, Trust, open_store, settings_of
 from ctxval.config import CertificateTable, Settings, stored_settings
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 from ctxval.store import Store
@@ -63,6 +63,7 @@ def certify_store(
     ] = None,
     experiment: Named = None,
     trust: Trust = False,
+    accept_change: AcceptChange = None,
     as_json: AsJson = False,
 ) -> Any:
     """Say what the trials of a store prove, and with what confidence; nothing is executed but for an audit.
@@ -95,7 +96,8 @@ def certify_store(
     _require_together(given, limit)
     if audit is not None:
         require_possible([trial.origin for trial in opened.trials()], chosen, options)
-        _run_audit(open_store(opened, store, experiment, trust).campaign, audit, show=not as_json)
+        made = open_store(opened, store, experiment, trust, accept_change)
+        _run_audit(made.campaign, audit, show=not as_json)
     trials = opened.trials()
     found = None if limit is None else counterexample(trials, limit)
     verdict: Verdict | None

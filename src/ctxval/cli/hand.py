@@ -11,7 +11,7 @@ import typer
 
 from ctxval.campaign import Campaign, OpenTrial
 from ctxval.cli.base import AsJson, app, command, out
-from ctxval.cli.trust import Named, Opened, Trust, open_store
+from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, open_store
 from ctxval.config import read_settings
 from ctxval.errors import InputError
 from ctxval.experiment import Experiment
@@ -64,12 +64,13 @@ def ask(
     seed: Annotated[int | None, typer.Option(help="For a new store.")] = None,
     experiment: Named = None,
     trust: Trust = False,
+    accept_change: AcceptChange = None,
     as_json: AsJson = False,
 ) -> Any:
     """Open the next trial and write its task and its controller, for a rig that people operate."""
     if sum((bool(parameters), draw, again is not None, trial is not None)) > 1:
         raise InputError("of --set, --draw, --again and --trial only one can be given.")
-    opened = _opened(target, {"store": store, "search": search, "seed": seed}, experiment, trust)
+    opened = _opened(target, {"store": store, "search": search, "seed": seed}, experiment, trust, accept_change)
     if trial is not None:
         found = opened.campaign.reopen(trial)
     else:
@@ -113,6 +114,7 @@ def tell(
     start_tolerance: StartTolerance = None,
     experiment: Named = None,
     trust: Trust = False,
+    accept_change: AcceptChange = None,
     as_json: AsJson = False,
 ) -> Any:
     """Say how an open trial ended."""
@@ -124,7 +126,7 @@ def tell(
     if trajectory is None and npz is None and (resample or start_tolerance is not None):
         raise InputError("--resample and --start-tolerance are for a recording, and there is none.")
     tolerance = _tolerance(start_tolerance)
-    opened = open_store(Store.existing(store), store, experiment, trust)
+    opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
     recording = None
     path = trajectory or npz
     if path is not None:
@@ -154,11 +156,12 @@ def import_runs(
     start_tolerance: StartTolerance = None,
     experiment: Named = None,
     trust: Trust = False,
+    accept_change: AcceptChange = None,
     as_json: AsJson = False,
 ) -> Any:
     """Take in executions that were made before; each counts as one, and none is taken in twice."""
     tolerance = _tolerance(start_tolerance)
-    opened = open_store(Store.existing(store), store, experiment, trust)
+    opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
     space = opened.experiment.validation.space
     runs = read_runs(files, parameters_from(parameters, space) if parameters else None, space)
     checked = []
@@ -198,12 +201,14 @@ def _tolerance(given: float | None) -> float:
     return START if given is None else given
 
 
-def _opened(target: str, overrides: dict[str, Any], experiment: str | None, trust: bool) -> Opened:
+def _opened(
+    target: str, overrides: dict[str, Any], experiment: str | None, trust: bool, accept_change: str | None
+) -> Opened:
     path = Path(target)
     if path.suffix != ".toml" and path.is_file():
         if any(value is not None for value in overrides.values()):
             raise InputError(f"{target} is a store, which knows its search and its seed; give no other.")
-        return open_store(Store.existing(path), path, experiment, trust)
+        return open_store(Store.existing(path), path, experiment, trust, accept_change)
     if path.suffix in _STORES:
         raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` makes one.")
     if experiment is not None or trust:
@@ -211,7 +216,7 @@ def _opened(target: str, overrides: dict[str, Any], experiment: str | None, trus
     settings = read_settings(target, overrides)
     made = settings.load()
     where = settings.store_path(made.name)
-    return Opened(settings, made, settings.campaign(made, where), where)
+    return Opened(settings, made, settings.campaign(made, where, accept_change=accept_change), where)
 
 
 def _ended(trial: Trial, opened: Opened) -> dict[str, Any]:
@@ -227,6 +232,8 @@ def _ended(trial: Trial, opened: Opened) -> dict[str, Any]:
 
 
 def _sentence(trial: Trial, experiment: Experiment) -> str:
+    if trial.state == "unmeasured":
+        return f"trial {trial.number} is stored without a distance: {trial.failure}"
     if trial.distance is None:
         return f"trial {trial.number} failed: {trial.failure}"
     return f"trial {trial.number} has the distance {trial.distance:.4g} {experiment.units}".rstrip()

@@ -32,6 +32,7 @@ from ctxval.cli.base import (
     worst_of,
 )
 from ctxval.cli.certify import decide
+from ctxval.cli.trust import AcceptChange
 from ctxval.config import Settings, read_settings
 from ctxval.errors import InputError
 from ctxval.experiment import Experiment
@@ -65,6 +66,7 @@ def run(
     workers: Workers = None,
     dask: Dask = None,
     timeout: Timeout = None,
+    accept_change: AcceptChange = None,
     as_json: AsJson = False,
     variant: Annotated[str | None, typer.Option(help="Variant of a case.")] = None,
     model: Annotated[str | None, typer.Option(help="Which learned model of a case.")] = None,
@@ -82,7 +84,7 @@ def run(
     chosen = experiment.threshold if settings.threshold is None else settings.threshold
     limit = None if chosen is None else require_threshold(chosen)
     path = settings.store_path(experiment.name)
-    campaign = settings.campaign(experiment, path)
+    campaign = settings.campaign(experiment, path, accept_change=accept_change)
     total = experiment.budget if settings.budget is None else settings.budget
     execute = _until_decided(campaign, limit, settings) if until_decided else campaign.run
     with hands(workers, dask, timeout) as given_hands, progress(campaign, total, show=not as_json) as on_trial:

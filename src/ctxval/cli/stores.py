@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -42,14 +43,18 @@ def status(
         "executions": sum(trial.executed for trial in trials),
         "failed": sum(trial.state == "failed" for trial in trials),
         "failures": failures_of(trials),
+        "unmeasured": [trial.number for trial in trials if trial.state == "unmeasured"],
         "open": [trial.number for trial in trials if trial.state == "open"],
         "worst": worst_of(
             max((t for t in trials if t.distance is not None), key=lambda t: t.distance or 0, default=None)
         ),
+        "changes": [asdict(change) for change in opened.history()],
         "store": str(store),
     }
     if not as_json:
-        print_table({key: value for key, value in report.items() if key != "failures"})
+        print_table({key: value for key, value in report.items() if key not in ("failures", "changes")})
+        for change in report["changes"]:
+            out.say(f"{change['at'][:19]} {change['what']}: {change['why']}")
         print_failures(report["failures"])
     return report
 

@@ -20,6 +20,15 @@ Trust = Annotated[
     bool,
     typer.Option("--trust", help="Import and run the code that the store names, although you did not make the store."),
 ]
+AcceptChange = Annotated[
+    str | None,
+    typer.Option(
+        "--accept-change",
+        metavar="WHY",
+        help="Go on although the experiment differs from the stored one, for this reason, which the store keeps: the "
+        "system was repaired, or the code computes the same.",
+    ),
+]
 Named = Annotated[
     str | None,
     typer.Option(
@@ -51,7 +60,15 @@ def settings_of(store: Store, experiment: str | None, trust: bool) -> Settings:
     return trusted_settings(store, experiment=experiment, trust=trust)
 
 
-def open_store(store: Store, path: Path, experiment: str | None, trust: bool) -> Opened:
+def open_store(
+    store: Store,
+    path: Path,
+    experiment: str | None,
+    trust: bool,
+    accept_change: str | None = None,
+    *,
+    remeasure: bool = False,
+) -> Opened:
     """Build the experiment of a store, and its campaign.
 
     Args:
@@ -67,7 +84,9 @@ def open_store(store: Store, path: Path, experiment: str | None, trust: bool) ->
     settings = settings_of(store, experiment, trust)
     asked = (trust or experiment is not None) and not verifies(store.settings())
     made = _load(settings)
-    opened = Opened(settings, made, settings.campaign(made, store), path)
+    opened = Opened(
+        settings, made, settings.campaign(made, store, accept_change=accept_change, remeasure=remeasure), path
+    )
     if asked and code_named(store.settings()):
         _say_signed(opened)
     return opened
