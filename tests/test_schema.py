@@ -20,8 +20,8 @@ from conftest import make_validation
 from ctxval import Campaign, Store, schema, searches
 from ctxval.cli import app
 from ctxval.errors import CtxvalError, ForeignStoreError, StoreAccessError
+from ctxval.migrations import MIGRATIONS
 from ctxval.salvage import salvage
-from ctxval.store import _MIGRATIONS
 
 FOREVER = "WITH RECURSIVE t(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM t) SELECT {} FROM t"
 
@@ -57,7 +57,7 @@ def said(path: Path, *command: str) -> str:
 
 def columns(table: str) -> str:
     connection = sqlite3.connect(":memory:")
-    for _, script in _MIGRATIONS:
+    for _, script in MIGRATIONS:
         connection.executescript(script)
     names = [row[1] for row in connection.execute(f"PRAGMA table_info({table})")]
     connection.close()

@@ -9,7 +9,8 @@ import pytest
 
 from ctxval import Store, Trajectory, Trial
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
-from ctxval.store import _MIGRATIONS, Change
+from ctxval.migrations import MIGRATIONS
+from ctxval.store import Change
 
 TRAJECTORY = Trajectory(np.arange(4.0), np.random.default_rng(0).normal(size=(4, 2)), np.ones((3, 1)))
 
@@ -48,7 +49,7 @@ def test_a_note_comes_back_bit_for_bit_and_none_as_none(tmp_path: Path) -> None:
 
 def test_a_store_without_notes_is_migrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr("ctxval.store._MIGRATIONS", _MIGRATIONS[:1])
+        patch.setattr("ctxval.store.MIGRATIONS", MIGRATIONS[:1])
         old = Store(tmp_path / "a.sqlite")
         old._connection.execute(
             "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, opened_at) "
@@ -175,11 +176,11 @@ def test_settings_do_not_change_which_experiment_it_is() -> None:
     assert store.description() == {"seed": 1}
 
 
-@pytest.mark.parametrize("version", range(1, len(_MIGRATIONS)))
+@pytest.mark.parametrize("version", range(1, len(MIGRATIONS)))
 def test_a_store_of_any_older_version_is_brought_up_with_its_trials(tmp_path: Path, version: int) -> None:
     path = tmp_path / "old.sqlite"
     connection = sqlite3.connect(path, isolation_level=None)
-    for number, (title, script) in enumerate(_MIGRATIONS[:version], start=1):
+    for number, (title, script) in enumerate(MIGRATIONS[:version], start=1):
         connection.executescript(script)
         connection.execute("INSERT INTO migrations VALUES (?, ?, 'then')", (number, title))
     connection.execute("PRAGMA application_id = 0x63747876")

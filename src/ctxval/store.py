@@ -17,6 +17,7 @@ from ctxval import rows, schema
 from ctxval.disks import make_folder, on_network, warn_of_network
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
 from ctxval.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
+from ctxval.migrations import MIGRATIONS
 from ctxval.rows import (
     COLUMNS,
     ENDED,
@@ -34,50 +35,6 @@ from ctxval.trial import Trial
 Side = Literal["model", "system"]
 
 _APPLICATION = 0x63747876  # "ctxv" in SQLite's application_id: how a file says that it is one of ours
-
-_MIGRATIONS = (
-    (
-        "trials, trajectories and the experiment's description",
-        """
-        CREATE TABLE migrations (version INTEGER PRIMARY KEY, title TEXT NOT NULL, applied_at TEXT NOT NULL);
-        CREATE TABLE experiment (key TEXT PRIMARY KEY, value TEXT NOT NULL);
-        CREATE TABLE trials (
-            number INTEGER PRIMARY KEY,
-            origin TEXT NOT NULL,
-            state TEXT NOT NULL CHECK (state IN ('open', 'completed', 'failed')),
-            unit_point TEXT NOT NULL,
-            parameters TEXT NOT NULL,
-            attempts INTEGER NOT NULL,
-            distance REAL,
-            failure TEXT,
-            executed INTEGER NOT NULL DEFAULT 0,
-            opened_at TEXT NOT NULL,
-            closed_at TEXT,
-            seconds REAL
-        );
-        CREATE TABLE trajectories (
-            trial INTEGER NOT NULL REFERENCES trials (number),
-            side TEXT NOT NULL CHECK (side IN ('model', 'system')),
-            npz BLOB NOT NULL,
-            PRIMARY KEY (trial, side)
-        );
-        """,
-    ),
-    ("what the search thought when it chose a trial", "ALTER TABLE trials ADD COLUMN note TEXT"),
-    ("what was run, for commands that go on", "CREATE TABLE settings (key TEXT PRIMARY KEY, value TEXT NOT NULL)"),
-    ("a checksum of each trial, as SQLite has none", "ALTER TABLE trials ADD COLUMN checksum INTEGER"),
-    ("a checksum of each trajectory with its place", "ALTER TABLE trajectories ADD COLUMN checksum INTEGER"),
-    (
-        "trials whose distance is not measured, why a task was executed again, and what was changed",
-        """
-        ALTER TABLE trials ADD COLUMN because TEXT;
-        ALTER TABLE trials ADD COLUMN unmeasured INTEGER NOT NULL DEFAULT 0;
-        CREATE TABLE history (
-            number INTEGER PRIMARY KEY, at TEXT NOT NULL, what TEXT NOT NULL, why TEXT NOT NULL, content TEXT NOT NULL
-        )
-        """,
-    ),
-)
 
 _DRAWS = "draws"
 """Key of the table experiment that is no part of the description."""
@@ -418,7 +375,7 @@ class Store:
 
     def _prepare(self) -> None:
         with schema.snapshot(self._connection):
-            version = schema.version(self._connection, self._name, _APPLICATION, [sql for _, sql in _MIGRATIONS])
+            version = schema.version(self._connection, self._name, _APPLICATION, [sql for _, sql in MIGRATIONS])
             page = self._connection.execute("PRAGMA page_size").fetchone()[0]
             if self.path is not None and self.path.stat().st_size % page:
                 raise self._damaged("its end is missing")
@@ -428,11 +385,11 @@ class Store:
         # FULL does not sync the folder after a journal is removed: a power cut may bring the journal back, and SQLite
         # then takes back the last transaction.
         self._connection.execute("PRAGMA synchronous = EXTRA")
-        for number in range(version, len(_MIGRATIONS)):
+        for number in range(version, len(MIGRATIONS)):
             self._migrate(number)
 
     def _migrate(self, number: int) -> None:
-        title, script = _MIGRATIONS[number]
+        title, script = MIGRATIONS[number]
         with self._transaction():
             if self._connection.execute("PRAGMA user_version").fetchone()[0] > number:
                 return  # another process was faster
