@@ -140,8 +140,9 @@ def test_python_may_probe_parameters_for_special_methods(space: TaskSpace) -> No
     assert not hasattr(space.parameters(np.zeros(4)), "__array_interface__")
 
 
-def test_the_description_has_the_bounds_by_scalar_name(space: TaskSpace) -> None:
-    expected = {"goal": [-3.0, 3.0], "offset[0]": [0.0, 1.0], "offset[1]": [10.0, 20.0], "mass": [1.0, 2.0]}
+def test_the_description_has_bounds_and_unit_by_scalar_name(space: TaskSpace) -> None:
+    offset = {"offset[0]": [0.0, 1.0, "m"], "offset[1]": [10.0, 20.0, "m"]}
+    expected = {"goal": [-3.0, 3.0, "rad"], **offset, "mass": [1.0, 2.0]}
     assert json.loads(json.dumps(space.describe())) == expected
     assert repr(TaskSpace(goal=(-3, 3))) == "TaskSpace(goal=(-3, 3))"
 
