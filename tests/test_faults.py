@@ -7,6 +7,7 @@ import csv
 import json
 import os
 import shutil
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -104,6 +105,21 @@ def test_a_cut_store_is_a_clear_error_and_what_is_readable_is_exported(
     trials = {trial.number: trial.distance for trial in Store(whole).trials()}
     for number, trial in found.trials.items():
         assert trial.distance == trials[number]
+
+
+def test_rows_that_cannot_be_read_are_told_together(whole: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.sqlite"
+    shutil.copy(whole, broken)
+    with contextlib.closing(sqlite3.connect(broken)) as connection:
+        page = connection.execute("PRAGMA page_size").fetchone()[0]
+        root = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'trajectories'").fetchone()[0]
+    data = bytearray(broken.read_bytes())
+    data[(root - 1) * page : root * page] = b"\xff" * page
+    broken.write_bytes(bytes(data))
+    found = salvage(broken)
+    assert len(found.trials) == 15
+    assert len(found.damaged) < 5
+    assert any(" rows from 0 to " in sentence for sentence in found.damaged)
 
 
 Everything = tuple[list[tuple[object, ...]], list[tuple[bytes, bytes, bytes] | None]]

@@ -467,6 +467,17 @@ def test_a_table_with_one_wrong_row_brings_nothing_in(invoke: Any, table: str, s
     assert len(Store("a.sqlite").trials()) == 1
 
 
+def test_a_table_of_runs_is_read_with_a_bound(invoke: Any) -> None:
+    new(invoke)
+    Path("runs.csv").touch()
+    os.truncate("runs.csv", 2**33)
+    assert "runs.csv cannot be read as a table of runs: it has 8589934592 bytes" in refused(
+        invoke("import", "a.sqlite", "runs.csv")
+    )
+    Path("runs.csv").write_text("distance,goal\n0.5\n")
+    assert "line 2: goal must be a number, got None" in refused(invoke("import", "a.sqlite", "runs.csv"))
+
+
 def test_what_is_imported_must_be_there(invoke: Any) -> None:
     new(invoke)
     assert "there is no file none.csv" in refused(invoke("import", "a.sqlite", "none.csv"))

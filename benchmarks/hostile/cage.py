@@ -9,6 +9,7 @@ import re
 import resource
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -168,6 +169,7 @@ def _inside(case: Case, folder: Path, streams: Sequence[Path]) -> None:
         os.setsid()
         os.chdir(folder)
         os.environ.update(case.environment)
+        tempfile.tempdir = None  # what the parent found out is of its own TMPDIR
         nothing = os.open(os.devnull, os.O_RDONLY)
         out, err, seen = (os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644) for path in streams)
         for there, here in ((nothing, 0), (out, 1), (err, 2)):

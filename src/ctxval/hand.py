@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import re
 import shutil
@@ -17,12 +16,16 @@ from ctxval.controller import AffineFeedback
 from ctxval.errors import InputError
 from ctxval.exchange import write_controller, write_task
 from ctxval.experiment import Experiment, labels_of
+from ctxval.files import csv_rows
 from ctxval.space import TaskSpace
 from ctxval.texts import unguarded
 from ctxval.trajectory import Trajectory
 from ctxval.validation import Plan
 
 _RESULTS = ("trajectory", "distance", "failed")
+
+_MOST_TABLE = 16 * 2**20
+"""Bytes that a table of runs may have."""
 
 
 def write_files(folder: Path, experiment: Experiment, opened: OpenTrial) -> list[str]:
@@ -152,13 +155,12 @@ def read_runs(files: Sequence[Path], parameters: Mapping[str, Any] | None, space
 def _table(path: Path, space: TaskSpace) -> list[KnownRun]:
     _require_file(path)
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            reader.fieldnames = [unguarded(name) for name in reader.fieldnames or ()]
-            rows = [(reader.line_num, row) for row in reader]
-            header = [name for name in reader.fieldnames or () if name]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        lines = list(csv_rows(path, _MOST_TABLE))
+    except InputError as error:
         raise InputError(f"{path} cannot be read as a table of runs: {error}.") from error
+    columns = [unguarded(name) for name in (lines[0][1] if lines else ())]
+    header = [name for name in columns if name]
+    rows = [(line, dict(zip(columns, cells, strict=False))) for line, cells in lines[1:]]
     missing = [name for name in space.names if name not in header]
     if missing or not any(name in header for name in _RESULTS):
         raise InputError(
@@ -172,9 +174,9 @@ def _table(path: Path, space: TaskSpace) -> list[KnownRun]:
     return [_run(path, line, row, space) for line, row in rows]
 
 
-def _run(path: Path, line: int, row: Mapping[str, str | None], space: TaskSpace) -> KnownRun:
+def _run(path: Path, line: int, row: Mapping[str, str], space: TaskSpace) -> KnownRun:
     where = f"{path}, line {line}"
-    point = [_number(where, name, row[name]) for name in space.names]
+    point = [_number(where, name, row.get(name)) for name in space.names]
     given = {name: unguarded((row.get(name) or "").strip()) for name in _RESULTS}
     if sum(bool(text) for text in given.values()) != 1:
         raise InputError(f"{where}: exactly one of {', '.join(_RESULTS)} must be filled in.")

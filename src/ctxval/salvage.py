@@ -167,14 +167,17 @@ class _Reader:
         if table not in self.tables:
             return
         wanted = ", ".join(name if name in self.tables[table] else f"NULL AS {name}" for name in columns)
+        unreadable: dict[str, list[int]] = {}
         for place in self._places(table):
             try:
                 row = self.connection.execute(f"SELECT {wanted} FROM {table} WHERE rowid = ?", (place,)).fetchone()
             except _UNREADABLE as error:
-                self._note(f"the table {table}, row {place}: {error}")
+                unreadable.setdefault(str(error), []).append(place)
                 continue
             if row is not None:
                 yield row
+        for reason, places in unreadable.items():
+            self._note(f"the table {table}, {_rows(places)}: {reason}")
 
     def _places(self, table: str) -> list[int]:
         places: set[int] = set()
@@ -218,6 +221,13 @@ class _Reader:
 
     def _note(self, sentence: str) -> None:
         self.found.damaged.append(shortened(sentence))
+
+
+def _rows(places: list[int]) -> str:
+    """Name rows, in the order of their places; one that is probed on damaged pages is one of thousands."""
+    if len(places) == 1:
+        return f"row {places[0]}"
+    return f"{len(places)} rows from {places[0]} to {places[-1]}"
 
 
 def export(found: Salvage, folder: Path) -> list[Path]:
