@@ -56,6 +56,7 @@ COMMANDS = {
     "ask": ("ask", "a.sqlite"),
     "import": ("import", "a.sqlite", "runs.csv"),
     "audit": ("certify", "a.sqlite", "--audit", "3"),
+    "remeasure": ("remeasure", "a.sqlite"),
 }
 """All that build the experiment of a store."""
 
