@@ -519,3 +519,25 @@ def test_an_open_trial_of_another_campaign_is_refused(validation: Validation) ->
     opened = there.ask()
     with pytest.raises(InputError, match="another campaign"):
         here.tell(opened, validation.execute(opened.plan))
+
+
+def test_independent_draws_know_how_many_there_were_to_be(validation: Validation) -> None:
+    campaign = Campaign(validation, search=searches.GPUCB(initial=2)).run(3)
+    campaign.audit(2)
+    campaign.audit(3)
+    assert [trial.note for trial in campaign.trials[3:]] == [{"draws": 2}, {"draws": 2}, {"draws": 3}]
+    assert all(trial.note is None for trial in campaign.trials[:3])
+    campaign.tell(campaign.ask(draw=True), distance=0.1)
+    assert campaign.trials[-1].note is None
+    drawn = Campaign(validation, search=searches.Random()).run(2).run_until_decided(90.0, 4, resolution=1.0)
+    assert [(trial.note or {}).get("draws") for trial in drawn.trials] == [2, 2, 0, 0]
+    assert Campaign(validation, search=searches.Random()).run(2, until=lambda _: False).trials[0].note == {"draws": 0}
+
+
+def test_a_resumed_random_search_keeps_its_plan(validation: Validation, tmp_path: Path) -> None:
+    stopped = Campaign(validation, search=searches.Random(), store=tmp_path / "a.sqlite")
+    with pytest.raises(KeyboardInterrupt):
+        stopped.run(3, on_trial=lambda _: interrupt_at_once())
+    stopped.store.close()
+    trials = Campaign(validation, search=searches.Random(), store=tmp_path / "a.sqlite").run(3).trials
+    assert [trial.note for trial in trials] == [{"draws": 3}] * 3

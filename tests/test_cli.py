@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from conftest import make_validation
-from ctxval import Campaign, Store
+from ctxval import Campaign, Store, TaskSpace, Validation, searches
 from ctxval.cli import app
 from ctxval.searches import CMAES
 
@@ -272,7 +272,9 @@ def test_every_kind_certifies_stored_campaigns(invoke, campaigns: dict[str, Path
     result = invoke(*of_kind(campaigns, case, kind), *volume, "--threshold", "90", "--confidence", "0.9", "--json")
     assert result.exit_code == 0, result.stderr
     report = json.loads(result.stdout)
-    assert (report["kind"], report["confidence"], report["verdict"]) == (kind, 0.9, "validated")
+    answer = "undecided" if kind == "convergence" else "validated"  # its search took a fixed beta
+    assert (report["kind"], report["confidence"], report["verdict"]) == (kind, 0.9, answer)
+    assert (report["rests_on"] is None) == (kind == "convergence")
     assert 0 < report["upper_bound"] <= 90
     assert report["assumptions"]
     assert report["trials"] >= 12
@@ -287,7 +289,8 @@ def test_every_kind_speaks_to_people(invoke, campaigns: dict[str, Path], kind: s
     assert text.startswith(f"{kind}: With ")
     assert "It assumes that - the " in text
     assert "verdict" not in text
-    assert text.endswith("version 0.1.0")
+    assert "version 0.1.0" in text
+    assert "1 other store of this experiment beside this one" in text
 
 
 def test_what_was_executed_falsifies_without_any_certificate(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
@@ -376,6 +379,9 @@ def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: 
         (["--kind", "audit", "--volume", "0.1"], "may exceed a threshold; say --threshold too"),
         (["--kind", "convergence", "--constant", "1", "--theorem", "1,2,3,4,5"], "only one can be given"),
         (["--confidence", "1e-300"], "the confidence must be strictly between 0 and 1"),
+        (["--confidence", "0.1"], "wrong more often than right"),
+        (["--audit", "5", "--confidence", "0.1"], "wrong more often than right"),
+        (["--audit", "5", "--threshold", "9", "--volume", "0.99"], "leave out most of the tasks"),
     ],
 )
 def test_what_cannot_be_certified_is_one_sentence_and_costs_no_execution(  # type: ignore[no-untyped-def]
@@ -388,6 +394,73 @@ def test_what_cannot_be_certified_is_one_sentence_and_costs_no_execution(  # typ
     assert "Traceback" not in result.stderr
     assert result.stdout == ""
     assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 12
+
+
+def test_an_audit_that_is_extended_counts_what_was_decided_on_last(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
+    shutil.copy(campaigns["linear"], "a.sqlite")
+    assert json.loads(invoke("certify", "a.sqlite", "--audit", "5", "--json").stdout)["trials"] == 5
+    extended = json.loads(invoke("certify", "a.sqlite", "--audit", "9", "--json").stdout)
+    assert (extended["trials"], extended["details"]["not_counted"]) == (4, 5)
+    assert any("5 other independent draws do not count" in sentence for sentence in extended["assumptions"])
+    said = json.loads(invoke("certify", "a.sqlite", "--audit", "9", "--threshold", "90", "--json").stdout)["reason"]
+    assert "5 draws do not count, as their number was changed after they were known" in said
+
+
+def test_draws_that_ended_with_the_verdict_have_no_number_chosen_beforehand(invoke) -> None:  # type: ignore[no-untyped-def]
+    arguments = ("run", "rig:experiment", "--search", "random", "--store", "a.sqlite")
+    invoke(*arguments, "--threshold", "90", "--resolution", "1", "--until-decided", "--budget", "12")
+    for kind, sentence in (("scenario", "ended with the verdict"), ("audit", "none counts")):
+        result = invoke("certify", "a.sqlite", "--kind", kind)
+        assert result.exit_code == 2
+        assert sentence in result.stderr
+
+
+def test_a_scenario_bound_of_a_budget_that_was_raised_is_refused(invoke) -> None:  # type: ignore[no-untyped-def]
+    for budget in ("6", "9"):
+        invoke("run", "rig:experiment", "--search", "random", "--store", "a.sqlite", "--budget", budget)
+    refused = invoke("certify", "a.sqlite", "--kind", "scenario")
+    assert "changed from 6 to 9 after the first were known" in refused.stderr
+    assert json.loads(invoke("certify", "a.sqlite", "--kind", "audit", "--json").stdout)["trials"] == 3
+
+
+def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -> None:  # type: ignore[no-untyped-def]
+    arguments = ("run", "rig:experiment", "--budget", "6", "--threshold", "90", "--resolution", "0.6")
+    alone = invoke(*arguments)
+    text = " ".join(alone.stdout.split())
+    assert "validated against 90" in text
+    assert "to a resolution of 3.6 rad in goal, 100 % of the task space (0.6 diagonals; usual: 0.125)" in text
+    assert "It rests on the distance being as smooth between the trials as at them" in text
+    assert "other store" not in text
+    again = invoke(*arguments, "--seed", "1")
+    assert "1 other store of this experiment beside this one: runs/short-gp-ucb-seed0.sqlite" in again.stdout
+    report = json.loads(invoke(*arguments, "--seed", "1", "--json").stdout)
+    assert report["other_stores"] == ["runs/short-gp-ucb-seed0.sqlite"]
+    assert report["rests_on"].startswith("It rests on")
+
+
+def test_a_certificate_tells_its_resolution_in_the_units_of_the_stored_task_space(invoke) -> None:  # type: ignore[no-untyped-def]
+    space = TaskSpace(goal=(-3.0, 3.0, "rad"), load=([0.0, 0.0], [1.0, 2.0], "kg"))
+    validation = make_validation()
+    wider = Validation(
+        space=space,
+        task=validation.task,
+        system=validation.system,
+        model=validation.model,
+        synthesizer=validation.synthesizer,
+        distance=validation.distance,
+    )
+    Campaign(wider, search=searches.Random(), store="own.sqlite").run(6)
+    result = invoke("certify", "own.sqlite", "--threshold", "1e6", "--resolution", "0.5766")
+    text = " ".join(result.stdout.split())
+    assert "to a resolution of 6 rad in goal and 1 kg in load[0] and 2 kg in load[1]" in text
+
+
+@pytest.mark.parametrize("value", ["0.1", "0.4999"])
+def test_a_run_with_a_confidence_worse_than_a_coin_is_refused(invoke, value: str) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:experiment", "--threshold", "9", "--confidence", value)
+    assert result.exit_code == 2
+    assert "confidence: input should be greater than or equal to 0.5" in result.stderr.replace("\n", " ")
+    assert not Path("runs").exists()
 
 
 def test_an_audit_waits_for_what_people_are_executing(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]

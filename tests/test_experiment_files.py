@@ -63,7 +63,7 @@ def test_the_file_of_init_reaches_a_verdict_as_it_is(invoke: Any) -> None:
     report = json.loads(result.stdout)
     assert (report["case"], report["search"], report["units"]) == ("cart", "auto", "m")
     assert report["verdict"] == "validated"
-    assert 4 <= report["executions"] < 25
+    assert 4 <= report["executions"] < 40
     assert report["worst"]["distance"] > 0.01
     again = json.loads(invoke("run", "experiment.toml", "--until-decided", "--json").stdout)
     assert again == report
@@ -130,7 +130,7 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         ("stochastic = false", "stochastik = true", "no setting is called 'stochastik'; did you mean 'stochastic'?"),
         (
             'kind = "posterior"',
-            'kind = "audit"',
+            'kind = "audit"\nresolution = 0.3',
             "resolution is for certificates of the kind posterior; the kind here is",
         ),
         ("repeats = 1", "repeats = 0", "search.repeats"),
@@ -162,7 +162,7 @@ def test_options_of_a_case_are_plain_values(invoke: Any, options: str) -> None:
 
 
 def test_what_the_certificate_of_the_file_would_ignore_is_refused(invoke: Any) -> None:
-    target = changed(('kind = "posterior"', 'kind = "scenario"'), ("resolution = 0.25", ""))
+    target = changed(('kind = "posterior"', 'kind = "scenario"'))
     for option in (["--stochastic"], ["--resolution", "1"]):
         said = sentence(invoke("run", target, *option))
         assert f"{option[0][2:]} is for certificates of the kind posterior; the kind here is scenario" in said
@@ -170,14 +170,14 @@ def test_what_the_certificate_of_the_file_would_ignore_is_refused(invoke: Any) -
 
 
 def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: Any) -> None:
-    scenario = ('kind = "posterior"', 'kind = "scenario"\nvolume = 0.5'), ("resolution = 0.25", "")
-    target = changed(*scenario, ('name = "auto"', 'name = "random"'))
+    scenario = ('kind = "posterior"', 'kind = "scenario"\nvolume = 0.5')
+    target = changed(scenario, ('name = "auto"', 'name = "random"'))
     run = json.loads(invoke("run", target, "--json").stdout)
     assert (run["verdict"], run["certificate"]["kind"]) == ("validated", "scenario")
     certified = json.loads(invoke("certify", run["store"], "--threshold", "0.5", "--json").stdout)
     assert (certified["kind"], certified["verdict"]) == ("scenario", "validated")
     assert "needs the posterior bound" in sentence(invoke("run", target, "--until-decided"))
-    adaptive = changed(*scenario, ('name = "auto"', 'name = "gp-ucb"'))
+    adaptive = changed(scenario, ('name = "auto"', 'name = "gp-ucb"'))
     refused = json.loads(invoke("run", adaptive, "--store", "b.sqlite", "--json").stdout)
     assert refused["verdict"] == "undecided"
     assert "independent draws alone" in refused["reason"]

@@ -301,9 +301,27 @@ def test_the_task_of_a_failed_trial_can_be_executed_again(invoke: Any) -> None:
     failed, made_good = Store("a.sqlite").trials()
     assert Sample.of([failed]).failed == 1
     assert Sample.of([failed, made_good]).failed == 0
+    assert made_good.because is None
     refused = invoke("ask", "a.sqlite", "--again", "7")
     assert refused.exit_code == 2
     assert "there is no trial 7; there are 2, numbered from 0" in refused.stderr
+
+
+def test_why_a_failed_task_is_executed_again_is_kept_and_certified(invoke: Any) -> None:
+    new(invoke)
+    invoke("tell", "a.sqlite", "0", "--failed", "the fuse blew")
+    assert asked(invoke, "a.sqlite", "--again", "0", "--because", "fuse replaced")["trial"] == 1
+    invoke("tell", "a.sqlite", "1", "--distance", "0.1")
+    assert Store("a.sqlite").trials()[1].because == "fuse replaced"
+    for number, goal in enumerate((0.6, 0.9, 1.4, 1.9), start=2):
+        asked(invoke, "a.sqlite", "--set", f"goal={goal}")
+        invoke("tell", "a.sqlite", str(number), "--distance", f"{0.1 + 0.01 * goal}")
+    report = json.loads(invoke("certify", "a.sqlite", "--resolution", "1", "--json").stdout)
+    assert report["details"]["failures"]["made_good"] == [{"trial": 0, "by": 1, "because": "fuse replaced"}]
+    assert any("you state why: 'fuse replaced'" in sentence for sentence in report["assumptions"])
+    refused = invoke("ask", "a.sqlite", "--because", "oil")
+    assert refused.exit_code == 2
+    assert "say --again TRIAL too" in refused.stderr.replace("\n", " ")
 
 
 def edit(change: Any) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctxval import Trial
+from ctxval import TaskSpace, Trial
 from ctxval.certificates import (
     Certificate,
     Sample,
@@ -13,9 +13,11 @@ from ctxval.certificates import (
     certify_posterior,
     certify_scenario,
 )
+from ctxval.certificates.covering import resolved_volume
 from ctxval.errors import CertificateError, InputError
+from ctxval.store import Change
 from ctxval.trial import Origin, State
-from ctxval.verdict import counterexample, judge, judge_by, require_threshold, standing
+from ctxval.verdict import counterexample, judge, judge_by, remarks_on, require_threshold, standing
 
 pytestmark = pytest.mark.usefixtures("few_draws")
 
@@ -236,6 +238,12 @@ def test_a_failure_that_was_made_good_counts_no_more() -> None:
     for not_made_good in ([*known, failed], failed_later):
         assert "executions failed" in judge(not_made_good, 1e3).reason
     made_good, never_failed = judge([*known, failed, again], 1e3), judge([*known, again], 1e3)
+    assert (made_good.answer, never_failed.answer) == ("undecided", "validated")
+    assert "for no stated reason" in made_good.reason
+    explained = judge([*known, failed, replace(again, because="fuse replaced")], 1e3)
+    assert explained.answer == "validated"
+    assert explained.rests_on is not None
+    assert "your word that what made trial 8 fail is removed for good" in explained.rests_on
     assert made_good.certificate is not None
     assert never_failed.certificate is not None
     assert made_good.certificate.upper_bound == never_failed.certificate.upper_bound
@@ -246,3 +254,97 @@ def test_a_failure_that_was_made_good_counts_no_more() -> None:
 def test_a_failed_draw_stays_one_whatever_came_later() -> None:
     drawn = [*trials(origin="iid"), trial(8, 0.31, None, state="failed", origin="iid"), trial(9, 0.31, 0.1)]
     assert Sample.of(drawn).failed == 1
+
+
+# What a verdict promises, in its own line
+
+
+@pytest.mark.parametrize("confidence", [0.1, 0.49])
+def test_a_confidence_below_a_half_is_refused(confidence: float) -> None:
+    with pytest.raises(InputError, match="wrong more often than right"):
+        judge(trials(), 50.0, confidence)
+    with pytest.raises(InputError, match="wrong more often than right"):
+        standing(trials(), 50.0, 0, confidence)
+    with pytest.raises(InputError, match="wrong more often than right"):
+        judge_by(replace(certificate(1.0), confidence=confidence), trials(), 50.0)
+
+
+def test_a_volume_of_most_of_the_tasks_is_refused() -> None:
+    with pytest.raises(InputError, match="leave out most of the tasks"):
+        judge_by(certificate(1.0, volume=0.05), trials(), 1.2, volume=0.99)
+
+
+SPACE = TaskSpace(goal=(0.0, 2.0, "rad"))
+
+
+def test_a_resolution_other_than_the_usual_one_stands_in_the_verdict_in_the_units_of_the_task() -> None:
+    usual = judge(trials(), 50.0, space=SPACE)
+    assert "resolution" not in usual.reason
+    coarse = judge(trials(), 50.0, resolution=0.25, space=SPACE)
+    assert "to a resolution of 0.5 rad in goal, 50 % of the task space (0.25 diagonals; usual: 0.125)" in coarse.reason
+    assert "to a resolution of 0.25 of each parameter's range, 50 %" in judge(trials(), 50.0, resolution=0.25).reason
+    none = judge(trials(), 50.0, resolution=1, space=SPACE)
+    assert "whole regions without a trial taken to be like the rest (1 diagonals; usual: 0.125)" in none.reason
+
+
+def test_a_quarter_of_the_diagonal_is_39_percent_of_a_plane() -> None:
+    assert resolved_volume(0.25, 2) == pytest.approx(0.3927, abs=1e-4)
+    assert resolved_volume(0.125, 1) == pytest.approx(0.25)
+    assert resolved_volume(0.125, 3) == pytest.approx(4 / 3 * np.pi * (0.125 * np.sqrt(3)) ** 3)
+    assert resolved_volume(1.0, 2) == 1.0
+
+
+def test_a_validation_names_what_it_rests_on() -> None:
+    verdict = judge(trials(), 50.0, space=SPACE)
+    assert verdict.rests_on == (
+        "It rests on the distance being as smooth between the trials as at them, to a resolution of 0.25 rad in goal "
+        "(a peak inside a gap of that radius, 25 % of the task space, may be missed); on each task having one "
+        "distance, however often it is executed; on this campaign not being chosen among several."
+    )
+    noisy = judge(trials(), 50.0, stochastic=True, space=SPACE)
+    assert noisy.rests_on is not None
+    assert "single executions may exceed it" in noisy.rests_on
+    assert judge(trials(), 0.5).rests_on is None
+    drawn = [trial(k, x, 0.5 * x, "iid") for k, x in enumerate(np.linspace(0, 1, 60).tolist())]
+    audited = judge_by(certify_audit(Sample.of(drawn), 0.9), drawn, 0.6, volume=0.05)
+    assert audited.rests_on is not None
+    assert "from which M was not learned (how large the distance is in the 3.77 % that are left out" in audited.rests_on
+
+
+def test_a_threshold_within_the_error_of_the_bound_is_undecided() -> None:
+    near = replace(certificate(1.0), error=0.05)
+    for threshold in (1.0, 1.09):
+        verdict = judge_by(near, trials(), threshold)
+        assert verdict.answer == "undecided"
+        assert "the posterior bound is 1 ± 0.05" in verdict.reason
+        assert "too near to it for the random draws" in verdict.reason
+    assert "more executions tighten it" in judge_by(near, trials(), 1.09).reason
+    assert judge_by(near, trials(), 1.11).answer == "validated"
+    assert "is 1 ± 0.05, at most 1.11" in judge_by(near, trials(), 1.11).reason
+
+
+def test_the_error_is_in_the_verdict_of_the_posterior() -> None:
+    verdict = judge(trials(5), 50.0, resolution=1)
+    assert verdict.certificate is not None
+    assert verdict.certificate.error > 0
+    assert "±" in verdict.reason
+
+
+def test_remarks_are_among_the_assumptions() -> None:
+    verdict = judge(trials(), 50.0, remarks=["S was changed after trial 3: oil"])
+    assert verdict.certificate is not None
+    assert verdict.certificate.assumptions[-1] == "S was changed after trial 3: oil"
+    assert any("several is wrong more often" in sentence for sentence in verdict.certificate.assumptions)
+
+
+def test_what_was_changed_in_a_store_is_remarked() -> None:
+    changes = [
+        Change("described anew", "made by an older version", {}),
+        Change("accepted", "gripper replaced", {"differences": ["x was 1 and is now 2", "y is new"], "trials": 7}),
+        Change("remeasured", "another norm", {"before": {}}),
+    ]
+    assert remarks_on(changes) == (
+        "what was changed after 7 trials makes no difference to them, as you state: 'gripper replaced' (x was 1 and is "
+        "now 2)",
+        "the distances are those measured anew: 'another norm'",
+    )

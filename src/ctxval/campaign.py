@@ -18,7 +18,7 @@ from ctxval.surrogate import Surrogate, fit_surrogate
 from ctxval.texts import text_of
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
-from ctxval.verdict import CONFIDENCE, Verdict, judge, require_threshold, standing
+from ctxval.verdict import CONFIDENCE, Verdict, judge, remarks_on, require_threshold, standing
 from ctxval.workers import Crew, Ended, crew
 
 __all__ = ["Campaign", "OpenTrial"]
@@ -89,7 +89,10 @@ class Campaign(Ledger):
             stochastic: whether two executions of one task may differ.
             resolution: how far from every trial a task may be, in diagonals of the task space, for a validation.
         """
-        return judge(self.trials, threshold, confidence, stochastic=stochastic, resolution=resolution)
+        space, said = self.validation.space, remarks_on(self.store.history())
+        return judge(
+            self.trials, threshold, confidence, stochastic=stochastic, resolution=resolution, space=space, remarks=said
+        )
 
     def surrogate(self) -> Surrogate:
         """Return the GP of the distance over the task space, whichever search chose the trials.
@@ -148,7 +151,7 @@ class Campaign(Ledger):
         hands, patience = self._crew(workers, executor, timeout), _Patience(retries, retry_failures)
         if retry_failures and hands is None:
             raise InputError("retry_failures is for workers, an executor or a timeout, and none is given.")
-        return self._carry_out(self._within(budget, chosen), hands, on_trial, patience)
+        return self._carry_out(self._within(budget, chosen, budget if until is None else 0), hands, on_trial, patience)
 
     def run_until_decided(
         self,
@@ -189,11 +192,14 @@ class Campaign(Ledger):
             return self._open(None if now.uncovered is None else (now.uncovered, "covering"), attempts=1)
 
         hands = self._crew(workers, executor, timeout)
-        return self._carry_out(self._within(budget, chosen), hands, on_trial, _Patience())
+        return self._carry_out(self._within(budget, chosen, 0), hands, on_trial, _Patience())
 
-    def _within(self, budget: int, chosen: Callable[[], OpenTrial | None]) -> Callable[[int], OpenTrial | None]:
+    def _within(
+        self, budget: int, chosen: Callable[[], OpenTrial | None], draws: int
+    ) -> Callable[[int], OpenTrial | None]:
         """Return what is wanted, given how many executions are running: what was interrupted, then what is chosen."""
         _require_count("budget must be a positive integer", budget)
+        self._planned = int(draws)  # how many independent draws there are to be; 0 if what is found ends them
 
         def wanted(running: int) -> OpenTrial | None:
             if self.executions + running >= budget:
@@ -230,6 +236,7 @@ class Campaign(Ledger):
             enough = sum(trial.origin == "iid" for trial in self._trials) >= draws
             return None if enough else self._open((self._draws.point(self._trials), "iid"), attempts=1)
 
+        self._planned = int(draws)
         return self._carry_out(wanted, self._crew(workers, executor, timeout), on_trial, _Patience())
 
     def _crew(self, workers: int | None, executor: cf.Executor | None, timeout: float | None) -> Crew | None:

@@ -25,7 +25,7 @@ from ctxval.store import Store
 from ctxval.texts import reason_of
 from ctxval.trust import code_named, signed, unsigned, verifies
 from ctxval.validation import Validation
-from ctxval.verdict import CONFIDENCE
+from ctxval.verdict import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME
 
 DEFAULT_SEARCH = "auto"
 
@@ -71,7 +71,7 @@ class CertificateTable(BaseModel):
 
     kind: str = "posterior"
     stochastic: bool = False
-    volume: float = Field(default=0.0, ge=0, lt=1, strict=True)
+    volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
     resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
     discard: int | None = Field(default=None, ge=0)
     constant: float | None = None
@@ -140,7 +140,7 @@ class Settings(BaseModel):
     units: str | None = None
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
-    confidence: float = Field(default=CONFIDENCE, gt=0, lt=1, strict=True)
+    confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
     certificate: CertificateTable = Field(default_factory=CertificateTable)
     seed: int = Field(default=0, ge=0)
     store: Path | None = None

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval.arrays import Array
+from ctxval.certificates import PLANNED
 from ctxval.describe import differences
 from ctxval.distance import Distance
 from ctxval.draws import IndependentDraws
@@ -84,6 +85,7 @@ class Ledger:
         identify(self.store, validation, self._description(), accept_change, remeasure)
         self._draws = IndependentDraws(self.store, validation, self.seed)
         self._executing: set[int] = set()
+        self._planned: int | None = None
         self._replay()
         if remeasure:
             self.remeasure()
@@ -163,6 +165,7 @@ class Ledger:
             raise InputError('a reason such as "fuse replaced" is given for a task that was executed before.')
         with self.store.sole_writer(wait):
             self._refresh()
+            self._planned = None
             if parameters is not None:
                 return self._open((self._unit_point(parameters), "manual"), attempts=0, because=because)
             return self._open((self._draws.point(self._trials), "iid") if draw else None, attempts=0)
@@ -203,6 +206,8 @@ class Ledger:
         else:
             unit_point, origin = given
             self.search.tell(unit_point[None], [np.nan])
+        if origin == "iid" and self._planned is not None:
+            note = {**(note or {}), PLANNED: self._planned}
         names = self.validation.space.describe_point(self.validation.space.from_unit(unit_point))
         trial = Trial(len(self._trials), origin, "open", unit_point, names, attempts, note=note, because=because)
         try:

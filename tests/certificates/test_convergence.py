@@ -36,11 +36,14 @@ def test_smoother_kernels_converge_faster_in_the_end() -> None:
     assert rate(n, 1, "squared-exponential") < rate(n, 1, "matern-5/2") < rate(n, 1, "matern-3/2")
 
 
+STATED = TheoremConstants(scale=0.01, noise=0.5, a=1.0, b=1.0, gain=1.0)
+
+
 def test_corollary_1_validates_where_the_best_is_below_the_threshold_less_the_rate() -> None:
     distances = [0.1, 0.3, 0.2, 0.25]
-    certificate = certify_convergence(sample(distances), constant=0.05)
-    assert certificate.upper_bound == pytest.approx(0.3 + 0.05 * rate(4, 1))
-    assert certificate.covers(0.4)
+    certificate = certify_convergence(sample(distances), STATED)
+    assert certificate.upper_bound == pytest.approx(0.3 + STATED.constant(4, 1, 0.95) * rate(4, 1))
+    assert certificate.covers(certificate.upper_bound)
     assert not certificate.covers(0.3)
     assert "nu > 2" in " ".join(certificate.assumptions)
 
@@ -64,6 +67,24 @@ def test_only_tasks_that_the_acquisition_function_chose_are_counted() -> None:
     assert (certificate.trials, certificate.details["iterations"]) == (4, 2)
     with pytest.raises(CertificateError, match="none of these was"):
         certify_convergence(sample([0.5, 0.1], initial=2), constant=0.05)
+
+
+def test_a_bare_constant_validates_nothing() -> None:
+    certificate = certify_convergence(sample([0.1, 0.3, 0.2, 0.25]), constant=0.01)
+    assert certificate.upper_bound == pytest.approx(0.3 + 0.01 * rate(4, 1))
+    assert not certificate.covers(1e9)
+    assert certificate.doubt is not None
+    assert "C = 0.01 is a number of yours that no theorem and no trial supports" in certificate.doubt
+
+
+def test_a_search_of_a_fixed_beta_and_fitted_hyperparameters_is_not_covered_by_the_theorem() -> None:
+    trials = sample([0.1, 0.3, 0.2, 0.25])
+    for options in (Options(theorem=STATED, search="GPUCB"), Options(constant=0.01, search="GPUCB")):
+        assert not certify(trials, "convergence", 0.95, options).covers(1e9)
+    doubt = certify(trials, "convergence", 0.95, Options(theorem=STATED, search="GPUCB")).doubt
+    assert doubt is not None
+    assert "fixed beta" in doubt
+    assert certify(trials, "convergence", 0.95, Options(theorem=STATED)).covers(1e9)
 
 
 # The constant

@@ -116,3 +116,55 @@ def test_units_do_not_matter() -> None:
     plain, moved = (diagnose([condition(KNOWN, X, values)], X) for values in (y, 1000 * y - 7))
     assert moved.surprise == pytest.approx(plain.surprise, rel=1e-3)
     assert (moved.trial, moved.left_out) == (plain.trial, pytest.approx(plain.left_out, rel=1e-3))
+
+
+# Trials whose order means nothing
+
+
+def test_left_out_alone_the_surprise_is_the_t_test_of_each_against_all_others() -> None:
+    X, y = np.linspace(0, 1, 7)[:, None], np.random.default_rng(3).normal(size=7)
+    independent = Hyperparameters(1.5, np.array([np.log(1e-4)]), float(np.log(EXACT)))
+    tails = []
+    for k in range(7):
+        others = np.delete(y, k)
+        tails.append(t(5).sf((y[k] - others.mean()) / (others.std(ddof=1) * np.sqrt(1 + 1 / 6))))
+    diagnosis = diagnose([condition(independent, X, y)], X, unordered=np.ones(7, dtype=bool))
+    assert diagnosis.surprise == pytest.approx(1 - (1 - min(tails)) ** 7, rel=1e-6)
+    assert diagnosis.trial == int(np.argmin(tails))
+
+
+def test_left_out_surprises_of_the_process_itself_are_as_rare_as_stated() -> None:
+    found = []
+    for seed in range(400):
+        rng = np.random.default_rng([6, seed])
+        X = rng.random((12, 1))
+        K = KNOWN.kernel(X, X) + EXACT * np.eye(12)
+        y = np.linalg.cholesky(K) @ rng.normal(size=12)
+        found.append(diagnose([condition(KNOWN, X, y)], X, unordered=np.ones(12, dtype=bool)).surprise)
+    for level in (0.01, 0.05, 0.2):
+        assert np.mean(np.array(found) < level) <= level + 3 * np.sqrt(level * (1 - level) / 400)
+
+
+@pytest.mark.parametrize("order", ["as they come", "worst first", "worst last", "shuffled"])
+def test_a_spike_among_unordered_trials_is_seen_in_any_order(order: str) -> None:
+    X, y = spiked(20.0)
+    rows = {
+        "as they come": np.arange(len(y)),
+        "worst first": np.argsort(-y),
+        "worst last": np.argsort(y),
+        "shuffled": np.random.default_rng(2).permutation(len(y)),
+    }[order]
+    unordered = np.ones(len(y), dtype=bool)
+    found = diagnose([condition(KNOWN, X[rows], y[rows])], X[rows], rows.tolist(), unordered=unordered)
+    assert found.trial == len(y) - 1
+    assert found.doubt is not None
+    assert "above what the other trials predict" in found.doubt
+
+
+def test_unordered_trials_are_predicted_from_all_and_the_others_in_order() -> None:
+    X, y = adaptive(KNOWN, np.random.default_rng(7))
+    unordered = np.arange(len(y)) < 4
+    seen = [condition(KNOWN, X, y)]
+    mixed, all_in_order = diagnose(seen, X, unordered=unordered), diagnose(seen, X)
+    assert 0 < mixed.surprise < 1
+    assert diagnose(seen, X, unordered=np.zeros(len(y), dtype=bool)).surprise == all_in_order.surprise

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from ctxval.certificates import (
     KINDS,
     Certificate,
+    MadeGood,
     Maxima,
     Options,
     Sample,
@@ -17,10 +18,13 @@ from ctxval.certificates import (
     certify,
     certify_posterior,
     draw_maxima,
+    settle_maxima,
 )
 from ctxval.certificates.base import at_most
+from ctxval.certificates.posterior import _MOST
 from ctxval.errors import CertificateError, UnknownNameError
 from ctxval.hyperposterior import Prior
+from ctxval.trial import Trial
 
 confidences = st.floats(0.01, 0.999)
 numbers = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=60)
@@ -291,3 +295,141 @@ def test_a_confidence_below_1_is_not_printed_as_1() -> None:
 def test_proposition_1_is_refused_where_another_search_chose_the_tasks() -> None:
     with pytest.raises(CertificateError, match="CMAES chose these"):
         certify(sample(), "convergence", 0.9, Options(constant=1.0, search="CMAES"))
+
+
+# The error of the bound
+
+
+def test_the_error_is_what_seeds_differ_by() -> None:
+    trials = sample(7)
+    found = [draw_maxima(trials, draws=48, paths=4, seed=seed) for seed in range(24)]
+    for confidence in (0.8, 0.9):
+        bounds = np.array([maxima.upper(confidence) for maxima in found])
+        errors = np.array([maxima.error(confidence) for maxima in found])
+        assert 0.5 * bounds.std(ddof=1) < np.median(errors) < 2 * bounds.std(ddof=1)
+        assert (np.abs(bounds - bounds.mean()) < 2 * errors).mean() >= 0.8
+
+
+def test_more_draws_have_a_smaller_error() -> None:
+    few, many = (draw_maxima(sample(7), draws=draws, paths=4) for draws in (16, 256))
+    assert 0 < many.error(0.9) < 0.7 * few.error(0.9)
+
+
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    seeds: list[int] = []
+
+    def few(trials: Sample, *, seed: int = 0, stochastic: bool = False) -> Maxima:
+        seeds.append(seed)
+        return draw_maxima(trials, draws=10, paths=4, seed=seed, stochastic=stochastic)
+
+    monkeypatch.setattr("ctxval.certificates.posterior.draw_maxima", few)
+    return seeds
+
+
+def test_far_from_the_threshold_the_draws_are_those_of_one_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds, usual = counted(monkeypatch), quick(sample())
+    for threshold in (1e-3, 1e3):
+        np.testing.assert_array_equal(settle_maxima(sample(), threshold, 0.9).draws, usual.draws)
+    assert seeds == [0, 0]
+
+
+def test_near_the_threshold_more_is_drawn_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds, trials = counted(monkeypatch), sample(6)
+    usual = quick(trials)
+    found = settle_maxima(trials, usual.upper(0.9), 0.9)
+    assert 2 <= len(seeds) <= _MOST
+    assert len(set(seeds)) == len(seeds)
+    assert len(found.draws) == len(seeds) * len(usual.draws)
+    assert len(found.conditioned) == 10 * len(seeds)
+    assert (np.diff(found.draws) >= 0).all()
+    assert np.bincount(found.owners).tolist() == [4] * len(found.conditioned)
+    assert np.isin(usual.draws, found.draws).all()
+
+
+def test_a_certificate_says_its_error() -> None:
+    trials = sample(6)
+    maxima = quick(trials)
+    certificate = certify_posterior(trials, 0.8, found=maxima, resolution=1)
+    assert certificate.error == certificate.details["error"] == maxima.error(0.8) > 0
+    assert "±" in certificate.statement
+    assert "standard error of the random draws" in certificate.statement
+    assert not certificate.covers(certificate.upper_bound)
+    assert certificate.covers(certificate.upper_bound + 2.001 * certificate.error)
+
+
+# What failed and what was made good
+
+
+def made_good(because: str | None) -> Sample:
+    trials = sample()
+    parts = (trials.points, trials.distances, trials.origins, trials.states, trials.numbers)
+    return Sample(*parts, made_good=(MadeGood(2, 7, because),))
+
+
+@pytest.mark.parametrize("stochastic", [False, True])
+def test_a_failure_made_good_for_no_stated_reason_withdraws_the_bound(stochastic: bool) -> None:
+    found = quick(sample(), stochastic=stochastic)
+    certificate = certify_posterior(made_good(None), 0.9, found=found, stochastic=stochastic, resolution=1)
+    assert not certificate.covers(1e9)
+    assert certificate.doubt is not None
+    assert "trial 2 failed and trial 7 executed the same task with success, for no stated reason" in certificate.doubt
+    assert '--again 2 --because "what was changed"' in certificate.doubt
+    explained = certify_posterior(made_good("fuse replaced"), 0.9, found=found, stochastic=stochastic, resolution=1)
+    assert explained.covers(1e9)
+    assert any("fuse replaced" in sentence for sentence in explained.assumptions)
+    assert explained.details["failures"]["made_good"] == [{"trial": 2, "by": 7, "because": "fuse replaced"}]
+
+
+def test_an_unmeasured_trial_bars_the_bound_and_can_be_measured() -> None:
+    trials = sample()
+    distances, states = trials.distances.copy(), ["completed"] * 9
+    distances[3], states[3] = np.nan, "unmeasured"
+    with pytest.raises(CertificateError, match=r"Trial 3 was executed.*`ctxval remeasure STORE`"):
+        draw_maxima(Sample(trials.points, distances, trials.origins, states))  # type: ignore[arg-type]
+
+
+# The order of imported rows
+
+
+def imported(order: np.ndarray, spike: float) -> list[Trial]:
+    X = np.append(np.linspace(0, 1, 14), 0.46)
+    y = 2 + np.sin(3 * X)
+    y[-1] += spike
+    return [
+        Trial(k, "manual", "completed", np.array([X[row]]), {}, 0, True, float(y[row])) for k, row in enumerate(order)
+    ]
+
+
+@pytest.mark.parametrize("spike", [0.0, 8.0])
+def test_the_order_of_imported_rows_changes_nothing(spike: float) -> None:
+    rng, found = np.random.default_rng(1), []
+    worst_first = np.roll(np.arange(15), 1)
+    for order in (np.arange(15), worst_first, rng.permutation(15), rng.permutation(15)):
+        trials = Sample.of(imported(order, spike))
+        for stochastic in (False, True):
+            maxima = quick(trials, stochastic=stochastic)
+            made = certify_posterior(trials, 0.8, found=maxima, stochastic=stochastic)
+            found.append((stochastic, made.upper_bound, made.error, made.doubt is None))
+    assert len(set(found)) == 2
+    assert {one[0]: one[3] for one in found}[False] == (spike == 0)
+
+
+def test_the_test_of_unordered_trials_sees_as_much_as_that_of_trials_in_order() -> None:
+    heights = (0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
+    fired = {"in order": 0, "worst first": 0, "unordered": 0}
+    X = np.append(np.linspace(0, 1, 24), 0.5)
+    for height in heights:
+        y = np.sin(3 * X)
+        y[-1] += height
+        worst_first = np.roll(np.arange(25), 1)
+        for name, rows, origin in (
+            ("in order", np.arange(25), "acquisition"),
+            ("worst first", worst_first, "acquisition"),
+            ("unordered", worst_first, "manual"),
+        ):
+            trials = Sample(X[rows][:, None], y[rows], [origin] * 25, ["completed"] * 25)  # type: ignore[list-item]
+            fired[name] += (
+                certify_posterior(trials, 0.8, found=draw_maxima(trials, draws=24, paths=1)).doubt is not None
+            )
+    assert fired["worst first"] == 0
+    assert fired["unordered"] >= max(4, fired["in order"])

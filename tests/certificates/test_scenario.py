@@ -137,7 +137,9 @@ def test_an_audit_bounds_the_volume_above_the_worst_of_all_trials() -> None:
         "largest_drawn": 0.5,
         "largest_chosen": 0.9,
         "exceeding": 0,
+        "not_counted": 0,
         "failed": 0,
+        "failures": {"failed": [], "unmeasured": [], "made_good": []},
     }
     assert certify_audit(mixed([0.4, np.nan], [0.1, 0.5])).details["failed"] == 1
     assert certify_audit(mixed([0.4, np.nan], [0.1, 0.5, 0.6])).details["exceeding"] == 2
@@ -190,3 +192,82 @@ def test_to_discard_as_many_as_failed_would_be_more_often_wrong_than_stated() ->
     volume_left = 1 - badness[np.arange(DRAWS), n - 1 - failed]
     claimed = np.array([volume_bound(n, k, beta) for k in range(n - 1)])[failed]
     assert (volume_left > claimed).mean() > beta + 0.02
+
+
+# How many draws there were to be, and when that was decided
+
+
+def planned(counts: list[int | None], origin: str = "iid") -> Sample:
+    n = len(counts)
+    distances = np.linspace(0.1, 0.5, n)
+    return Sample(np.full((n, 1), 0.5), distances, [origin] * n, ["completed"] * n, planned=counts)  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize("discarded", [0, 2])
+def test_draws_that_ended_with_the_verdict_are_refused(discarded: int) -> None:
+    with pytest.raises(CertificateError, match="ended with the verdict"):
+        certify_scenario(planned([0] * 30), 0.95, discarded)
+    with pytest.raises(CertificateError, match="none counts; certify --audit N"):
+        certify_audit(planned([0] * 30), 0.95)
+
+
+@pytest.mark.parametrize("discarded", [0, 2])
+def test_a_number_of_draws_that_was_raised_after_looking_is_refused(discarded: int) -> None:
+    with pytest.raises(CertificateError, match="changed from 20 to 40 after the first were known"):
+        certify_scenario(planned([20] * 20 + [40] * 20), 0.95, discarded)
+    assert certify_scenario(planned([40] * 40), 0.95, discarded).trials == 40
+
+
+def test_an_audit_that_was_extended_counts_the_draws_that_were_decided_on_last() -> None:
+    certificate = certify_audit(planned([20] * 20 + [60] * 40), 0.95)
+    assert certificate.trials == 40
+    assert certificate.volume == pytest.approx(volume_bound(40, 0, 0.05))
+    assert certificate.upper_bound == 0.5
+    assert certificate.details["not_counted"] == 20
+    assert any("20 other independent draws do not count" in sentence for sentence in certificate.assumptions)
+    assert certify_audit(planned([0] * 10 + [30] * 20), 0.95).trials == 20
+
+
+def test_the_statement_on_an_extended_audit_holds_as_often_as_stated() -> None:
+    # Look at 20 draws; go on with 20 more only where they look bad. All 40 together would be wrong too often where
+    # the first alone are not; each batch by itself is right as often as stated, given all that was seen before it.
+    rng, beta = np.random.default_rng(3), 0.1
+    first, second = rng.random((DRAWS, 20)).max(axis=1), rng.random((DRAWS, 20)).max(axis=1)
+    went_on = first < 0.95
+    volume = volume_bound(20, 0, beta)
+    wrong = (1 - np.maximum(first, second) > volume)[went_on].mean()
+    assert wrong <= beta + 0.01
+
+
+def test_what_is_known_of_the_number_of_draws_is_said() -> None:
+    for certified in (certify_scenario, certify_audit):
+        unknown = " ".join(certified(planned([None] * 20)).assumptions)
+        assert "their number was chosen before they were executed (the store does not know when)" in unknown
+        known = " ".join(certified(planned([20] * 20)).assumptions)
+        assert "their number was chosen before they were executed" in known
+        assert "does not know" not in known
+        ended_early = " ".join(certified(planned([30] * 20)).assumptions)
+        assert "although 30 were planned and 20 are known" in ended_early
+
+
+def test_draws_say_nothing_of_a_model_that_was_learned_from_them() -> None:
+    for certified in (certify_scenario, certify_audit):
+        assert "M was not learned from these tasks" in " ".join(certified(planned([20] * 20)).assumptions)
+
+
+def test_failures_are_listed() -> None:
+    certificate = certify_scenario(sample([0.1, np.nan, 0.3]), discarded=1)
+    assert certificate.details["failures"]["failed"] == [1]
+    assert "trial 1 failed, and no distance is known there" in certificate.assumptions
+    audited = certify_audit(mixed([0.4, np.nan], [0.1, 0.5]))
+    assert audited.details["failures"]["failed"] == [1]
+    assert "trial 1 failed, and no distance is known there" in audited.assumptions
+
+
+def test_an_unmeasured_draw_is_a_violation_that_can_be_measured() -> None:
+    trials = Sample(
+        np.zeros((3, 1)), np.array([0.1, np.nan, 0.2]), ["iid"] * 3, ["completed", "unmeasured", "completed"]
+    )
+    for certified in (certify_scenario, certify_audit):
+        with pytest.raises(CertificateError, match=r"Trial 1 was executed.*`ctxval remeasure STORE`"):
+            certified(trials)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,26 @@ from ctxval.errors import CertificateError
 from ctxval.trial import Origin, State, Trial
 from ctxval.version import VERSION
 
+PLANNED = "draws"
+"""What a note of an independent draw calls the number of draws that there were to be in all."""
+
 _SAME_TASK = 1e-9
 """How far points of the unit cube may be apart that are one task: parameters are scaled there and back."""
+
+
+@dataclass(frozen=True)
+class MadeGood:
+    """A failure whose task was executed with success later.
+
+    Attributes:
+        trial: number of the trial that failed.
+        by: number of the one that succeeded.
+        because: what was changed on the system in between; None if nobody stated it.
+    """
+
+    trial: int
+    by: int
+    because: str | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +45,9 @@ class Sample:
         origins: n reasons why a trial was chosen.
         states: n states; open trials are refused by every certificate.
         numbers: of the trials, for messages; 0, 1, ... by default.
+        planned: for each trial, how many independent draws there were to be in all when it was drawn; 0 if they were to
+            end with the verdict, None if that is not known.
+        made_good: failures that are left out, because their tasks were executed with success later.
 
     Raises:
         CertificateError: the parts do not fit together, or a trial is still open.
@@ -37,14 +58,19 @@ class Sample:
     origins: Sequence[Origin]
     states: Sequence[State]
     numbers: Sequence[int] = ()
+    planned: Sequence[int | None] = ()
+    made_good: tuple[MadeGood, ...] = ()
 
     def __post_init__(self) -> None:
         if not len(self.numbers):
             object.__setattr__(self, "numbers", range(len(self.points)))
-        lengths = {len(self.points), len(self.distances), len(self.origins), len(self.states), len(self.numbers)}
+        if not len(self.planned):
+            object.__setattr__(self, "planned", [None] * len(self.points))
+        parts = (self.points, self.distances, self.origins, self.states, self.numbers, self.planned)
+        lengths = {len(part) for part in parts}
         if len(lengths) != 1:
             raise CertificateError(
-                f"points, distances, origins, states and numbers must be equally many, got {sorted(lengths)}."
+                f"points, distances, origins, states, numbers and planned must be equally many, got {sorted(lengths)}."
             )
         if "open" in self.states:
             raise CertificateError(
@@ -58,8 +84,8 @@ class Sample:
     def of(cls, trials: Sequence[Trial]) -> Sample:
         """Return what a certificate may know of trials; a task that failed before its execution has failed as well.
 
-        A failure does not count where the same task was executed with success later, but for independent draws: those
-        are what they are.
+        A failure does not count if the same task was executed with success later, except for independent draws. Trials
+        that people chose or imported come in an order of no meaning, and are sorted by their tasks.
 
         Raises:
             CertificateError: there is none, or one is still open.
@@ -67,20 +93,34 @@ class Sample:
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
         good = _made_good(trials)
-        count = [trial for trial in trials if trial.number not in good]
+        left_out = {one.trial for one in good}
+        count = _in_order([trial for trial in trials if trial.number not in left_out])
         return cls(
             np.array([trial.unit_point for trial in count]),
             np.array([np.nan if trial.distance is None else trial.distance for trial in count]),
             [trial.origin for trial in count],
             [trial.state for trial in count],
             [trial.number for trial in count],
+            [_planned(trial) for trial in count],
+            good,
         )
 
     def only(self, origin: Origin) -> Sample:
         """Return the trials of one origin."""
-        rows = [row for row, own in enumerate(self.origins) if own == origin]
-        states, numbers = [self.states[row] for row in rows], [self.numbers[row] for row in rows]
-        return Sample(self.points[rows], self.distances[rows], [origin] * len(rows), states, numbers)
+        return self.rows([row for row, own in enumerate(self.origins) if own == origin])
+
+    def rows(self, rows: Sequence[int]) -> Sample:
+        """Return some of the trials."""
+        chosen = list(rows)
+        return Sample(
+            self.points[chosen],
+            self.distances[chosen],
+            [self.origins[row] for row in chosen],
+            [self.states[row] for row in chosen],
+            [self.numbers[row] for row in chosen],
+            [self.planned[row] for row in chosen],
+            self.made_good,
+        )
 
     @property
     def best(self) -> float:
@@ -89,22 +129,100 @@ class Sample:
 
     @property
     def failed(self) -> int:
-        """How many executions failed."""
+        """How many trials have no distance: they failed, or could not be measured."""
         return int(np.isnan(self.distances).sum())
 
+    def numbers_of(self, state: State) -> list[int]:
+        """Return the numbers of the trials in a state."""
+        return [number for number, own in zip(self.numbers, self.states, strict=True) if own == state]
 
-def _made_good(trials: Sequence[Trial]) -> set[int]:
-    """Return the numbers of the trials that failed, but whose tasks were executed with success later."""
+    @property
+    def failures(self) -> dict[str, list[Any]]:
+        """What failed, what could not be measured and what was made good, ready for JSON."""
+        return {
+            "failed": self.numbers_of("failed"),
+            "unmeasured": self.numbers_of("unmeasured"),
+            "made_good": [asdict(one) for one in self.made_good],
+        }
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on what failed, what could not be measured and what was made good."""
+        failed, unmeasured = self.numbers_of("failed"), self.numbers_of("unmeasured")
+        found = [f"{listed(failed)} failed, and no distance is known there"] if failed else []
+        if unmeasured:
+            found.append(f"{listed(unmeasured)} {_was(unmeasured)} executed, but the distance could not be measured")
+        causes = dict.fromkeys((one.by, one.because) for one in self.made_good)
+        for by, because in causes:
+            which = listed([one.trial for one in self.made_good if one.by == by])
+            why = "nobody stated why" if because is None else f"you state why: {because!r}"
+            found.append(f"{which} failed, and trial {by} executed the same task with success; {why}")
+        return tuple(found)
+
+
+_LISTED = 5
+"""Numbers of trials that a message has at most."""
+
+
+def listed(numbers: Sequence[int]) -> str:
+    """Return numbers of trials as text, the first few of many."""
+    first = ", ".join(map(str, numbers[:_LISTED])) + (", ..." if len(numbers) > _LISTED else "")
+    return f"trial {first}" if len(numbers) == 1 else f"{len(numbers)} trials ({first})"
+
+
+def remeasure(sample: Sample) -> str:
+    """Return what to do about trials that were executed but not measured, as a sentence after another one."""
+    unmeasured = sample.numbers_of("unmeasured")
+    if not unmeasured:
+        return ""
+    what = listed(unmeasured)
+    return (
+        f" {what[0].upper()}{what[1:]} {_was(unmeasured)} executed, but the distance could not be measured: mend the "
+        "distance, and `ctxval remeasure STORE` measures without executing again."
+    )
+
+
+def _was(numbers: Sequence[int]) -> str:
+    return "was" if len(numbers) == 1 else "were"
+
+
+def _planned(trial: Trial) -> int | None:
+    """Return how many independent draws there were to be when a trial was drawn; 0 if the verdict was to end them."""
+    planned = (trial.note or {}).get(PLANNED) if trial.origin == "iid" else None
+    return planned if isinstance(planned, int) else None
+
+
+def _in_order(trials: list[Trial]) -> list[Trial]:
+    """Return trials with those of no meaningful order sorted, each in the place of another one of them."""
+    places = [place for place, trial in enumerate(trials) if trial.origin == "manual"]
+    ordered = sorted(
+        (trials[place] for place in places),
+        key=lambda trial: (trial.unit_point.tolist(), np.inf if trial.distance is None else trial.distance),
+    )
+    found = list(trials)
+    for place, trial in zip(places, ordered, strict=True):
+        found[place] = trial
+    return found
+
+
+def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
+    """Return the trials that failed, but whose tasks were executed with success later.
+
+    Of several successes that is one whose reason was stated, if there is one, or else the first.
+    """
     known = [trial for trial in trials if trial.distance is not None]
     failed = [trial for trial in trials if trial.state == "failed" and trial.origin != "iid"]
     if not known or not failed:
-        return set()
+        return ()
     points, numbers = np.array([trial.unit_point for trial in known]), np.array([trial.number for trial in known])
-    return {
-        trial.number
-        for trial in failed
-        if ((np.abs(points - trial.unit_point).max(axis=1) <= _SAME_TASK) & (numbers > trial.number)).any()
-    }
+    found = []
+    for trial in failed:
+        same = (np.abs(points - trial.unit_point).max(axis=1) <= _SAME_TASK) & (numbers > trial.number)
+        later = [known[row] for row in np.flatnonzero(same)]
+        if later:
+            by = next((one for one in later if one.because), later[0])
+            found.append(MadeGood(trial.number, by.number, by.because))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -121,6 +239,7 @@ class Certificate:
         assumptions: what must hold, in plain words.
         details: the numbers behind it.
         doubt: why it is withdrawn, where the trials speak against what it assumes; a user must not believe it then.
+        error: standard error of ``upper_bound`` where it is computed from random draws, in the distance's units.
         version: of ctxval.
     """
 
@@ -133,15 +252,44 @@ class Certificate:
     assumptions: tuple[str, ...]
     details: dict[str, Any] = field(default_factory=dict)
     doubt: str | None = None
+    error: float = 0.0
     version: str = VERSION
 
     def covers(self, threshold: float, volume: float = 0.0) -> bool:
-        """Return whether it bounds the distance by the threshold, but for a volume that is acceptable."""
-        return self.doubt is None and self.volume <= volume and self.upper_bound <= threshold
+        """Return whether it bounds the distance by the threshold for sure, but for a volume that is acceptable."""
+        return self.doubt is None and self.volume <= volume and self.upper_bound + ERRORS * self.error <= threshold
+
+    def with_remarks(self, remarks: Sequence[str]) -> Certificate:
+        """Return the certificate with more sentences among its assumptions: what the user states and must know."""
+        return replace(self, assumptions=(*self.assumptions, *remarks))
 
     def to_json(self) -> dict[str, Any]:
         """Return everything, ready for JSON."""
         return asdict(self)
+
+
+ERRORS = 2.0
+"""Standard errors of a computed bound by which it must keep a threshold."""
+
+ONE_CAMPAIGN = "this campaign was fixed beforehand: the best of several is wrong more often than stated"
+"""What every certificate assumes."""
+
+
+def with_error(upper: float, error: float) -> str:
+    """Return a bound and its standard error as text, both rounded up, with the digits that the error supports."""
+    if not error > 0 or not np.isfinite(error + upper):
+        return at_most(upper)
+    high, low = _place(upper or error), _place(error)
+    # Two digits of an error that starts with 1, and never more than four of the bound.
+    last = max(low - (error < 2 * 10.0**low), high - 3)
+    if error < 10.0**last:
+        return at_most(upper)
+    return f"{at_most(upper, max(high - last + 1, 1))} ± {at_most(error, max(low - last + 1, 1))}"
+
+
+def _place(value: float) -> int:
+    """Return the power of ten of a number's first digit."""
+    return int(np.floor(np.log10(abs(value))))
 
 
 def at_most(value: float, digits: int = 4) -> str:

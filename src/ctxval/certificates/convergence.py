@@ -18,10 +18,13 @@ from typing import Literal
 
 import numpy as np
 
-from ctxval.certificates.base import Certificate, Sample, at_most, require_probability
+from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, Sample, at_most, require_probability
 from ctxval.errors import CertificateError
 
 KernelName = Literal["matern-3/2", "matern-5/2", "squared-exponential"]
+
+_FIXED = ("GPUCB",)
+"""Searches with a fixed beta and with hyperparameters that are estimated."""
 
 _SMOOTHNESS: dict[str, float] = {"matern-3/2": 1.5, "matern-5/2": 2.5}
 
@@ -80,30 +83,40 @@ class TheoremConstants:
 
 
 def certify_convergence(
-    sample: Sample, constant: float, confidence: float = 0.95, kernel: KernelName = "matern-3/2"
+    sample: Sample,
+    constant: float | TheoremConstants,
+    confidence: float = 0.95,
+    kernel: KernelName = "matern-3/2",
+    *,
+    search: str | None = None,
 ) -> Certificate:
-    """Return the bound ``best_n + r_n`` of Proposition 1.
+    """Return the bound ``best_n + r_n`` of Proposition 1, withdrawn if the theorem does not cover it.
 
     Args:
         sample: the trials of a GP-UCB campaign; n counts those that the acquisition function chose.
-        constant: C, in the distance's units; the paper does not give it, and nothing can compute it from the trials.
-            :class:`TheoremConstants` computes it from what one is ready to state.
+        constant: what C is computed from, or C itself in the distance's units; the paper does not give it, and nothing
+            can compute it from the trials, so that a bound by a bare C is withdrawn.
         confidence: 1 - eps.
         kernel: of the prior.
+        search: the type of the search that chose the tasks, if it is known; the bound of a search whose beta is fixed
+            and whose hyperparameters are fitted is withdrawn.
 
     Raises:
         CertificateError: no distance is known, an execution failed, no task was chosen by an acquisition function, or C
             is not positive.
     """
     require_probability("confidence", confidence)
-    if not (constant > 0 and np.isfinite(constant)):
+    if not isinstance(constant, TheoremConstants) and not (constant > 0 and np.isfinite(constant)):
         raise CertificateError(f"the constant C of Proposition 1 must be a positive number, got {constant!r}.")
     if sample.failed or not len(sample):
         raise CertificateError(
-            f"Proposition 1 needs a distance from every execution, but {sample.failed} of {len(sample)} failed."
+            f"Proposition 1 needs a distance from every execution, but {sample.failed} of {len(sample)} trials have "
+            "none."
         )
     n, dimension = require_iterations(sample), sample.points.shape[1]
-    best, gap = float(sample.distances.max()), constant * rate(n, dimension, kernel)
+    computed = isinstance(constant, TheoremConstants)
+    C = constant.constant(n, dimension, confidence, kernel) if isinstance(constant, TheoremConstants) else constant
+    best, gap = float(sample.distances.max()), C * rate(n, dimension, kernel)
     return Certificate(
         kind="convergence",
         statement=f"With probability {confidence} under the prior, d* is at most {at_most(best + gap)}.",
@@ -113,13 +126,34 @@ def certify_convergence(
         trials=len(sample),
         assumptions=(
             f"the distance is a draw from a Gaussian process with zero mean and a {kernel} kernel",
-            "the kernel's hyperparameters are known; here they were estimated",
+            "the kernel's hyperparameters are known; ctxval's own GP-UCB estimates them",
             "every task was chosen by GP-UCB with the theorem's growing beta_n; with a fixed beta it does not hold",
             "the theorem needs sample paths smoother than Matern 3/2 gives (nu > 2)",
-            f"C = {constant:g} is yours: the paper does not say what it is, and it grows as eps falls",
+            f"C = {C:g} is {'computed from the constants of the theorem that you state' if computed else 'yours'}",
+            *sample.remarks,
+            ONE_CAMPAIGN,
         ),
-        details={"best": best, "gap": gap, "iterations": n, "constant": constant, "kernel": kernel},
+        details={
+            **{"best": best, "gap": gap, "iterations": n, "constant": C, "kernel": kernel},
+            "failures": sample.failures,
+        },
+        doubt=_doubt(C, computed, search),
     )
+
+
+def _doubt(constant: float, computed: bool, search: str | None) -> str | None:
+    """Return why the theorem says nothing of these trials; None if it does what is stated."""
+    if not computed:
+        return (
+            f"C = {constant:g} is a number of yours that no theorem and no trial supports, so the bound is withdrawn; "
+            "--theorem computes C from what the theorem needs to be known"
+        )
+    if search in _FIXED:
+        return (
+            f"{search} took a fixed beta and estimated the kernel's hyperparameters, while the theorem needs a growing "
+            "beta_n and known hyperparameters, so the bound is withdrawn; --kind posterior needs neither"
+        )
+    return None
 
 
 def require_iterations(sample: Sample) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial import KDTree
+from scipy.special import gammaln
 
 from ctxval.arrays import Array
 from ctxval.errors import CertificateError
@@ -24,6 +25,13 @@ def require_resolution(value: float) -> float:
     if not 0 < value < float("inf"):
         raise CertificateError(f"the resolution must be a positive number of diagonals, got {value!r}.")
     return float(value)
+
+
+def resolved_volume(resolution: float, dimension: int) -> float:
+    """Return the share of the unit cube's volume that a ball of this many diagonals' radius has, at most 1."""
+    radius = resolution * np.sqrt(dimension)
+    log_volume = 0.5 * dimension * np.log(np.pi) - gammaln(0.5 * dimension + 1) + dimension * np.log(radius)
+    return float(np.exp(min(log_volume, 0.0)))
 
 
 def farthest_task(X: Array) -> float:

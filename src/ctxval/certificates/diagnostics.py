@@ -3,7 +3,10 @@
 Each trial is predicted from those before it, and from all others.
 
 Under the process, the standardised error of each prediction from the trials before it follows a t distribution, and
-these errors are independent, whatever chose the tasks (recursive residuals; Brown, Durbin and Evans 1975).
+these errors are independent, whatever chose the tasks (recursive residuals; Brown, Durbin and Evans 1975). Trials that
+people chose or imported have no order that means anything; each of them is predicted from all others, and its
+standardised error follows a t distribution as well (externally studentised residuals; Cook and Weisberg 1982), if their
+tasks were not chosen by the distances.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 from scipy.special import ndtri, stdtr
 
-from ctxval.arrays import Array
+from ctxval.arrays import Array, Mask
 from ctxval.certificates.covering import RESOLUTION, covering, farthest_task
 from ctxval.hyperposterior import Conditioned
 
@@ -55,6 +58,7 @@ def diagnose(
     X: Array,
     numbers: Sequence[int] | None = None,
     *,
+    unordered: Mask | None = None,
     level: float = LEVEL,
     resolution: float = RESOLUTION,
 ) -> Diagnosis:
@@ -64,19 +68,22 @@ def diagnose(
         conditioned: the values under draws of the hyperparameters.
         X: the trials' points ``(n, d)``.
         numbers: of the trials; 0, 1, ... by default.
+        unordered: which trials have no order that means anything, shape ``(n,)``; none by default.
         level: how unlikely a surprise withdraws the bound.
         resolution: how far from every trial a task may be without withdrawing it, in diagonals.
     """
-    exceed = np.mean([_exceedances(one) for one in conditioned], axis=0)
-    worst = int(exceed.argmin())
-    trial = worst + 2 if numbers is None else numbers[worst + 2]
-    surprise = float(-np.expm1(len(exceed) * np.log1p(-min(exceed[worst], 1 - 1e-16))))
+    exceed, before = _surprises(conditioned, np.zeros(len(X), dtype=bool) if unordered is None else unordered)
+    worst = int(np.nanargmin(exceed))
+    trial = worst if numbers is None else numbers[worst]
+    tested = int(np.isfinite(exceed).sum())
+    surprise = float(-np.expm1(tested * np.log1p(-min(exceed[worst], 1 - 1e-16))))
     left_out = float(np.sqrt(np.mean([_left_out(one) for one in conditioned])))
     farthest, doubt = farthest_task(X), None
     if surprise < level:
         doubt = (
             f"trial {trial} came out {-ndtri(max(exceed[worst], 1e-300)):.1f} standard deviations above what the "
-            "trials before it predict: the distance is not what the process takes it for, and the bound is withdrawn"
+            f"{'trials before it' if before[worst] else 'other trials'} predict: the distance is not as smooth as the "
+            "bound takes it to be, and the bound is withdrawn"
         )
     elif farthest > resolution:
         doubt = _uncovered(X, farthest, resolution)
@@ -89,9 +96,31 @@ def _uncovered(X: Array, farthest: float, resolution: float) -> str:
     return (
         f"some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the "
         f"{resolution:g} within which the distance is taken to be like what was seen, and the bound is withdrawn; "
-        f"{many} more executions would come near to every task (--until-decided), or audit, or state a larger "
-        "resolution"
+        f"{many} more executions would come near to every task (--until-decided makes them), or an audit bounds how "
+        "many tasks are worse"
     )
+
+
+def _surprises(conditioned: list[Conditioned], unordered: Mask) -> tuple[Array, Mask]:
+    """Return Pr(a value as large) for each trial ``(n,)``, NaN if not tested, and which ones the earlier predict."""
+    exceed = np.full(len(unordered), np.nan)
+    before = ~unordered
+    exceed[2:] = np.mean([_exceedances(one) for one in conditioned], axis=0)
+    if unordered.any():
+        exceed[unordered] = np.mean([_left_out_exceedances(one) for one in conditioned], axis=0)[unordered]
+    return exceed, before
+
+
+def _left_out_exceedances(conditioned: Conditioned) -> Array:
+    """Return Pr(a value as large) for each trial given all others, shape ``(n,)``."""
+    y, n = conditioned.y, len(conditioned.y)
+    inverse = cho_solve((conditioned.L, True), np.eye(n), check_finite=False)
+    ones = inverse.sum(axis=1)
+    inverse = inverse - np.outer(ones, ones) / ones.sum()  # the unknown mean is projected out
+    pull, own = inverse @ y, np.maximum(np.diag(inverse), np.finfo(np.float64).tiny)
+    freedom = n - 2
+    scale2 = np.maximum(y @ pull - pull**2 / own, np.finfo(np.float64).tiny) / freedom
+    return np.asarray(stdtr(freedom, -pull / np.sqrt(own * scale2)))
 
 
 def _exceedances(conditioned: Conditioned) -> Array:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from ctxval.certificates.base import Certificate, Sample
-from ctxval.certificates.convergence import TheoremConstants, certify_convergence, require_iterations
+from ctxval.certificates.convergence import TheoremConstants, certify_convergence
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.posterior import certify_posterior
 from ctxval.certificates.scenario import certify_audit, certify_scenario
@@ -39,7 +39,8 @@ class Options:
         discard: sampling-discarding: how many of the largest distances are discarded.
         constant: convergence: C, in the distance's units.
         theorem: convergence: what C is computed from, in place of it.
-        search: convergence: the type of the search that chose the tasks, where it is known.
+        search: convergence: the type of the search that chose the tasks, if it is known.
+        remarks: sentences that the certificate lists among its assumptions, such as what was changed on the system.
     """
 
     stochastic: bool = False
@@ -48,6 +49,7 @@ class Options:
     theorem: TheoremConstants | None = None
     search: str | None = None
     resolution: float = RESOLUTION
+    remarks: tuple[str, ...] = ()
 
 
 def certify(sample: Sample, kind: str, confidence: float, options: Options | None = None) -> Certificate:
@@ -58,6 +60,10 @@ def certify(sample: Sample, kind: str, confidence: float, options: Options | Non
         CertificateError: its theory does not allow these trials, or something that it needs is not given.
     """
     chosen = Options() if options is None else options
+    return _certified(sample, kind, confidence, chosen).with_remarks(chosen.remarks)
+
+
+def _certified(sample: Sample, kind: str, confidence: float, chosen: Options) -> Certificate:
     if kind == "posterior":
         return certify_posterior(sample, confidence, stochastic=chosen.stochastic, resolution=chosen.resolution)
     if kind == "audit":
@@ -71,7 +77,7 @@ def certify(sample: Sample, kind: str, confidence: float, options: Options | Non
     if kind == "convergence":
         if chosen.search not in (None, "GPUCB"):
             raise CertificateError(f"Proposition 1 is about tasks that GP-UCB chose; {chosen.search} chose these.")
-        return certify_convergence(sample, _constant(sample, confidence, chosen), confidence)
+        return certify_convergence(sample, _constant(chosen), confidence, search=chosen.search)
     raise UnknownNameError.among("certificate", kind, KINDS)
 
 
@@ -101,11 +107,11 @@ def require_possible(origins: Iterable[Origin], kind: str, options: Options) -> 
         raise CertificateError("Proposition 1 is about tasks that GP-UCB chose: it has no use for an audit.")
 
 
-def _constant(sample: Sample, confidence: float, options: Options) -> float:
+def _constant(options: Options) -> float | TheoremConstants:
     if options.constant is not None:
         return options.constant
     if options.theorem is not None:
-        return options.theorem.constant(require_iterations(sample), sample.points.shape[1], confidence)
+        return options.theorem
     raise CertificateError(
-        "Proposition 1 needs its constant C, which the paper does not give: state it, or what it is computed from."
+        "Proposition 1 needs its constant C, which the paper does not give: state what it is computed from (--theorem)."
     )

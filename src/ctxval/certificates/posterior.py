@@ -17,8 +17,17 @@ import numpy as np
 
 from ctxval.acquisition import UpperConfidenceBound, maximise
 from ctxval.arrays import Array, Rows, single_threaded
-from ctxval.certificates.base import Certificate, Sample, at_most, require_probability
-from ctxval.certificates.covering import RESOLUTION, require_resolution
+from ctxval.certificates.base import (
+    ERRORS,
+    ONE_CAMPAIGN,
+    Certificate,
+    Sample,
+    listed,
+    remeasure,
+    require_probability,
+    with_error,
+)
+from ctxval.certificates.covering import RESOLUTION, require_resolution, resolved_volume
 from ctxval.certificates.diagnostics import diagnose
 from ctxval.errors import CertificateError, InputError
 from ctxval.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
@@ -34,14 +43,22 @@ STOCHASTIC = (1e-6, 1.0)
 _ROUNDING = 1e-14
 """Distances that differ by less, relative to their size, are one distance and rounding."""
 
-_LISTED = 5
-"""Numbers of failed trials that a message has at most."""
-
 _EXTREME = 1e100
 """Distances beyond it, or that differ by less than its inverse, have squares that no float holds."""
 
 _REPEATED = 1e-6
 """Two executions of a task may differ by so much of all distances' spread where the system is deterministic."""
+
+_LOTS = 32
+"""Parts of the chain of hyperparameters that are resampled for the error of a bound."""
+
+_RESAMPLES = 200
+
+_SEEDS = 1_000_003
+"""Between the seeds of chains whose draws are taken together."""
+
+_MOST = 4
+"""Times as many draws of d* as usual that a bound near a threshold may take."""
 
 _EXACTNESS = 3.0 * np.sqrt(EXACT)
 """How far a path may miss exact values, in standard deviations of the distance."""
@@ -75,6 +92,28 @@ class Maxima:
                 f"a confidence of {confidence:g} needs more than the {len(self.draws)} draws of d* that there are."
             )
         return float(self.draws[rank - 1])
+
+    def error(self, confidence: float) -> float:
+        """Return the standard error of the bound: what it differs by from one seed of the draws to another.
+
+        Of lots of the hyperparameters' chain, drawn with replacement: draws that follow each other are alike, and so
+        are those that share their hyperparameters. Few draws are above a bound of a high confidence, so that their own
+        spread may be too small; the bound with less of them above it has one too, and the larger of the two is taken.
+        """
+        share = require_probability("confidence", confidence)
+        lots = min(_LOTS, len(self.conditioned))
+        if lots < 2:
+            return 0.0
+        lot_of = self.owners * lots // len(self.conditioned)
+        times = np.random.default_rng(0).multinomial(lots, np.full(lots, 1 / lots), size=_RESAMPLES)
+        weights = np.cumsum(times[:, lot_of], axis=1, dtype=np.float64)
+        total = weights[:, -1:]
+
+        def spread(confidence: float) -> float:
+            rows = (weights < np.minimum(confidence * (total + 1), total)).sum(axis=1)
+            return float(self.draws[np.minimum(rows, len(self.draws) - 1)].std(ddof=1))
+
+        return max(spread(share), spread(1 - (1 - share) / np.sqrt(2)))
 
     def probability(self, threshold: float) -> float:
         """Return Pr(d* <= threshold), rounded down to what so many draws can tell."""
@@ -128,12 +167,44 @@ def draw_maxima(
     return Maxima(tops[order], np.concatenate([where for _, where in found])[order], conditioned, owners[order])
 
 
+def settle_maxima(
+    sample: Sample, threshold: float, confidence: float, *, seed: int = 0, stochastic: bool = False
+) -> Maxima:
+    """Return draws of d*, up to four times as many as usual while the threshold is within two errors of the bound.
+
+    The first of them are those of :func:`draw_maxima`; the others come from chains of their own.
+
+    Raises:
+        CertificateError: as of :func:`draw_maxima`, or so high a confidence needs more draws.
+    """
+    found = draw_maxima(sample, seed=seed, stochastic=stochastic)
+    lots = [found]
+    while len(lots) < _MOST and abs(found.upper(confidence) - threshold) < ERRORS * found.error(confidence):
+        more = range(len(lots), 2 * len(lots))
+        lots += [draw_maxima(sample, seed=_SEEDS * lot + seed, stochastic=stochastic) for lot in more]
+        found = _together(lots)
+    return found
+
+
+def _together(lots: list[Maxima]) -> Maxima:
+    draws, points = np.concatenate([one.draws for one in lots]), np.concatenate([one.points for one in lots])
+    before = np.cumsum([0, *(len(one.conditioned) for one in lots[:-1])])
+    owners = np.concatenate([one.owners + first for one, first in zip(lots, before, strict=True)])
+    order = np.argsort(draws, kind="stable")
+    return Maxima(draws[order], points[order], [each for one in lots for each in one.conditioned], owners[order])
+
+
 def _required(sample: Sample) -> tuple[Array, Array]:
+    failed = sample.failed - len(sample.numbers_of("unmeasured"))
+    if failed:
+        raise CertificateError(
+            f"{failed} of {len(sample)} executions failed: what the distance is there is unknown, so nothing bounds "
+            f"d*; once the cause is removed, execute the same tasks again and say what it was (ctxval ask STORE "
+            f'--again N --because "..."): {listed(sample.numbers_of("failed"))}.{remeasure(sample)}'
+        )
     if sample.failed:
         raise CertificateError(
-            f"{sample.failed} of {len(sample)} executions failed: what the distance is there is unknown, so nothing "
-            f"bounds d*; execute those tasks again (trial {_listed(sample)}), or leave them out of the task space of a "
-            "new store."
+            f"what the distance is at some task is unknown, so nothing bounds d*.{remeasure(sample)}"
         )
     if len(sample) < FEWEST:
         raise CertificateError(f"a posterior bound needs at least {FEWEST} trials, got {len(sample)}.")
@@ -148,12 +219,6 @@ def _required(sample: Sample) -> tuple[Array, Array]:
             f"between {1 / _EXTREME:g} and {_EXTREME:g}; take other units."
         )
     return sample.points, sample.distances
-
-
-def _listed(sample: Sample) -> str:
-    """Return the numbers of the first trials that failed."""
-    numbers = [str(number) for number, d in zip(sample.numbers, sample.distances, strict=True) if np.isnan(d)]
-    return ", ".join(numbers[:_LISTED]) + (", ..." if len(numbers) > _LISTED else "")
 
 
 def _require_one_distance_each(sample: Sample) -> None:
@@ -197,9 +262,16 @@ def certify_posterior(
     require_resolution(resolution)
     maxima_found = draw_maxima(sample, stochastic=stochastic, seed=seed) if found is None else found
     upper, best = maxima_found.upper(confidence), float(sample.distances.max())
-    diagnosis = diagnose(maxima_found.conditioned, sample.points, sample.numbers, resolution=resolution)
+    error = maxima_found.error(confidence)
+    unordered = np.array([origin == "manual" for origin in sample.origins])
+    diagnosis = diagnose(
+        maxima_found.conditioned, sample.points, sample.numbers, unordered=unordered, resolution=resolution
+    )
     what = "the largest expected distance" if stochastic else "d*"
-    statement = f"With probability {confidence} under the prior, given the trials, {what} is at most {at_most(upper)}."
+    statement = (
+        f"With probability {confidence} under the prior, given the trials, {what} is at most "
+        f"{with_error(upper, error)}{_STANDARD_ERROR if '±' in with_error(upper, error) else ''}."
+    )
     return Certificate(
         kind="posterior",
         statement=statement,
@@ -207,16 +279,42 @@ def certify_posterior(
         confidence=confidence,
         volume=0.0,
         trials=len(sample),
-        assumptions=_assumptions(stochastic, resolution),
+        assumptions=(*_assumptions(stochastic, resolution), *sample.remarks, ONE_CAMPAIGN),
         details={
             "best": best,
             "gap": upper - best,
+            "error": error,
             "draws": len(maxima_found.draws),
+            "stochastic": stochastic,
+            "resolution": _resolution(resolution, sample.points.shape[1]),
             "instantaneous": instantaneous_bound(sample),
             **_summary(maxima_found.conditioned),
             "diagnosis": diagnosis.to_json(),
+            "failures": sample.failures,
         },
-        doubt=diagnosis.doubt,
+        doubt=_both_outcomes(sample, stochastic) or diagnosis.doubt,
+        error=error,
+    )
+
+
+_STANDARD_ERROR = " (plus or minus one standard error of the random draws that it is computed from)"
+
+
+def _both_outcomes(sample: Sample, stochastic: bool) -> str | None:
+    """Return why failures that were made good for no stated reason withdraw the bound."""
+    unexplained = [one for one in sample.made_good if one.because is None]
+    if not unexplained:
+        return None
+    first = unexplained[0]
+    what = (
+        "a failure has no distance, so that nothing is known of the expected one there"
+        if stochastic
+        else "the system is not deterministic there"
+    )
+    return (
+        f"trial {first.trial} failed and trial {first.by} executed the same task with success, for no stated reason: "
+        f"{what}, and the bound is withdrawn; if the cause was removed in between, execute the task once more and say "
+        f'so: ctxval ask STORE --again {first.trial} --because "what was changed"'
     )
 
 
@@ -235,6 +333,12 @@ def _assumptions(stochastic: bool, resolution: float) -> tuple[str, ...]:
         noise,
         "how the tasks were chosen and when the campaign stopped does not matter",
     )
+
+
+def _resolution(resolution: float, dimension: int) -> dict[str, float]:
+    """Return the resolution in diagonals, as a share of each parameter's range, and its ball's share of the space."""
+    share = resolution * float(np.sqrt(dimension))
+    return {"diagonals": resolution, "of_each_range": share, "of_the_space": resolved_volume(resolution, dimension)}
 
 
 def _summary(conditioned: list[Conditioned]) -> dict[str, object]:

@@ -15,10 +15,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import bdtr, betaincinv
 
-from ctxval.certificates.base import Certificate, Sample, at_most, require_probability
+from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, Sample, at_most, listed, remeasure, require_probability
 from ctxval.errors import CertificateError
 
 _MOST_SAMPLES = 2**40
+
+_UNSEEN = (
+    "M was not learned from these tasks, nor chosen after seeing them: a model that is retrained on them needs a new "
+    "store and fresh draws"
+)
 
 
 def tail(n: int, discarded: int, volume: float) -> float:
@@ -70,7 +75,8 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
         discarded: k; 0 is scenario optimisation. It must be chosen before the distances are looked at.
 
     Raises:
-        CertificateError: a trial is no independent draw, too few are left, or more failed than are discarded.
+        CertificateError: a trial is no independent draw, the number of draws depended on their distances, too few are
+            left, or more failed than are discarded.
     """
     beta = 1 - require_probability("confidence", confidence)
     foreign = [origin for origin in sample.origins if origin != "iid"]
@@ -80,10 +86,10 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
             f"were chosen otherwise ({', '.join(sorted(set(foreign)))}); run --search random, or say --kind audit."
         )
     _require_counts(len(sample), discarded)
+    _require_one_number(sample, _name(discarded))
     if sample.failed > discarded:
         raise CertificateError(
-            f"{sample.failed} of {len(sample)} executions failed and count as violations, more than the {discarded} "
-            "discarded; nothing bounds them."
+            f"{_violations(sample)}, more than the {discarded} discarded; nothing bounds them.{remeasure(sample)}"
         )
     ordered = np.sort(np.nan_to_num(sample.distances, nan=np.inf))
     h = float(ordered[len(sample) - 1 - discarded])
@@ -99,12 +105,15 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
         volume=volume,
         trials=len(sample),
         assumptions=(
-            "the trials are independent and uniform over the task space, and their number did not depend on distances",
+            f"the trials are independent and uniform over the task space, and {_number(sample)}",
             "the number discarded was chosen before the distances were known",
+            _UNSEEN,
             "each task has one distance: the system is deterministic",
             "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
+            *sample.remarks,
+            ONE_CAMPAIGN,
         ),
-        details={"discarded": discarded, "failed": sample.failed},
+        details={"discarded": discarded, "failed": sample.failed, "failures": sample.failures},
     )
 
 
@@ -112,23 +121,32 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
     """Bound the volume of the tasks that are worse than the worst one known, by the independent draws among the trials.
 
     The volume above the largest of N independent draws is bounded whatever the distance is like, and that above the
-    largest of all trials, however chosen, is not larger.
+    largest of all trials, however chosen, is not larger. If the number of draws was raised after some were known, only
+    those that were decided on last count, as their number was chosen before they were executed.
 
     Args:
         sample: trials of any origin, some of them independent draws.
         confidence: 1 - beta.
 
     Raises:
-        CertificateError: there is no independent draw, or an execution of one failed.
+        CertificateError: there is no independent draw, their number depended on their distances, or an execution of
+            one failed.
     """
     beta = 1 - require_probability("confidence", confidence)
-    drawn = sample.only("iid")
-    if not len(drawn):
+    everything = sample.only("iid")
+    if not len(everything):
         raise CertificateError("an audit needs independent draws of tasks, and there is none; run certify --audit N.")
+    drawn = _last_decided_on(everything)
+    if not len(drawn):
+        raise CertificateError(
+            f"the {len(everything)} independent draws ended with the verdict (--until-decided), so their number "
+            f"depended on their distances and none counts; certify --audit N draws until there are N in all, and "
+            f"counts those beyond the {len(everything)}."
+        )
     if drawn.failed:
         raise CertificateError(
-            f"{drawn.failed} of {len(drawn)} independently drawn executions failed and count as violations, larger "
-            "than any distance; leave such tasks out of the task space, and audit what is left."
+            f"{_violations(drawn)}; a new store of a task space without such tasks can be audited, and says nothing of "
+            f"them.{remeasure(drawn)}"
         )
     volume, h = volume_bound(len(drawn), 0, beta), sample.best
     return Certificate(
@@ -142,12 +160,75 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
         volume=volume,
         trials=len(drawn),
         assumptions=(
-            "the audited tasks are independent and uniform over the task space, and their number was chosen before",
+            f"the audited tasks are independent and uniform over the task space, and {_number(drawn)}",
+            *_not_counted(everything, drawn),
+            _UNSEEN,
             "each task has one distance: the system is deterministic",
             "nothing is assumed of how the distance depends on the task",
             "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
+            *sample.remarks,
+            ONE_CAMPAIGN,
         ),
-        details={"largest_found": h, **_against_the_search(sample, drawn), "failed": sample.failed},
+        details={
+            **{"largest_found": h, **_against_the_search(sample, drawn)},
+            **{"not_counted": len(everything) - len(drawn), "failed": sample.failed, "failures": sample.failures},
+        },
+    )
+
+
+def _last_decided_on(drawn: Sample) -> Sample:
+    """Return the draws whose number was decided on last, without those that the verdict was to end."""
+    plans = [planned for planned in drawn.planned if planned != 0]
+    return drawn.rows([row for row, planned in enumerate(drawn.planned) if plans and planned == plans[-1]])
+
+
+def _not_counted(everything: Sample, drawn: Sample) -> tuple[str, ...]:
+    missing = len(everything) - len(drawn)
+    if not missing:
+        return ()
+    return (
+        f"{missing} other independent draws do not count: the number of draws was changed, or the verdict ended them, "
+        "after they were known",
+    )
+
+
+def _number(sample: Sample) -> str:
+    """Return what is known of when the number of draws was chosen."""
+    planned = sample.planned[-1] if len(sample) else None
+    if planned is None:
+        return "their number was chosen before they were executed (the store does not know when)"
+    if planned > len(sample) and set(sample.origins) == {"iid"} and sample.numbers[0] == 0:
+        return (
+            f"their number did not depend on their distances, although {planned} were planned and {len(sample)} are "
+            "known"
+        )
+    return "their number was chosen before they were executed"
+
+
+def _require_one_number(sample: Sample, kind: str) -> None:
+    """Refuse draws whose number was chosen after some of them were known.
+
+    Raises:
+        CertificateError: it was.
+    """
+    plans = list(dict.fromkeys(planned for planned in sample.planned if planned is not None))
+    if 0 in plans:
+        raise CertificateError(
+            f"the draws ended with the verdict (--until-decided), so their number depended on their distances, which a "
+            f"{kind} bound does not allow; certify --audit N counts draws that are made from now on."
+        )
+    if len(plans) > 1:
+        raise CertificateError(
+            f"the number of draws was changed from {plans[-2]} to {plans[-1]} after the first were known, which a "
+            f"{kind} bound does not allow; say --kind audit, which counts the last ones alone."
+        )
+
+
+def _violations(sample: Sample) -> str:
+    numbers = [*sample.numbers_of("failed"), *sample.numbers_of("unmeasured")]
+    return (
+        f"{sample.failed} of {len(sample)} executions of independent draws have no distance and count as violations, "
+        f"larger than any distance ({listed(numbers)})"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,11 +22,13 @@ from ctxval.certificates import (
 )
 from ctxval.cli.base import (
     FALSIFIED,
+    RESOLUTION_HELP,
     AsJson,
     app,
     certificate_of,
     command,
     out,
+    print_other_stores,
     print_table,
     print_verdict,
     progress,
@@ -33,9 +36,20 @@ from ctxval.cli.base import (
 from ctxval.cli.trust import AcceptChange, Named, Trust, open_store, settings_of
 from ctxval.config import CertificateTable, Settings, stored_settings
 from ctxval.errors import CertificateError, InputError, UnknownNameError
+from ctxval.siblings import other_stores
+from ctxval.space import TaskSpace
 from ctxval.store import Store
 from ctxval.trial import Trial
-from ctxval.verdict import Verdict, counterexample, judge, judge_by, require_threshold
+from ctxval.verdict import (
+    Verdict,
+    counterexample,
+    judge,
+    judge_by,
+    remarks_on,
+    require_confidence,
+    require_threshold,
+    require_volume,
+)
 
 
 @app.command("certify")
@@ -50,7 +64,9 @@ def certify_store(
     ] = None,
     volume: Annotated[float | None, typer.Option(help="Share of the task space that may exceed the threshold.")] = None,
     discard: Annotated[int | None, typer.Option(help="sampling-discarding: how many; chosen beforehand.")] = None,
-    constant: Annotated[float | None, typer.Option(help="convergence: C, in the distance's units.")] = None,
+    constant: Annotated[
+        float | None, typer.Option(help="convergence: C, in the distance's units; it validates nothing.")
+    ] = None,
     theorem: Annotated[
         str | None, typer.Option(help="convergence: SCALE,NOISE,A,B,GAIN that C is computed from (see the manual).")
     ] = None,
@@ -59,7 +75,7 @@ def certify_store(
     ] = None,
     resolution: Annotated[
         float | None,
-        typer.Option(help="posterior: how far from every trial a task may be, in diagonals of the task space."),
+        typer.Option(help=f"posterior: {RESOLUTION_HELP[0].lower()}{RESOLUTION_HELP[1:]}"),
     ] = None,
     experiment: Named = None,
     trust: Trust = False,
@@ -98,22 +114,33 @@ def certify_store(
         require_possible([trial.origin for trial in opened.trials()], chosen, options)
         made = open_store(opened, store, experiment, trust, accept_change)
         _run_audit(made.campaign, audit, show=not as_json)
-    trials = opened.trials()
+    trials, space, remarks = opened.trials(), _space_of(opened), remarks_on(opened.history())
+    options = replace(options, remarks=remarks)
     found = None if limit is None else counterexample(trials, limit)
     verdict: Verdict | None
     if chosen == "posterior" and limit is not None and found is None:
-        verdict, refusal = judge(trials, limit, confidence, stochastic=stochastic, resolution=resolution), None
+        verdict, refusal = (
+            judge(
+                trials, limit, confidence, stochastic=stochastic, resolution=resolution, space=space, remarks=remarks
+            ),
+            None,
+        )
         certificate = verdict.certificate
         if certificate is None:
             raise CertificateError(verdict.reason)
     else:
         certificate, refusal = _certificate(trials, chosen, confidence, options, needed=found is None)
-        verdict = found if limit is None or certificate is None else judge_by(certificate, trials, limit, volume=volume)
-    answer = {} if verdict is None else {"verdict": verdict.answer, "reason": verdict.reason, "threshold": limit}
+        verdict = found
+        if limit is not None and certificate is not None:
+            verdict = judge_by(certificate, trials, limit, volume=volume, space=space)
+    answer = _answer(verdict)
     said = {"kind": chosen, "refused": refusal} if certificate is None else certificate.to_json()
-    report = {**answer, **said, "expected": certificate_of(verdict)["expected"], "store": str(store)}
+    others = [str(other) for other in other_stores(store)]
+    report = {**answer, **said, "expected": certificate_of(verdict)["expected"]}
+    report |= {"store": str(store), "other_stores": others}
     if not as_json:
         _print_certificate(certificate, verdict, refusal)
+        print_other_stores(others)
     return report, FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
 
@@ -124,6 +151,28 @@ def _planned(store: Store) -> Settings:
 
 def _first(given: Any, planned: Any) -> Any:
     return planned if given is None else given
+
+
+def _answer(verdict: Verdict | None) -> dict[str, Any]:
+    if verdict is None:
+        return {}
+    said = {"verdict": verdict.answer, "reason": verdict.reason, "rests_on": verdict.rests_on}
+    return {**said, "threshold": verdict.threshold}
+
+
+def _space_of(store: Store) -> TaskSpace | None:
+    """Return the task space as the store describes it; None if it does not."""
+    try:
+        described = dict(store.description()["validation"]["space"])
+        described.pop("type", None)
+        bounds: dict[str, tuple[Any, ...]] = {}
+        for name, (low, high, *unit) in described.items():
+            vector = name.partition("[")[0]
+            lows, highs, *_ = bounds.get(vector, ([], []))
+            bounds[vector] = (low, high, *unit) if vector == name else ([*lows, low], [*highs, high], *unit)
+        return TaskSpace(**bounds)
+    except (KeyError, TypeError, ValueError, InputError):
+        return None  # nothing but the units in a sentence depends on it
 
 
 def _search_of(store: Store) -> str | None:
@@ -138,14 +187,14 @@ def decide(campaign: Campaign, threshold: float, confidence: float, table: Certi
     if found is not None:
         return found
     if table.kind == "posterior":
-        return judge(trials, threshold, confidence, stochastic=table.stochastic, resolution=table.resolution)
-    search = _search_of(campaign.store)
-    options = Options(table.stochastic, table.discard, table.constant, None, search, table.resolution)
+        return campaign.verdict(threshold, confidence, stochastic=table.stochastic, resolution=table.resolution)
+    search, remarks = _search_of(campaign.store), remarks_on(campaign.store.history())
+    options = Options(table.stochastic, table.discard, table.constant, None, search, table.resolution, remarks)
     try:
         certificate = certify(Sample.of(trials), table.kind, confidence, options)
     except CertificateError as error:
         return Verdict("undecided", threshold, str(error))
-    return judge_by(certificate, trials, threshold, volume=table.volume)
+    return judge_by(certificate, trials, threshold, volume=table.volume, space=campaign.validation.space)
 
 
 def _require_together(given: dict[str, Any], threshold: float | None) -> None:
@@ -167,8 +216,8 @@ def _require_closed(campaign: Campaign) -> None:
 def _require_shares(confidence: float, volume: float) -> None:
     if not 0 < 1 - confidence < 1:
         raise InputError(f"the confidence must be strictly between 0 and 1, got {confidence!r}.")
-    if not 0 <= volume < 1:
-        raise InputError(f"the volume must be a share of the task space, at least 0 and below 1, got {volume!r}.")
+    require_confidence(confidence)
+    require_volume(volume)
 
 
 def _certificate(
@@ -213,4 +262,5 @@ def _print_certificate(certificate: Certificate | None, verdict: Verdict | None,
     out.say("It assumes that")
     for assumption in certificate.assumptions:
         out.say(f"- {assumption};", wrap=True)
-    print_table({**certificate.details, "trials": certificate.trials, "version": certificate.version})
+    shown = {key: value for key, value in certificate.details.items() if key != "failures"}  # assumptions have them
+    print_table({**shown, "trials": certificate.trials, "version": certificate.version})

@@ -19,7 +19,7 @@ _EXPERIMENT = """\
 #   ctxval check {name}      looks at it without executing the system
 #   ctxval run {name}        searches for the task at which system and model differ most
 name = "cart"
-budget = 25             # executions of the system, in all; fewer with ctxval run --until-decided
+budget = 40             # executions of the system, in all; fewer with ctxval run --until-decided
 threshold = 0.5         # the largest distance that you can accept
 confidence = 0.95       # of a validation
 seed = 0                # of the search
@@ -79,8 +79,6 @@ repeats = 1             # executions of each task: more where two of one task di
 [certificate]           # what a validation rests on: see `ctxval certify --help`
 kind = "posterior"
 stochastic = false      # whether two executions of one task may differ
-resolution = 0.25       # share of the task space's diagonal within which the distance is like what was seen: yours to
-                        # know; without this line it is an eighth, which takes more executions
 """
 
 _SYSTEM = '''"""The system of {name}; yours goes here."""

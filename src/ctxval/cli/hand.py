@@ -59,6 +59,9 @@ def ask(
     again: Annotated[
         int | None, typer.Option(metavar="TRIAL", help="The task of this trial once more, as a new one.")
     ] = None,
+    because: Annotated[
+        str | None, typer.Option(help='With --again: what was changed on the system since, such as "fuse replaced".')
+    ] = None,
     trial: Annotated[int | None, typer.Option(help="Write the files of this open trial again.")] = None,
     search: Annotated[str | None, typer.Option(help="How tasks are chosen, for a new store.")] = None,
     seed: Annotated[int | None, typer.Option(help="For a new store.")] = None,
@@ -70,13 +73,15 @@ def ask(
     """Open the next trial and write its task and its controller, for a rig that people operate."""
     if sum((bool(parameters), draw, again is not None, trial is not None)) > 1:
         raise InputError("of --set, --draw, --again and --trial only one can be given.")
+    if because is not None and again is None:
+        raise InputError("--because says why a task is executed again; say --again TRIAL too.")
     opened = _opened(target, {"store": store, "search": search, "seed": seed}, experiment, trust, accept_change)
     if trial is not None:
         found = opened.campaign.reopen(trial)
     else:
         space = opened.experiment.validation.space
         chosen = parameters_from(parameters, space) if parameters else _parameters_of(opened.campaign, again)
-        found = opened.campaign.ask(chosen, draw=draw, wait=_WAIT)
+        found = opened.campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
     folder = opened.path.with_suffix(".trials") / str(found.number) if out_folder is None else out_folder
     report = {
         "trial": found.number,

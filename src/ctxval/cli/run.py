@@ -14,6 +14,7 @@ from ctxval.campaign import Campaign
 from ctxval.cli.base import (
     CANNOT_GO_ON,
     FALSIFIED,
+    RESOLUTION_HELP,
     AsJson,
     Dask,
     Timeout,
@@ -25,6 +26,7 @@ from ctxval.cli.base import (
     failures_of,
     hands,
     print_failures,
+    print_other_stores,
     print_table,
     print_verdict,
     progress,
@@ -36,6 +38,7 @@ from ctxval.cli.trust import AcceptChange
 from ctxval.config import Settings, read_settings
 from ctxval.errors import InputError
 from ctxval.experiment import Experiment
+from ctxval.siblings import other_stores
 from ctxval.texts import reason_of
 from ctxval.truth import Truth
 from ctxval.verdict import Verdict, require_threshold
@@ -48,7 +51,7 @@ def run(
     budget: Annotated[int | None, typer.Option(help="Executions of the system in all, earlier ones counted.")] = None,
     search: Annotated[str | None, typer.Option(help="How tasks are chosen: auto, gp-ucb, random, ...")] = None,
     threshold: Annotated[float | None, typer.Option(help="Largest distance that you can accept.")] = None,
-    confidence: Annotated[float | None, typer.Option(help="Of a validation; 0.95 if not given.")] = None,
+    confidence: Annotated[float | None, typer.Option(help="Of a validation, at least 0.5; 0.95 if not given.")] = None,
     until_decided: Annotated[
         bool, typer.Option("--until-decided", help="Stop as soon as the verdict is reached; the budget is the most.")
     ] = False,
@@ -58,7 +61,7 @@ def run(
     ] = None,
     resolution: Annotated[
         float | None,
-        typer.Option(help="How far from every trial a task may be, in diagonals of the task space, for a validation."),
+        typer.Option(help=RESOLUTION_HELP),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Of the data, the model and the search.")] = None,
     store: Annotated[Path | None, typer.Option(help="File of the trials; it is resumed if it exists.")] = None,
@@ -146,9 +149,11 @@ def _report(
         "units": experiment.units,
         "verdict": None if verdict is None else verdict.answer,
         "reason": None if verdict is None else verdict.reason,
+        "rests_on": None if verdict is None else verdict.rests_on,
         "threshold": None if verdict is None else verdict.threshold,
         **certificate_of(verdict),
         "store": str(path),
+        "other_stores": [str(other) for other in other_stores(path)],
     }
     if truth is not None:
         task = campaign.validation.space.describe_point(truth.parameters.points)
@@ -192,9 +197,20 @@ def _true_curve(experiment: Experiment) -> plot.Curve | None:
 
 
 def _print_report(report: dict[str, Any], verdict: Verdict | None) -> None:
-    apart = ("failures", "verdict", "reason", "threshold", "units", "certificate", "expected")
+    apart = (
+        "failures",
+        "verdict",
+        "reason",
+        "rests_on",
+        "threshold",
+        "units",
+        "certificate",
+        "expected",
+        "other_stores",
+    )
     shown = {key: value for key, value in report.items() if key not in apart}
     print_table(shown, units=report["units"])
     print_failures(report["failures"])
     if verdict is not None:
         print_verdict(verdict)
+        print_other_stores(report["other_stores"])
