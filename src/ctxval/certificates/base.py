@@ -73,9 +73,8 @@ class Sample:
                 f"points, distances, origins, states, numbers and planned must be equally many, got {sorted(lengths)}."
             )
         if "open" in self.states:
-            raise CertificateError(
-                f"{list(self.states).count('open')} trials are open; tell how they ended before certifying."
-            )
+            waiting = [str(n) for n, state in zip(self.numbers, self.states, strict=True) if state == "open"]
+            raise CertificateError(f"trials are open: {', '.join(waiting)}; tell how they ended before certifying.")
 
     def __len__(self) -> int:
         return len(self.distances)
