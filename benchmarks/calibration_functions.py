@@ -51,9 +51,11 @@ def _vertex(d: int, rng: np.random.Generator) -> Array:
 
 
 def corner_cusp(d: int, rng: np.random.Generator) -> Values:
-    """Return a path and an exponential that falls from a corner."""
+    """Return a path and an exponential that falls from a corner, where it tops the path by a tenth of its range or more."""
     path, vertex = _background(d, rng), _vertex(d, rng)
-    height, width = rng.uniform(1.0, 4.0), np.sqrt(d) * rng.uniform(0.05, 0.2)
+    sample = path(np.random.default_rng(0).random((2000, d)))
+    top = float(sample.max() + rng.uniform(0.1, 1.0) * np.ptp(sample))
+    height, width = top - float(path(vertex[None])[0]), np.sqrt(d) * rng.uniform(0.02, 0.1)
     return lambda Z: path(Z) + height * np.exp(-np.linalg.norm(Z - vertex, axis=1) / width)
 
 
@@ -113,8 +115,8 @@ DEVELOPMENT: dict[str, Make] = {
 def corner_root(d: int, rng: np.random.Generator) -> Values:
     """Return waves and a root or a cone that falls from a corner to nothing, in one of three norms."""
     waves, vertex = _waves(d, rng), _vertex(d, rng)
-    norm, power = rng.choice([1.0, 2.0, np.inf]), rng.uniform(0.5, 1.0)
-    reach, height = np.sqrt(d) * rng.uniform(0.15, 0.5), rng.uniform(1.0, 3.0)
+    norm, power = rng.choice([1.0, 2.0, np.inf]), rng.uniform(0.4, 1.0)
+    reach, height = np.sqrt(d) * rng.uniform(0.1, 0.35), rng.uniform(0.6, 2.5)
 
     def values(Z: Array) -> Array:
         gap = np.linalg.norm(Z - vertex, ord=norm, axis=1) / reach
