@@ -139,7 +139,7 @@ NOISY_CHECKPOINTS = {1: (12, 24), 2: (30,)}
 def maximum(values: Values, d: int) -> float:
     """Return the maximum over the unit cube: a dense sample, and climbs from its best points."""
     rng = np.random.default_rng(0)
-    sample = np.linspace(0, 1, 4001)[:, None] if d == 1 else rng.random(({2: 10000, 4: 20000}[d], d))
+    sample = np.linspace(0, 1, 4001)[:, None] if d == 1 else rng.random(({2: 10000, 3: 20000, 4: 20000}[d], d))
     corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * d, indexing="ij"), axis=-1).reshape(-1, d)
     sample = np.concatenate([sample, corners])
     heights = np.concatenate([values(part) for part in np.array_split(sample, 1 + len(sample) // 1000)])

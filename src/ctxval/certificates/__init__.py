@@ -2,7 +2,14 @@
 
 from ctxval.certificates.base import PLANNED, Certificate, MadeGood, Sample
 from ctxval.certificates.convergence import TheoremConstants, certify_convergence, rate
-from ctxval.certificates.covering import RESOLUTION, covering, farthest_task, require_resolution
+from ctxval.certificates.covering import (
+    RESOLUTION,
+    bare_corners,
+    covering,
+    farthest_task,
+    most_contested,
+    require_resolution,
+)
 from ctxval.certificates.diagnostics import Diagnosis, diagnose
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.named import KINDS, USES, Options, certify, require_possible, require_use
@@ -27,6 +34,7 @@ __all__ = [
     "certify_convergence",
     "certify_posterior",
     "certify_scenario",
+    "bare_corners",
     "covering",
     "diagnose",
     "draw_maxima",
@@ -35,6 +43,7 @@ __all__ = [
     "instantaneous_bound",
     "rate",
     "require_possible",
+    "most_contested",
     "require_resolution",
     "require_use",
     "samples_needed",

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
 from ctxval.arrays import Array
@@ -14,6 +17,13 @@ RESOLUTION = 0.125
 farther away may be unlike anything that was seen (docs/calibration.md)."""
 
 _PROBES = 8192
+
+_BESIDE = 0.125
+"""How far a corner may be from every trial, as a share of what any other task may be. A trial that is merely near to a
+corner says little of it: there are none beyond, and a distance often rises steeply towards the corner that is worst."""
+
+_MOST_PARAMETERS = 4
+"""Parameters up to which corners are asked for: there are 2^d of them."""
 
 
 def require_resolution(value: float) -> float:
@@ -39,10 +49,24 @@ def farthest_task(X: Array) -> float:
     return float(_gaps(X, _probes(X.shape[1])).max())
 
 
+def bare_corners(X: Array, resolution: float) -> Array:
+    """Return the corners ``(k, d)`` of the cube that no trial is at or beside; of few parameters, else none.
+
+    Args:
+        X: the trials' points ``(n, d)``.
+        resolution: how far a task may be, in diagonals; a corner must be eight times nearer. With 1 none is bare.
+    """
+    d = X.shape[1]
+    if d > _MOST_PARAMETERS or resolution >= 1:
+        return np.empty((0, d))
+    corners = np.array(list(product((0.0, 1.0), repeat=d)))
+    return np.asarray(corners[_gaps(X, corners) > _BESIDE * resolution])
+
+
 def covering(X: Array, resolution: float, most: int) -> Array | None:
     """Return the points ``(k, d)`` whose execution would leave no task too far from every trial; None without such.
 
-    Each is the task that is farthest from the trials and from the points before it.
+    First the bare corners, then each is the task that is farthest from the trials and from the points before it.
 
     Args:
         X: the trials' points ``(n, d)``.
@@ -50,14 +74,30 @@ def covering(X: Array, resolution: float, most: int) -> Array | None:
         most: how many points there may be.
     """
     probes = _probes(X.shape[1])
-    gaps = _gaps(X, probes)
-    points: list[Array] = []
+    points: list[Array] = list(bare_corners(X, resolution))
+    if len(points) > most:
+        return None
+    gaps = _gaps(np.concatenate([X, *[point[None] for point in points]]), probes)
     while gaps.max() > resolution:
         if len(points) == most:
             return None
         points.append(probes[int(gaps.argmax())])
         gaps = np.minimum(gaps, np.linalg.norm(probes - points[-1], axis=1) / np.sqrt(X.shape[1]))
     return np.array(points).reshape(-1, X.shape[1])
+
+
+def most_contested(points: Array, X: Array, resolution: float) -> Array | None:
+    """Return the point that many others are near to and every trial is far from; None where all are beside trials.
+
+    Args:
+        points: where a distance may be highest, as the highest draws of it have it, shape ``(k, d)``.
+        X: the trials' points ``(n, d)``.
+        resolution: how far a task may be from every trial, in diagonals.
+    """
+    gaps = _gaps(X, points)
+    near = (cdist(points, points) / np.sqrt(X.shape[1]) <= resolution / 2).sum(axis=1)
+    best = int((gaps * near).argmax())
+    return points[best] if gaps[best] > _BESIDE * resolution else None
 
 
 def _probes(d: int) -> Array:

@@ -20,7 +20,7 @@ from scipy.linalg import cho_solve, solve_triangular
 from scipy.special import ndtri, stdtr
 
 from ctxval.arrays import Array, Mask
-from ctxval.certificates.covering import RESOLUTION, covering, farthest_task
+from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task
 from ctxval.hyperposterior import Conditioned
 
 LEVEL = 0.01
@@ -87,6 +87,8 @@ def diagnose(
         )
     elif farthest > resolution:
         doubt = _uncovered(X, farthest, resolution)
+    elif len(bare := bare_corners(X, resolution)):
+        doubt = _bare(bare, len(X[0]))
     return Diagnosis(surprise, trial, left_out, farthest, doubt)
 
 
@@ -121,6 +123,14 @@ def _left_out_exceedances(conditioned: Conditioned) -> Array:
     freedom = n - 2
     scale2 = np.maximum(y @ pull - pull**2 / own, np.finfo(np.float64).tiny) / freedom
     return np.asarray(stdtr(freedom, -pull / np.sqrt(own * scale2)))
+
+
+def _bare(bare: Array, d: int) -> str:
+    where = "ends of the task parameter's range" if d == 1 else "corners of the task space"
+    return (
+        f"no trial is at or beside {len(bare)} of the {2**d} {where}, towards which the distance may rise with nothing to "
+        f"show it, and the bound is withdrawn; {len(bare)} more executions would be (--until-decided makes them)"
+    )
 
 
 def _exceedances(conditioned: Conditioned) -> Array:
