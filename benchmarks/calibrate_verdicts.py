@@ -108,7 +108,7 @@ def _of_function(one: Decision) -> dict[str, Any]:
 
 
 def _lot(trials: list[Trial], uncovered: Array, budget: int) -> Array:
-    """Return the next tasks that nothing came near to ``(n, d)``; where there are none, what puts the bound to the test."""
+    """Return the next tasks that nothing came near to ``(n, d)``, or, if there are none, one that tests the bound."""
     missing = covering(np.array([trial.unit_point for trial in trials]), RESOLUTION, budget - len(trials))
     return uncovered[None] if missing is None or not len(missing) else missing[: LOTS[len(uncovered)]]
 
@@ -164,7 +164,9 @@ def _key(line: dict[str, Any]) -> tuple[str, float, int]:
 def main() -> None:
     """Run what is missing."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--campaigns", type=int, default=10, help="for each family and search; fewer in three dimensions")
+    parser.add_argument(
+        "--campaigns", type=int, default=10, help="for each family and search; fewer in three dimensions"
+    )
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)

@@ -51,7 +51,7 @@ def _vertex(d: int, rng: np.random.Generator) -> Array:
 
 
 def corner_cusp(d: int, rng: np.random.Generator) -> Values:
-    """Return a path and an exponential that falls from a corner, where it tops the path by a tenth of its range or more."""
+    """Return a path and an exponential that falls from a corner, at least a tenth of the range above the path."""
     path, vertex = _background(d, rng), _vertex(d, rng)
     sample = path(np.random.default_rng(0).random((2000, d)))
     top = float(sample.max() + rng.uniform(0.1, 1.0) * np.ptp(sample))

@@ -34,8 +34,8 @@ _GLANCES = ((8, 0.3), (32, 0.05))
 """Draws of d* that tell whether all of them are worth their cost, and by how much their probability may be wrong."""
 
 _CHALLENGES = 2
-"""Executions where the highest draws of d* are, after which the bound must still keep the threshold. They find what made
-it too low more often than not (docs/calibration.md)."""
+"""Executions where the highest draws of d* are, after which the bound must still keep the threshold: they mostly find
+what made it too low (docs/calibration.md)."""
 
 Answer = Literal["validated", "falsified", "undecided"]
 

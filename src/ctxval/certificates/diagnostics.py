@@ -128,8 +128,8 @@ def _left_out_exceedances(conditioned: Conditioned) -> Array:
 def _bare(bare: Array, d: int) -> str:
     where = "ends of the task parameter's range" if d == 1 else "corners of the task space"
     return (
-        f"no trial is at or beside {len(bare)} of the {2**d} {where}, towards which the distance may rise with nothing to "
-        f"show it, and the bound is withdrawn; {len(bare)} more executions would be (--until-decided makes them)"
+        f"no trial is at or beside {len(bare)} of the {2**d} {where}, towards which the distance may rise unseen, and "
+        f"the bound is withdrawn; {len(bare)} more executions would be (--until-decided makes them)"
     )
 
 
