@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import beta, binom
+from scipy.stats import binom
 
 from calibrate import (
     CONFIDENCES,
@@ -24,10 +24,9 @@ from calibrate import (
     ROOT,
     SYSTEMS,
     Run,
-    lines,
     stored,
 )
-from calibrate_verdicts import BUDGETS, DRIVEN, SEARCHES, SHARES, name_of
+from calibration_verdicts_part import interval, table, until_decided
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.diagnostics import LEVEL
 
@@ -96,19 +95,6 @@ def coverage(missed: int, total: int, confidence: float) -> str:
     return f"**{text}**" if chance < SIGNIFICANT else text
 
 
-def interval(missed: int, total: int) -> tuple[float, float]:
-    """Return the 95 % Clopper-Pearson interval of a coverage in per cent."""
-    low = beta.ppf(0.025, total - missed, missed + 1) if missed < total else 0.0
-    high = beta.ppf(0.975, total - missed + 1, missed) if missed else 1.0
-    return 100 * float(low), 100 * float(high)
-
-
-def table(header: list[str], rows: list[list[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def exact_table() -> str:
     """Return the coverage on draws of the prior, with the posterior exactly as Bayes has it."""
     rows = []
@@ -157,64 +143,6 @@ def validation_table(names: Iterable[tuple[str, int]]) -> str:
             rows.append([cell.family, f"{cell.dimension}-D", str(cell.n), str(counts[0][1]), *rates])
     header = ["function", "", "executions", "campaigns", *(f"tau = {t:g} d*" for t in THRESHOLDS)]
     return table(header, rows)
-
-
-# Verdicts
-
-
-def decided() -> dict[tuple[str, int, str], list[dict[str, Any]]]:
-    """Return the campaigns that ran until they were decided, by family, dimension and search."""
-    functions = [(family, d) for family, (_, ds) in FAMILIES.items() for d in ds if d in BUDGETS]
-    systems = [(name, SYSTEMS[name].dimension) for name in DRIVEN]
-    found = {}
-    for family, d in [*functions, *systems]:
-        results = lines(name_of(family, d))
-        for search in (*SEARCHES, "auto"):
-            of_search = [result for result in results if result["search"] == search]
-            if of_search:
-                found[family, d, search] = of_search
-    return found
-
-
-def verdict_table() -> str:
-    """Return what campaigns answered that ran until they were decided."""
-    below, above = SHARES
-    rows = []
-    for (family, d, search), results in decided().items():
-        false = [result for result in results if result["share"] == below]
-        true = [result for result in results if result["share"] == above]
-        rows.append([family, f"{d}-D", search, *_answers(false, "validated"), *_answers(true, "undecided")])
-    return table(
-        [
-            *("function", "", "search"),
-            *(f"tau = {below:g} d*: validated, falsely", "executions"),
-            *(f"tau = {above:g} d*: left undecided", "executions"),
-        ],
-        rows,
-    )
-
-
-def _answers(results: list[dict[str, Any]], wrong: str) -> tuple[str, str]:
-    """Return how many gave the answer that they should not, and quartiles of the executions."""
-    if not results:
-        return "-", "-"
-    count = sum(result["answer"] == wrong for result in results)
-    low, middle, high = np.quantile([result["executions"] for result in results], [0.25, 0.5, 0.75])
-    return f"{count} of {len(results)}", f"{middle:.3g} ({low:.3g} to {high:.3g})"
-
-
-def verdict_summary() -> str:
-    """Return how many verdicts were false in all, with an interval."""
-    results = [result for found in decided().values() for result in found]
-    low = [result for result in results if result["share"] == SHARES[0]]
-    false = sum(result["answer"] == "validated" for result in low)
-    if not low:
-        return "None is stored yet."
-    most = 100 - interval(false, len(low))[0]
-    return (
-        f"Of {len(low)} campaigns with a threshold below d*, {false} said `validated` ({100 * false / len(low):.2g} %, "
-        f"at most {most:.2g} % with confidence 97.5 %; the target is 5 %)."
-    )
 
 
 # Pictures
@@ -315,15 +243,7 @@ the bound is one on the largest expected value, and that is what it is held agai
 
 {noisy}
 
-## Until decided
-
-Campaigns that run as `--until-decided` does, in which the tasks that nothing came near to are executed before anything
-is validated; at most {budgets}. One threshold is below d*, so that `validated` is false, and one above, so that nothing
-can be falsified.
-
-{verdicts}
-
-{verdict_table}
+{until_decided}
 
 ## Said to be validated, and not so
 
@@ -360,9 +280,7 @@ def main() -> None:
             system_validation=validation_table(systems),
             noise=NOISE,
             noisy=used_table(noisy),
-            budgets=" and ".join(f"{budget} executions in {d}-D" for d, budget in BUDGETS.items()),
-            verdicts=verdict_summary(),
-            verdict_table=verdict_table(),
+            until_decided=until_decided(),
         )
     )
     print(f"page: {Path(PAGE).relative_to(ROOT)}")

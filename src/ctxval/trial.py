@@ -21,7 +21,8 @@ class Trial:
 
     Attributes:
         number: from 0, in the order of asking.
-        origin: why it was chosen: iid, initial, acquisition, covering (nothing had come near to it) or manual.
+        origin: why it was chosen: iid, initial, acquisition, covering (nothing had come near to it, or the bound
+            was put to the test there) or manual.
         state: open, completed, failed, or unmeasured.
         unit_point: p in the unit cube, shape ``(d,)``.
         parameters: p by name.

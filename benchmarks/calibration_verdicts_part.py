@@ -1,0 +1,228 @@
+"""The part of ``docs/calibration.md`` on campaigns that ran until they were decided. Nothing is run here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+from calibrate import FAMILIES, SYSTEMS
+from calibrate_verdicts import BUDGETS, DRIVEN, FRESH, HARD, LOTS, RULE, SEARCHES, SHARES, decisions
+from calibration_functions import DEVELOPMENT, DIMENSIONS, REPORTING
+
+TRIED = """What mends them, on the 5 that were false at a cusp in a corner, and on 9 others in one dimension (jumps and
+chirps: 8) and two (a narrow peak: 1). Executions are those that it takes from 8, 12 and 20 random trials on in 1-D, 2-D
+and 3-D, beside the 1.3, 17.7 and 78.7 that covering takes anyway.
+
+| what | cusps | others | more executions |
+| --- | --- | --- | --- |
+| corners at an eighth of the resolution (taken) | 5 of 5 | 0 of 9 | 1, 1, 2.2 |
+| corners at half of it | 2 of 5 | 0 of 9 | 0.5, 0.5, 1.5 |
+| the same, and edges at three quarters | 2 of 5 | 0 of 9 | 0.5, 5.8, 44 |
+| all tasks at 0.8 of it | 1 of 5 | 2 of 9 | 1, 12, - |
+| two tests where the highest draws of d* are (taken) | - | 3 of 9 | 2, 2, 2 |
+| the same, every other one at the farthest of these places | - | 4 of 9 | 2, 2, 2 |
+
+What is left are peaks and jumps in the middle of the largest gaps that the resolution allows, a quarter of the range in
+one dimension; tests find those of which the trials show a trace."""
+
+TEXT = """## Until decided
+
+Campaigns that run as `--until-decided` does: corners and tasks that nothing came near to are executed before anything is
+validated, and the bound is put to the test twice; at most {budgets}. One threshold is
+below d*, so that `validated` is false, and one above, so that nothing can be falsified. The functions of this section
+were written down before any of them was run, and nothing was chosen by them (`REPORTING` in
+`benchmarks/calibration_functions.py`); in brackets: the share, and the limit that it stays below with confidence 97.5 %.
+
+{families}
+
+By search: {searches}. The target: 5 % with a limit of 7 %, and 10 % in no family.
+
+{before}
+
+{verdict_table}
+
+In two and three dimensions, tasks that nothing came near to are executed in lots of {lots}, as with so many workers; in
+three dimensions a campaign ends as undecided once the budget is too small to come near to every task.
+
+### What it was chosen by
+
+`before`: validated once every task was within the resolution, corners as all others, and no tests. The prior, the
+resolution, the corners and the tests were chosen by these functions, so that they tell what mends a false verdict, and
+nothing of how often one is false. Most that were false before were run again.
+
+{chosen}
+
+{tried}
+
+Other functions of the families that are hardest, of seeds from {fresh} on, by which nothing was chosen:
+
+{hard}
+
+### What it costs
+
+The paper's systems, searched by `auto`, at most {budgets}.
+
+{price}
+"""
+
+
+def until_decided() -> str:
+    """Return the part of the page."""
+    reported = decided((family, d) for family in REPORTING for d in DIMENSIONS)
+    return TEXT.format(
+        budgets=", ".join(f"{budget} executions in {d}-D" for d, budget in BUDGETS.items()),
+        lots=" and ".join(f"{LOTS[d]}" for d in DIMENSIONS[1:]),
+        families=family_table(reported),
+        searches=search_summary(reported),
+        before=before_summary(),
+        verdict_table=verdict_table(reported),
+        chosen=chosen_table(),
+        tried=TRIED,
+        fresh=FRESH,
+        hard=family_table(_of_seeds(decided((family, d) for family in HARD for d in DIMENSIONS), fresh=True)),
+        price=price_table(),
+    ).rstrip()
+
+
+def interval(missed: int, total: int) -> tuple[float, float]:
+    """Return the 95 % Clopper-Pearson interval of a coverage in per cent."""
+    low = beta.ppf(0.025, total - missed, missed + 1) if missed < total else 0.0
+    high = beta.ppf(0.975, total - missed + 1, missed) if missed else 1.0
+    return 100 * float(low), 100 * float(high)
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+Found = dict[tuple[str, int, str], list[dict[str, Any]]]
+"""Campaigns that ran until they were decided, by family, dimension and search."""
+
+
+def decided(names: Iterable[tuple[str, int]], rule: int = RULE) -> Found:
+    """Return the stored campaigns that ran by a rule of coverage."""
+    found: Found = {}
+    for family, d in names:
+        for result in decisions(family, d, rule):
+            found.setdefault((family, d, result["search"]), []).append(result)
+    return dict(sorted(found.items(), key=lambda item: item[0][1]))
+
+
+def verdict_table(found: Found) -> str:
+    """Return what campaigns answered that ran until they were decided."""
+    below, above = SHARES
+    rows = []
+    for (family, d, search), results in found.items():
+        false = [result for result in results if result["share"] == below]
+        true = [result for result in results if result["share"] == above]
+        rows.append([family, f"{d}-D", search, *_answers(false, "validated"), *_answers(true, "undecided")])
+    return table(
+        [
+            *("function", "", "search"),
+            *(f"tau = {below:g} d*: validated, falsely", "executions"),
+            *(f"tau = {above:g} d*: left undecided", "executions"),
+        ],
+        rows,
+    )
+
+
+def _answers(results: list[dict[str, Any]], wrong: str) -> tuple[str, str]:
+    """Return how many gave the answer that they should not, and quartiles of the executions."""
+    if not results:
+        return "-", "-"
+    count = sum(result["answer"] == wrong for result in results)
+    return f"{count} of {len(results)}", _quartiles(results)
+
+
+def _quartiles(results: list[dict[str, Any]]) -> str:
+    low, middle, high = np.quantile([result["executions"] for result in results], [0.25, 0.5, 0.75])
+    return f"{middle:.3g} ({low:.3g} to {high:.3g})"
+
+
+def _of_seeds(found: Found, *, fresh: bool) -> Found:
+    """Return the campaigns on functions by which nothing was chosen, or on the others."""
+    return {key: [result for result in results if (result["seed"] >= FRESH) == fresh] for key, results in found.items()}
+
+
+def _below(
+    found: Found, family: str | None = None, dimension: int | None = None, search: str | None = None
+) -> list[dict[str, Any]]:
+    """Return the campaigns with a threshold below d*, of a family, dimension and search where they are given."""
+    wanted = (family, dimension, search)
+    results = [
+        result
+        for key, of_key in found.items()
+        if all(asked in (None, own) for asked, own in zip(wanted, key, strict=True))
+        for result in of_key
+    ]
+    return [result for result in results if result["share"] == SHARES[0]]
+
+
+def false_of(results: list[dict[str, Any]]) -> tuple[int, str]:
+    """Return how many were validated falsely, and that in words with the 97.5 % limit (Clopper and Pearson)."""
+    false = sum(result["answer"] == "validated" for result in results)
+    if not results:
+        return 0, "-"
+    most = 100 - interval(false, len(results))[0]
+    return false, f"{false} of {len(results)} ({100 * false / len(results):.2g} %, at most {most:.2g} %)"
+
+
+def family_table(found: Found) -> str:
+    """Return how many verdicts were false, family by family, with limits of 97.5 % confidence."""
+    rows = []
+    for family in [*dict.fromkeys(family for family, _, _ in found), None]:
+        parts = [_below(found, family, d) for d in (*DIMENSIONS, None)]
+        rows.append([family or "all", *(false_of(part)[1] for part in parts)])
+    return table(["function", *(f"{d}-D" for d in DIMENSIONS), "all"], rows)
+
+
+def search_summary(found: Found) -> str:
+    """Return how many verdicts were false, search by search."""
+    return "; ".join(f"{search}: {false_of(_below(found, search=search))[1]}" for search in SEARCHES)
+
+
+def before_summary() -> str:
+    """Return how many verdicts were false on the same functions before the rule."""
+    results = _below(decided(((family, d) for family in REPORTING for d in DIMENSIONS), 1))
+    return (
+        f"Before there was a rule for corners, and tests: {false_of(results)[1]}, in one and two dimensions. (Campaigns "
+        "falsified before anything was covered are the same then and now, and were run once.)"
+    )
+
+
+def chosen_table() -> str:
+    """Return false verdicts on the functions that the rule was chosen by, before it and now."""
+    names = [(family, d) for family in [*FAMILIES, *DEVELOPMENT] for d in DIMENSIONS]
+    before, now = decided(names, 1), _of_seeds(decided(names), fresh=False)
+    rows = []
+    for family, d in dict.fromkeys(key[:2] for key in before):
+        old = _below(before, family, d)
+        if not old:
+            continue
+        text = false_of(old)[1]
+        again = _below(now, family, d)
+        still = sum(result["answer"] == "validated" for result in again)
+        rows.append([family, f"{d}-D", text, f"{still} of {len(again)}" if again else "-"])
+    return table(["function", "", "before: validated, falsely", "of these again, now"], rows)
+
+
+def price_table() -> str:
+    """Return what a verdict costs on the paper's systems, before the rule and now."""
+    rows = []
+    for name in DRIVEN:
+        d, cells = SYSTEMS[name].dimension, []
+        for rule in (1, RULE):
+            for share in SHARES:
+                results = [line for line in decisions(name, d, rule) if line["share"] == share]
+                cells += [*_answers(results, "validated" if share < 1 else "undecided")]
+        rows.append([name, f"{d}-D", *cells])
+    header = ["system", ""]
+    for when in ("before", "now"):
+        header += [f"{when}, tau = {SHARES[0]:g} d*: validated, falsely", "executions"]
+        header += [f"{when}, tau = {SHARES[1]:g} d*: left undecided", "executions"]
+    return table(header, rows)
