@@ -30,11 +30,12 @@ one dimension; tests find those of which the trials show a trace."""
 
 TEXT = """## Until decided
 
-Campaigns that run as `--until-decided` does: corners and tasks that nothing came near to are executed before anything is
-validated, and the bound is put to the test twice; at most {budgets}. One threshold is
-below d*, so that `validated` is false, and one above, so that nothing can be falsified. The functions of this section
-were written down before any of them was run, and nothing was chosen by them (`REPORTING` in
-`benchmarks/calibration_functions.py`); in brackets: the share, and the limit that it stays below with confidence 97.5 %.
+Campaigns that run as `--until-decided` does: corners and tasks that nothing came near to are executed before anything
+is validated, and the bound is put to the test twice; at most {budgets}. One
+threshold is below d*, so that `validated` is false, and one above, so that nothing can be falsified. The functions of
+this section were written down before any of them was run, and nothing was chosen by them (`REPORTING` in
+`benchmarks/calibration_functions.py`); in brackets: the share, and the limit that it stays below with confidence
+97.5 %.
 
 {families}
 
@@ -190,8 +191,8 @@ def before_summary() -> str:
     """Return how many verdicts were false on the same functions before the rule."""
     results = _below(decided(((family, d) for family in REPORTING for d in DIMENSIONS), 1))
     return (
-        f"Before there was a rule for corners, and tests: {false_of(results)[1]}, in one and two dimensions. (Campaigns "
-        "falsified before anything was covered are the same then and now, and were run once.)"
+        f"Before there was a rule for corners, and tests: {false_of(results)[1]}, in one and two dimensions. "
+        "(Campaigns falsified before anything was covered are the same then and now, and were run once.)"
     )
 
 
