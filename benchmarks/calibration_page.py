@@ -219,8 +219,9 @@ Here the stated confidence must be the measured coverage, and the 95 % interval 
 Real distances are no draws from the prior. What is used is therefore no smoother than the trials that are spread best
 say (`spread_share` in `hyperposterior.py`): too wide on draws of the prior, and meant to hold on functions that are
 none. `withdrawn`: the diagnosis told the user not to believe it, for a surprise among the trials or a task farther than
-{resolution:g} diagonals from all of them; the coverage is of all bounds, withdrawn or not. `max UCB covers`: how often
-the paper's GP with its hyperparameters plugged in, `max (mu + sqrt(2) sigma)`, is above d*.
+{resolution:g} diagonals from all of them (bare corners, for which it is withdrawn as well, are not counted here); the
+coverage is of all bounds, withdrawn or not. `max UCB covers`: how often the paper's GP with its hyperparameters plugged
+in, `max (mu + sqrt(2) sigma)`, is above d*.
 
 {used}
 
