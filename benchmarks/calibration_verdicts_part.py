@@ -42,6 +42,8 @@ this section were written down before any of them was run, and nothing was chose
 By search: {searches}. The target: 5 % with a limit of 7 %, and 10 % in no family.
 
 {before}
+These functions are less hard than those below, of which some were made to be missed: most campaigns are falsified by the
+search, before anything is covered.
 
 {verdict_table}
 
@@ -62,9 +64,12 @@ Other functions of the families that are hardest, of seeds from {fresh} on, by w
 
 {hard}
 
+The false one, a chirp in one dimension under gp-ucb: the search crowded half of its executions on the second highest
+wave, the trials at 0 and 0.13 are both half as high as d*, and the highest wave is between them.
+
 ### What it costs
 
-The paper's systems, searched by `auto`, at most {budgets}.
+The paper's systems, searched by `auto`, with tau = {above:g} d*; the same seeds before and now.
 
 {price}
 """
@@ -84,6 +89,7 @@ def until_decided() -> str:
         tried=TRIED,
         fresh=FRESH,
         hard=family_table(_of_seeds(decided((family, d) for family in HARD for d in DIMENSIONS), fresh=True)),
+        above=SHARES[1],
         price=price_table(),
     ).rstrip()
 
@@ -213,17 +219,15 @@ def chosen_table() -> str:
 
 
 def price_table() -> str:
-    """Return what a verdict costs on the paper's systems, before the rule and now."""
-    rows = []
+    """Return what a verdict above d* costs on the paper's systems, before the rule and now, of the same seeds."""
+    rows, above = [], SHARES[1]
     for name in DRIVEN:
-        d, cells = SYSTEMS[name].dimension, []
-        for rule in (1, RULE):
-            for share in SHARES:
-                results = [line for line in decisions(name, d, rule) if line["share"] == share]
-                cells += [*_answers(results, "validated" if share < 1 else "undecided")]
-        rows.append([name, f"{d}-D", *cells])
-    header = ["system", ""]
-    for when in ("before", "now"):
-        header += [f"{when}, tau = {SHARES[0]:g} d*: validated, falsely", "executions"]
-        header += [f"{when}, tau = {SHARES[1]:g} d*: left undecided", "executions"]
-    return table(header, rows)
+        d = SYSTEMS[name].dimension
+        now = [line for line in decisions(name, d) if line["share"] == above]
+        seeds = {line["seed"] for line in now}
+        before = [line for line in decisions(name, d, 1) if line["share"] == above and line["seed"] in seeds]
+        if now:
+            was, left = _answers(before, "undecided"), _answers(now, "undecided")
+            rows.append([name, f"{d}-D", was[0], was[1], left[0], left[1]])
+    header = ["before: left undecided", "executions", "now: left undecided", "executions"]
+    return table(["system", "", *header], rows)
