@@ -42,8 +42,8 @@ this section were written down before any of them was run, and nothing was chose
 By search: {searches}. The target: 5 % with a limit of 7 %, and 10 % in no family.
 
 {before}
-These functions are less hard than those below, of which some were made to be missed: most campaigns are falsified by the
-search, before anything is covered.
+These functions are less hard than those below, of which some were made to be missed: most campaigns are falsified by
+the search, before anything is covered.
 
 {verdict_table}
 
