@@ -50,6 +50,7 @@ pictures: .venv/.installed  ## those of the README
 calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/calibration.md, and resumes
 	$(BIN)/python benchmarks/calibrate.py --campaigns $(CAMPAIGNS)
 	$(BIN)/python benchmarks/calibrate_verdicts.py
+	$(BIN)/python benchmarks/study_retrain.py
 	$(BIN)/python benchmarks/calibration_page.py
 
 search: .venv/.test  ## how many executions the searches need; writes docs/search.md, and resumes
