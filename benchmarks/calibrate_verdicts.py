@@ -20,7 +20,8 @@ from ctxval import Campaign, Trial, cases, searches
 from ctxval.arrays import Array, single_threaded
 from ctxval.certificates import RESOLUTION, covering
 from ctxval.reproduce.jobs import Job, Results
-from ctxval.verdict import counterexample, standing
+from ctxval.standing import standing
+from ctxval.verdict import counterexample
 
 RULE = 2
 """Of coverage, by which campaigns are run now."""

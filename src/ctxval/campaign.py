@@ -14,11 +14,12 @@ from ctxval.certificates import RESOLUTION
 from ctxval.errors import CtxvalError, ExecutionError, InputError
 from ctxval.interrupts import Interrupts, kept_alive
 from ctxval.ledger import Ledger, OpenTrial
+from ctxval.standing import standing
 from ctxval.surrogate import Surrogate, fit_surrogate
 from ctxval.texts import text_of
 from ctxval.trajectory import Trajectory
 from ctxval.trial import Trial
-from ctxval.verdict import CONFIDENCE, Verdict, judge, remarks_on, require_threshold, standing
+from ctxval.verdict import CONFIDENCE, Verdict, judge, remarks_on, require_threshold
 from ctxval.workers import Crew, Ended, crew
 
 __all__ = ["Campaign", "OpenTrial"]
