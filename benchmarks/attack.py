@@ -195,13 +195,15 @@ def _data(rng: Rng, folder: Path, base: Path) -> Case:
     text = (folder / experiments.FILE).read_text()
     kind = int(rng.integers(3))
     name = ("run.npz", "run.csv", "model.onnx")[kind]
-    content = (
-        archives.npz,
-        archives.recording_csv,
-        lambda rng: archives.onnx(rng, (base / "network.onnx").read_bytes()),
-    )
-    archives.placed(rng, folder / name, content[kind](rng))
-    model = f'type = "Onnx"\npath = "{name}"' if kind == 2 else f'type = "Linear"\ndata = ["{name}"]'
+    match kind:
+        case 0:
+            content = archives.npz(rng)
+        case 1:
+            content = archives.recording_csv(rng, "t,x0,x1,u0")
+        case _:
+            content = archives.onnx(rng, (base / "network.onnx").read_bytes())
+    archives.placed(rng, folder / name, content)
+    model = f'type = "Onnx"\nsource = "{name}"' if kind == 2 else f'type = "Linear"\ndata = ["{name}"]'
     begin, end = text.index("[model]"), text.index("[synthesizer]")
     (folder / experiments.FILE).write_text(f"{text[:begin]}[model]\n{model}\n\n{text[end:]}")
     return Case(experiments.run_or_check(rng), code=True)

@@ -500,6 +500,7 @@ def test_what_is_imported_must_be_there(invoke: Any) -> None:
     new(invoke)
     assert "there is no file none.csv" in refused(invoke("import", "a.sqlite", "none.csv"))
     assert "finite number >= 0" in refused(invoke("import", "a.sqlite", "none.csv", "--start-tolerance", "inf"))
+    assert "cannot be read: File name too long" in refused(invoke("import", "a.sqlite", "x" * 300))
 
 
 def test_the_search_knows_what_was_imported(invoke: Any) -> None:

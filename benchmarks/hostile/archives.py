@@ -41,7 +41,7 @@ def npz(rng: Rng) -> bytes:
         members[f"{name}.npy"] = _header(rng)
     elif kind == 3:
         members[f"{name}.npy"] = mutated(rng, members.get(f"{name}.npy", _npy(np.array("complete"))))
-    elif kind == 4:
+    elif kind == 4 and rng.random() < 0.5:
         members = {str(pick(rng, (key, f"../{key}", f"/{key}", key[:-4]))): data for key, data in members.items()}
         members[text(rng, 99)] = rng.bytes(20)
     elif kind == 5:
@@ -132,7 +132,10 @@ def _header(rng: Rng) -> bytes:
 
 
 def _archived(rng: Rng, members: dict[str, bytes], *, broken: bool) -> bytes:
-    methods = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+    # NumPy writes the first two alone.
+    methods = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+    if rng.random() < 0.1:
+        methods += (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", pick(rng, methods)) as archive:
         for name, data in members.items():
@@ -196,11 +199,12 @@ def table(rng: Rng, header: list[str], rows: list[list[Any]]) -> bytes:
                 cells.insert(row, list(cells[row]))
     # Seldom, as what ends a reader at once hides what comes after.
     ends = str(pick(rng, ("\r\n", "\r", "\0\n"))) if rng.random() < 0.15 else "\n"
-    content = ends.join((";" if rng.random() < 0.005 else ",").join(row) for row in cells)
+    separator = ";" if rng.random() < 0.03 else ","
+    content = ends.join(separator.join(row) for row in cells)
     data = content.encode(str(pick(rng, ("utf-16", "latin-1"))) if rng.random() < 0.1 else "utf-8", "replace")
-    if rng.random() < 0.2:
+    if rng.random() < 0.12:
         data = mutated(rng, data)
-    if rng.random() < 0.1:
+    if rng.random() < 0.06:
         return pick(rng, (b"", b"\xef\xbb\xbf" + data, b'"' + data, b"," * 300_000 + data, data * 200))
     return data
 
@@ -213,14 +217,14 @@ def _cell(rng: Rng, content: str) -> str:
     return f'"{quoted}"'
 
 
-def recording_csv(rng: Rng) -> bytes:
+def recording_csv(rng: Rng, header: str = "t,position [m],speed [m/s],force [N]") -> bytes:
     """Return a recording as a hostile CSV file."""
     arrays = sound()
     rows = [
         [t, *x, *(arrays["inputs"][k] if k < HORIZON else [""])]
         for k, (t, x) in enumerate(zip(arrays["times"].tolist(), arrays["states"].tolist(), strict=True))
     ]
-    return table(rng, ["t", "position [m]", "speed [m/s]", "force [N]"], rows)
+    return table(rng, header.split(","), rows)
 
 
 def runs_csv(rng: Rng) -> bytes:

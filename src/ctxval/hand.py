@@ -100,8 +100,12 @@ def read_recording(
 
 def _require_file(path: Path) -> None:
     """Say what a reader of the content would say less clearly."""
-    if not path.is_file():
-        raise InputError(f"{path} cannot be read: it is a folder." if path.is_dir() else f"there is no file {path}.")
+    try:
+        found, folder = path.is_file(), path.is_dir()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    if not found:
+        raise InputError(f"{path} cannot be read: it is a folder." if folder else f"there is no file {path}.")
 
 
 @dataclass(frozen=True, eq=False)
