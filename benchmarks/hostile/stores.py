@@ -326,6 +326,10 @@ def _around(path: Path, rng: Rng, base: Path) -> None:
 NO_STORES = (_fifo, _folder, _link, _link, _socket, _sparse, _bytes, _bytes, _other, _around)
 
 
+_EXPERIMENTS = ("tell", "ask", "import", "remeasure")
+"""Commands that build the experiment of a store, which may be named again."""
+
+
 def commands(rng: Rng) -> tuple[str, ...]:
     """Return a command line that takes a store."""
     json_ = ("--json",) if rng.random() < 0.4 else ()
@@ -349,10 +353,11 @@ def commands(rng: Rng) -> tuple[str, ...]:
         ("ask", NAME, "--again", "0"),
         ("ask", NAME, "--draw"),
         ("import", NAME, "table.csv"),
+        ("remeasure", NAME),
+        ("remeasure", NAME, "--accept-change", str(pick(rng, [t for t in TEXTS if "\0" not in t]))),
         ("certify", NAME, "--audit", "6", "--kind", "scenario"),
     ]
+    own = ("--experiment", "experiment.toml") if rng.random() < 0.15 else ()
     run = "run", "experiment.toml", "--store", NAME, "--budget", "4", "--search", "random"
-    return (
-        *(run if rng.random() < 0.03 else pick(rng, options)),
-        *json_,
-    )  # running draws pictures, which takes a second
+    chosen = run if rng.random() < 0.03 else pick(rng, options)  # running draws pictures, which takes a second
+    return (*chosen, *(own if chosen[0] in _EXPERIMENTS else ()), *json_)
