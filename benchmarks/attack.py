@@ -30,7 +30,7 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
-from hostile import archives, experiments, stores  # noqa: E402
+from hostile import archives, arguments, experiments, stores  # noqa: E402
 from hostile.cage import Case, Outcome, carry_out  # noqa: E402
 from hostile.values import Rng, pick  # noqa: E402
 
@@ -213,7 +213,7 @@ def _arguments(rng: Rng, folder: Path, base: Path) -> Case:
     experiments.write(folder, base)
     shutil.copy(base / "a.sqlite", folder / stores.NAME)
     archives_of(rng, folder)
-    return Case(experiments.command_line(rng), code=True)
+    return Case(arguments.command_line(rng), code=True)
 
 
 FAMILIES: dict[str, Family] = {
@@ -253,7 +253,7 @@ def inflict(name: str, number: int, seed: int, base: Path, keep: Path | None = N
         if keep is not None:
             shutil.copytree(folder, keep, symlinks=True)
         outcome = _apart(case, folder) if apart else carry_out(case, folder)
-        return replace(outcome, said=f"{experiments.shown(case.arguments)}\n{outcome.said}")
+        return replace(outcome, said=f"{arguments.shown(case.arguments)}\n{outcome.said}")
 
 
 def _apart(case: Case, folder: Path) -> Outcome:
