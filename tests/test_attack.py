@@ -22,7 +22,7 @@ from hostile.cage import Case, carry_out  # noqa: E402
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="inputs are tried in forks")
 
-EACH = {"damaged": 45, "crafted": 35, "crafted-own": 20, "coded": 20, "no-store": 20, "told": 30, "imported": 20}
+EACH = {"damaged": 45, "crafted": 40, "crafted-own": 20, "coded": 20, "no-store": 20, "told": 25, "imported": 20}
 EACH |= {"data": 3, "toml": 6, "systems": 3, "arguments": 6}
 
 
