@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import os
 import struct
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ def npz(rng: Rng) -> bytes:
         members = {str(pick(rng, (key, f"../{key}", f"/{key}", key[:-4]))): data for key, data in members.items()}
         members[text(rng, 99)] = rng.bytes(20)
     elif kind == 5:
-        return _bomb(rng, members, f"{name}.npy")
+        return _bomb(name, int(pick(rng, (50_000_000, 200_000_000))))
     return _archived(rng, members, broken=kind == 6)
 
 
@@ -151,33 +151,20 @@ def _archived(rng: Rng, members: dict[str, bytes], *, broken: bool) -> bytes:
     return bytes(content)
 
 
-def _bomb(rng: Rng, members: dict[str, bytes], name: str) -> bytes:
-    """Return a small archive that unpacks to very much."""
-    size = int(pick(rng, (50_000_000, 400_000_000)))
-    head = io.BytesIO()
-    np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (size // 16, 2)})
-    packer = zlib.compressobj(1, zlib.DEFLATED, -15)
-    packed = packer.compress(head.getvalue())
-    block = b"\0" * 1_000_000
-    for _ in range(size // len(block)):
-        packed += packer.compress(block)
-    packed += packer.flush()
+@functools.cache
+def _bomb(name: str, size: int) -> bytes:
+    """Return a small archive of which one array unpacks to very much."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for key, data in members.items():
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for key, array in sound().items():
             if key != name:
-                archive.writestr(key, data)
-        archive.writestr(name, packed)
-    content = buffer.getvalue()
-    # Stored as it is: now say that it is deflated, and how long it becomes.
-    full = struct.pack("<I", size + len(head.getvalue()))
-    for mark, method, length in ((b"PK\3\4", 8, 22), (b"PK\1\2", 10, 24)):
-        place = content.rfind(mark, 0, content.rfind(name.encode(), 0, content.rfind(name.encode()) + 1) + 1)
-        if mark == b"PK\3\4":
-            place = content.rfind(mark)
-        content = content[: place + method] + b"\x08\0" + content[place + method + 2 :]
-        content = content[: place + length] + full + content[place + length + 4 :]
-    return content
+                archive.writestr(f"{key}.npy", _npy(array))
+        with archive.open(f"{name}.npy", "w") as member:
+            shape = {"descr": "<f8", "fortran_order": False, "shape": (size // 16, 2)}
+            np.lib.format.write_array_header_1_0(member, shape)
+            for _ in range(size // 1_000_000):
+                member.write(b"\0" * 1_000_000)
+    return buffer.getvalue()
 
 
 def table(rng: Rng, header: list[str], rows: list[list[Any]]) -> bytes:
