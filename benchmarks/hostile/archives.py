@@ -19,11 +19,11 @@ HORIZON, STATES, INPUTS = 60, 2, 1
 
 def sound() -> dict[str, Any]:
     """Return arrays of a recording that the campaigns of the attack would take."""
-    times = np.arange(HORIZON + 1) * 0.05
+    k = np.arange(HORIZON + 1)
     return {
-        "times": times,
-        "states": np.stack([np.linspace(0, 1, HORIZON + 1), np.full(HORIZON + 1, 0.1)], axis=-1),
-        "inputs": np.zeros((HORIZON, INPUTS)),
+        "times": k * 0.05,
+        "states": np.stack([np.sin(k / 7), 0.1 + np.sin(k * k / 50)], axis=-1),  # excited enough to learn a model of
+        "inputs": np.cos(k[:-1] * k[:-1] / 90)[:, None],
     }
 
 
@@ -208,7 +208,7 @@ def recording_csv(rng: Rng, header: str = "t,position [m],speed [m/s],force [N]"
     """Return a recording as a hostile CSV file."""
     arrays = sound()
     rows = [
-        [t, *x, *(arrays["inputs"][k] if k < HORIZON else [""])]
+        [t, *x, *(arrays["inputs"][k].tolist() if k < HORIZON else [""])]
         for k, (t, x) in enumerate(zip(arrays["times"].tolist(), arrays["states"].tolist(), strict=True))
     ]
     return table(rng, header.split(","), rows)
