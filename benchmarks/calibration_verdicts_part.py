@@ -49,7 +49,7 @@ the search, before anything is covered.
 
 In two and three dimensions, tasks that nothing came near to are executed in lots of {lots}, as with so many workers; in
 three dimensions a campaign ends as undecided once the budget is too small to come near to every task. All of this was
-run before a bound near to a threshold took more draws (`settle_maxima`), which only withholds validations.
+run before a bound near to a threshold took more draws (`settle_maxima`), which withholds validations that hang on them.
 
 ### What it was chosen by
 
