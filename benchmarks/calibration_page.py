@@ -153,7 +153,7 @@ def retrained() -> str:
     study = json.loads(RETRAINED.read_text())
     rows = []
     for name, count in study["counts"].items():
-        low, high = interval(count["false"], count["campaigns"])
+        low, high = interval(count["campaigns"] - count["false"], count["campaigns"])
         share = 100 * count["false"] / count["campaigns"]
         rows.append([name, f"{count['false']} of {count['campaigns']} ({share:.1f} %, {low:.1f} to {high:.1f} %)"])
     sentence = (
