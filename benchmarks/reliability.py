@@ -233,11 +233,13 @@ POWER = """
 
 A power cut takes the page cache too: what was written and not synced may be on the disk, in part, in any order, or not
 at all. `make crash-states` runs campaigns (random search, failures, two workers, by hand in many processes, killed and
-resumed, a distance that raises) under `strace`, which sees what the package and Python's own SQLite write and sync.
-After each of these acts the power is cut, in many ways: writes dropped, torn at sectors of 512 bytes or at any byte,
-reordered, holes full of old data; names in folders as journalling file systems keep them (*ordered*: the first few
-changes since the last sync), or each at will as POSIX allows (*strict*). Every disk that is left is opened: the store
-must hold all that was acknowledged before the cut, and at most the one transaction more that was being written.
+resumed, a distance that raises, a full disk) under `strace`, which sees what the package and Python's own SQLite write
+and sync. After each of these acts the power is cut, in many ways: writes dropped, torn at sectors of 512 bytes or at
+any byte, reordered, holes full of old data; names in folders as journalling file systems keep them (*ordered*: the
+first few changes since the last sync), or each at will as POSIX allows (*strict*). Every disk that is left is opened:
+the store must hold all that was acknowledged before the cut, and at most the one transaction more that was being
+written.
+
 """
 
 POWER_TAIL = """
@@ -255,6 +257,7 @@ HOSTILE = """
 `make attack` makes each input from a seed and runs its command line, each in a process of its own: what `ctxval` prints
 and how it ends is looked at, its memory and time are bounded, and an audit hook sees whether it runs or writes what it
 should not. A share goes through interpreters of their own, as a shell starts them.
+
 """
 
 HOSTILE_TAIL = """
