@@ -10,6 +10,8 @@ printed; ``python benchmarks/attack.py --repeat FAMILY NUMBER --keep FOLDER`` re
 from __future__ import annotations
 
 import argparse
+import contextlib
+import importlib
 import json
 import os
 import shutil
@@ -340,6 +342,10 @@ def _warm() -> None:
     import ctxval.plot
     import ctxval.reproduce
 
+    with contextlib.suppress(ImportError):
+        importlib.import_module(
+            "mujoco"
+        )  # it starts a process to find its window library, which is no code of an input
     assert matplotlib.pyplot, matplotlib.backends.backend_agg
     assert ctxval.cli, (ctxval.plot, ctxval.reproduce)
     gc.freeze()  # or the collector copies all pages into each fork
