@@ -366,6 +366,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as place:
         base = prepare(Path(place) / "base")
         if given.repeat:
+            _warm()
             print(inflict(given.repeat[0], int(given.repeat[1]), given.seed, base, given.keep))
             return
         kept = json.loads(given.results.read_text()) if given.results.exists() and not given.anew else {}
