@@ -19,6 +19,10 @@ from ctxval import Task, TaskSpace, Validation, controllers, distances, models, 
 from ctxval.cases import pendulum
 from ctxval.certificates import Maxima, Sample, draw_maxima
 
+# A shell starts what is in the background deaf to Ctrl-C, and tests may run there.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 settings.register_profile("ctxval", deadline=None, derandomize=True)
 settings.load_profile("ctxval")
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -409,7 +410,7 @@ def test_an_audit_that_is_extended_counts_what_was_decided_on_last(invoke, campa
 def test_draws_that_ended_with_the_verdict_have_no_number_chosen_beforehand(invoke) -> None:  # type: ignore[no-untyped-def]
     arguments = ("run", "rig:experiment", "--search", "random", "--store", "a.sqlite")
     invoke(*arguments, "--threshold", "90", "--resolution", "1", "--until-decided", "--budget", "12")
-    for kind, sentence in (("scenario", "ended with the verdict"), ("audit", "none counts")):
+    for kind, sentence in (("scenario", "were chosen otherwise (covering)"), ("audit", "none counts")):
         result = invoke("certify", "a.sqlite", "--kind", kind)
         assert result.exit_code == 2
         assert sentence in result.stderr
@@ -424,7 +425,8 @@ def test_a_scenario_bound_of_a_budget_that_was_raised_is_refused(invoke) -> None
 
 
 def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -> None:  # type: ignore[no-untyped-def]
-    arguments = ("run", "rig:experiment", "--budget", "6", "--threshold", "90", "--resolution", "0.6")
+    arguments = ("run", "rig:experiment", "--budget", "12", "--threshold", "90", "--resolution", "0.6")
+    arguments += ("--until-decided",)
     alone = invoke(*arguments)
     text = " ".join(alone.stdout.split())
     assert "validated against 90" in text
@@ -449,7 +451,10 @@ def test_a_certificate_tells_its_resolution_in_the_units_of_the_stored_task_spac
         synthesizer=validation.synthesizer,
         distance=validation.distance,
     )
-    Campaign(wider, search=searches.Random(), store="own.sqlite").run(6)
+    campaign = Campaign(wider, search=searches.Random(), store="own.sqlite").run(6)
+    for goal, load in itertools.product((-3.0, 3.0), ([0.0, 0.0], [0.0, 2.0], [1.0, 0.0], [1.0, 2.0])):
+        opened = campaign.ask({"goal": goal, "load": load})
+        campaign.tell(opened, wider.execute(opened.plan))
     result = invoke("certify", "own.sqlite", "--threshold", "1e6", "--resolution", "0.5766")
     text = " ".join(result.stdout.split())
     assert "to a resolution of 6 rad in goal and 1 kg in load[0] and 2 kg in load[1]" in text

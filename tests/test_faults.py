@@ -259,7 +259,7 @@ def test_a_read_only_folder_is_a_clear_error_and_can_still_be_read(whole: Path) 
         (folder / "a.sqlite").chmod(0o444)
         folder.chmod(0o555)
         code = (
-            "import os, encodings.cp437\n"
+            "import os, encodings.cp437, encodings.utf_32_le\n"
             "from conftest import make_validation; from ctxval import Campaign, Store, searches\n"
             "from ctxval.errors import StoreAccessError\n"
             "Campaign(make_validation(), search=searches.Random()).run(1)\n"  # imports all that is needed

@@ -94,8 +94,9 @@ def carry_out(case: Case, folder: Path) -> Outcome:
 
 
 def _resting() -> float:
-    """Return the megabytes that this process has now, and so each of its forks at first."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
+    """Return the megabytes that this process has now and that each of its forks has at first: not those of files."""
+    resident, shared = map(int, Path("/proc/self/statm").read_text().split()[1:3])
+    return (resident - shared) * resource.getpagesize() / 2**20
 
 
 def _wait(child: int, began: float) -> tuple[bool, int, Any]:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval import Campaign, cases, searches
+from ctxval import cases, searches
 from ctxval.errors import InputError
 from ctxval.reproduce.jobs import DISCARDED, Job, Results, case_digest, distances_of, records, run_job
 from ctxval.reproduce.study import running_estimate
@@ -22,10 +22,11 @@ def test_records_give_the_estimates_of_all_the_distances(distances: list[float])
         np.testing.assert_array_equal(running_estimate(kept, search), running_estimate(distances, search))
 
 
-def test_a_batched_random_search_is_the_campaign_of_the_same_seed() -> None:
+def test_a_batched_random_search_is_the_search_of_the_same_seed() -> None:
     result = run_job(Job("search", "pendulum", 3, search="random", budget=12))
-    campaign = Campaign(cases.by_name("pendulum", 3).validation, search=searches.Random(), seed=3).run(12)
-    distances = [trial.distance for trial in campaign.trials]
+    validation, search = cases.by_name("pendulum", 3).validation, searches.Random()
+    search.reset(validation.space.dimension, 3)
+    distances = validation.distances(validation.space.from_unit(search.ask(12)))
     np.testing.assert_allclose(running_estimate(distances_of(result), "random"), np.maximum.accumulate(distances))
 
 
