@@ -106,6 +106,13 @@ def test_an_exit_leaves_forked_processes_alone() -> None:
     assert [t.state for t in campaign_of(forks).run(2).trials] == ["completed"] * 2
 
 
+def test_a_recursion_limit_that_a_system_sets_is_its_own() -> None:
+    before = sys.getrecursionlimit()
+    campaign = campaign_of(lambda whole: sys.setrecursionlimit(before - 1)).run(2)
+    assert [t.state for t in campaign.trials] == ["completed"] * 2
+    assert sys.getrecursionlimit() == before
+
+
 def test_run_ends_with_a_report_if_the_system_leaves_hard(tmp_path: Path) -> None:
     (tmp_path / "rig.py").write_text(
         textwrap.dedent("""

@@ -87,8 +87,11 @@ def _function_of(handler: object) -> FunctionType | None:
 
 @contextmanager
 def kept_alive() -> Iterator[None]:
-    """Make an exit of this very process, which no exception would show, an exception; forked processes may exit."""
-    ours, leave = os.getpid(), os._exit
+    """Make an exit of this very process, which no exception would show, an exception; forked processes may exit.
+
+    A recursion limit that is set inside is taken back, as little of this package would run under a small one.
+    """
+    ours, leave, depth = os.getpid(), os._exit, sys.getrecursionlimit()
 
     def refuse(status: int) -> NoReturn:
         if os.getpid() != ours:
@@ -100,3 +103,4 @@ def kept_alive() -> Iterator[None]:
         yield
     finally:
         os._exit = leave
+        sys.setrecursionlimit(depth)
