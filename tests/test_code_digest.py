@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import importlib
 import itertools
+import logging
 import shutil
 import subprocess
 import sys
@@ -103,6 +104,72 @@ def test_edits_that_compute_something_else_are_named(
     found = difference(written(BEFORE), written(BEFORE.replace(old, new)), name)
     assert found is not None
     assert said in found
+
+
+DEEP = """
+import functools
+import logging
+import threading
+from dataclasses import dataclass
+
+LOG = logging.getLogger("rig")
+LOCK = threading.Lock()
+TABLE = {"a": {"b": {"c": {"d": {"e": 9.0}}}}}
+G = 9.0
+
+
+def f5(x): return 9.25 * x
+def f4(x): return f5(x)
+def f3(x): return f4(x)
+def f2(x): return f3(x)
+def f1(x): return f2(x)
+
+
+@functools.lru_cache
+def cached(x): return 9.5 * x
+
+
+def wrap(function):
+    @functools.wraps(function)
+    def wrapper(*arguments):
+        return function(*arguments)
+    return wrapper
+
+
+class Rig:
+    @wrap
+    def execute(self, x):
+        LOG.info("x")
+        with LOCK:
+            return G * x
+
+
+def step(x):
+    return f1(x) + cached(x) + TABLE["a"]["b"]["c"]["d"]["e"]
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("step", "9.25", "8.0"),
+        ("step", "9.5", "8.0"),
+        ("step", '"e": 9.0', '"e": 8.0'),
+        ("Rig", "G = 9.0", "G = 8.0"),
+    ],
+)
+def test_what_lies_deep_is_noticed(written: Callable[[str], ModuleType], name: str, old: str, new: str) -> None:
+    assert old in DEEP
+    assert difference(written(DEEP), written(DEEP.replace(old, new)), name) is not None
+    assert difference(written(DEEP), written(DEEP), name) is None
+
+
+def test_loggers_and_locks_are_tools_and_no_values(written: Callable[[str], ModuleType]) -> None:
+    module = written(DEEP)
+    before = describe(module.Rig())
+    logging.getLogger("another one")
+    module.LOG.setLevel(logging.ERROR)
+    assert first_difference(before, describe(module.Rig())) is None
 
 
 def test_two_lambdas_of_one_line_are_told_apart(written: Callable[[str], ModuleType]) -> None:

@@ -196,3 +196,36 @@ def test_large_arrays_in_another_order_are_told_apart() -> None:
 
 def test_small_weights_are_told_apart() -> None:
     assert first_difference(1e-10, 9e-10, "R") is not None
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        range(10**9),
+        b"x" * 10**7,
+        1 + 2j,
+        np.array([np.nan, *range(500)]),
+        np.array([Slotted()], dtype=object),
+        type("Answering", (), {"__getattr__": lambda self, name: lambda *a, **k: 1})(),
+        type("Raising", (), {"describe": property(lambda self: 1 / 0)})(),
+        type("Text", (), {"describe": lambda self: "text"})(),
+        type("Wanting", (), {"describe": lambda self, more: {}})(),
+    ],
+)
+def test_odd_objects_have_a_short_description_that_agrees_with_itself(value: object) -> None:
+    described = stored(value)
+    assert len(json.dumps(described)) < 3000
+    assert first_difference(described, stored(value)) is None
+    assert " at 0x" not in json.dumps(described)
+
+
+def test_a_variable_without_a_value_is_left_out() -> None:
+    def outer() -> object:
+        def inner() -> object:
+            return later
+
+        found = stored(inner)
+        later = 1
+        return found, later
+
+    assert outer()

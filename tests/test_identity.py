@@ -235,3 +235,98 @@ def test_a_store_of_version_0_1_0_of_another_model_is_refused(old: Path) -> None
     experiment.validation.model = models.Linear([[1.0, 0.05], [0.0, 0.99]], [[0.0], [0.05]])
     with pytest.raises(StoreMismatchError, match=r"model\.A\[1\]\[1\] was 1.0 and is now 0.99"):
         settings.campaign(experiment, old / "cart-0.1.0.sqlite")
+
+
+# Changed while it is open
+
+
+def test_a_campaign_that_has_not_seen_another_distance_writes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    stale = campaign(path)
+    stale.run(2)
+    opened = stale.ask()
+    whole = stale.validation.execute(opened.plan)
+    fresh = campaign(path, make_validation(distance=Scaled(scale=100.0)), remeasure=True)
+    for act in (
+        lambda: stale.run(5),
+        lambda: stale.tell(opened, whole),
+        lambda: stale.add({"goal": 1.0}, stale.validation.execute(stale.validation.plan([1.0]))),
+        lambda: stale.ask(),
+    ):
+        with pytest.raises(StoreMismatchError, match="made by another experiment"):
+            act()
+    assert [t.state for t in Store(path).trials()] == ["completed", "completed", "open"]
+    assert fresh.run(5).executions == 5
+
+
+def test_what_is_measured_by_the_old_distance_at_the_same_time_is_kept_beside(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    stale = campaign(path)
+    opened = stale.ask()
+    whole = stale.validation.execute(opened.plan)
+    before = stale.store.signature()
+    campaign(path, make_validation(distance=Scaled(scale=100.0)), remeasure=True)
+    stale.store.signature = lambda: before  # type: ignore[method-assign]  # it has looked just before
+    stale.store._require_unchanged = Store(path)._require_unchanged  # type: ignore[method-assign]
+    with pytest.raises(StoreMismatchError, match=r"was changed meanwhile.*kept in .*a\.trial-0\.npz"):
+        stale.tell(opened, whole)
+
+
+def test_what_is_told_while_distances_are_measured_anew_is_measured_anew_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    first = campaign(path).run(2)
+    opened = first.ask()
+    whole = first.validation.execute(opened.plan)
+    told: list[int] = []
+
+    class Telling(Scaled):
+        def __call__(self, model: Any, system: Any, task: Any) -> Any:
+            if not told:
+                told.append(1)
+                first.tell(opened, whole)
+            return super().__call__(model, system, task)
+
+    second = campaign(path)
+    second.remeasure(Telling(scale=100.0))
+    plain = [
+        first.validation.measure(first._plan(t), m) for t in second.trials for m in [second.trajectories(t)[1]] if m
+    ]
+    np.testing.assert_allclose([t.distance for t in second.trials], 100 * np.array(plain))
+    assert len(plain) == 3
+
+
+def test_an_interrupted_remeasure_changes_neither_store_nor_campaign(store: Path) -> None:
+    def interrupted(model: Any, system: Any, task: Any) -> float:
+        raise KeyboardInterrupt
+
+    running = campaign(store)
+    before = [trial.distance for trial in running.trials]
+    with pytest.raises((KeyboardInterrupt, DistanceError)):
+        running.remeasure(interrupted)
+    assert running.run(8).executions == 8
+    assert [trial.distance for trial in campaign(store).trials][:7] == before
+
+
+def test_a_reason_is_kept_although_no_code_differs(store: Path) -> None:
+    repaired = campaign(store, accept_change="gripper replaced")
+    assert [(c.what, c.why) for c in repaired.store.history()] == [("accepted", "gripper replaced")]
+
+
+def test_counters_of_a_system_do_not_go_into_the_store_with_another_distance(tmp_path: Path) -> None:
+    rig = FaultyRig(make_validation().system)
+    rig.executed = 0  # type: ignore[attr-defined]
+    running = campaign(tmp_path / "a.sqlite", make_validation(system=rig)).run(2)
+    rig.executed = 2  # type: ignore[attr-defined]
+    running.remeasure(Scaled(scale=2.0))
+    rig.executed = 0  # type: ignore[attr-defined]
+    assert campaign(tmp_path / "a.sqlite", make_validation(system=rig, distance=Scaled(scale=2.0))).executions == 2
+
+
+def test_a_task_that_was_told_in_another_distance_counts_again_once_it_is_executed(store: Path) -> None:
+    told = campaign(store)
+    told.tell(told.ask({"goal": 1.0}), distance=0.25)
+    told.remeasure(Scaled(scale=2.0))
+    assert "Trial 7 was executed, but the distance could not be measured" in told.verdict(1e6).reason
+    again = told.ask({"goal": 1.0})
+    told.tell(again, told.validation.execute(again.plan))
+    assert "could not be measured" not in told.verdict(1e6).reason

@@ -18,7 +18,7 @@ import pytest
 
 from conftest import interrupt_at_once, make_validation
 from ctxval import Campaign, Store, Trajectory, searches
-from ctxval.errors import DistanceError, ExecutionError, InputError, StoreAccessError
+from ctxval.errors import DesignError, DistanceError, ExecutionError, InputError, StoreAccessError
 
 HERE = Path(__file__).parent
 PLAIN = make_validation()
@@ -249,7 +249,6 @@ def test_what_a_store_does_not_take_is_kept_beside_it_every_time(tmp_path: Path)
     whole = campaign.validation.execute(opened.plan)
     late = [Campaign(campaign.validation, search=searches.GPUCB(), store=path, seed=1) for _ in range(3)]
     for one in late:  # they have looked before the first one told
-        one.store.signature = campaign.store.signature()  # type: ignore[assignment, method-assign]
         one._refresh = lambda: None  # type: ignore[method-assign]
     campaign.tell(opened, distance=0.1)
     for one in late[:2]:
@@ -316,3 +315,43 @@ def test_an_execution_in_a_notebook_can_be_interrupted_by_a_person() -> None:
         signal.signal(signal.SIGINT, before)
     with pytest.raises(ExecutionError, match="SystemExit"):
         make_validation(system=Doing(leave)).execute(plan)
+
+
+def test_an_alarm_of_the_system_itself_is_its_failure() -> None:
+    def stuck(_number: int, _frame: Any) -> None:
+        raise TimeoutError("rig stuck")
+
+    before = signal.signal(signal.SIGUSR1, stuck)
+    try:
+        campaign = campaign_of(lambda whole: signal.raise_signal(signal.SIGUSR1)).run(2)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert [t.failure for t in campaign.trials] == ["TimeoutError: rig stuck"] * 2
+
+
+@pytest.mark.parametrize("act", [leave, interrupt_by_code, leave_hard])
+def test_a_distance_that_exits_leaves_its_execution(act: Any) -> None:
+    def distance(model: Any, system: Any, task: Any) -> float:
+        act(system)
+        return 0.0
+
+    campaign = campaign_of(distance=distance)
+    with pytest.raises(DistanceError):
+        campaign.run(2)
+    assert [t.state for t in campaign.trials] == ["unmeasured"]
+
+
+def test_a_design_that_exits_stops_the_campaign_behind_its_trial() -> None:
+    class Leaving:
+        def design(self, task: Any, model: Any) -> Any:
+            os._exit(0)
+
+        def describe(self) -> dict[str, object]:
+            return {}
+
+    campaign = campaign_of()
+    campaign.validation.synthesizer = Leaving()
+    for _ in range(2):
+        with pytest.raises(DesignError, match=r"os\._exit"):
+            campaign.run(2)
+    assert [t.state for t in campaign.trials] == ["failed", "failed"]

@@ -257,7 +257,7 @@ class Campaign(Ledger):
         patience: _Patience,
     ) -> Campaign:
         """Execute what is wanted, given how many executions are running, until nothing is."""
-        with self.store.sole_writer(), Interrupts() as interrupts:
+        with self.store.sole_writer(), Interrupts() as interrupts, kept_alive():
             self._refresh()
             if self.unmeasured:
                 self.remeasure()
@@ -285,8 +285,7 @@ class Campaign(Ledger):
     def _execute(self, opened: OpenTrial, on_trial: Callable[[Trial], None] | None) -> None:
         started = time.perf_counter()
         try:
-            with kept_alive():
-                trajectory = self.validation.execute(opened.plan)
+            trajectory = self.validation.execute(opened.plan)
         except ExecutionError as error:
             ended = self._close(opened.trial, failure=text_of(error), seconds=time.perf_counter() - started)
         else:

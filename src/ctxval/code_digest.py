@@ -78,13 +78,21 @@ def code_of(value: Any) -> Code | None:
     return Code(digest, tuple(sorted(name for name in _names(node) if name.partition(".")[0] in loaded)))
 
 
-def bytecode_digest(code: types.CodeType) -> str:
-    """Return a digest of a function's names and constants, for one whose source cannot be read.
+def bytecode_digest(value: Any) -> str | None:
+    """Return a digest of a function's or class's names and constants, for one whose source cannot be read.
 
     The instructions are left out, as they differ between versions of Python.
     """
+    if isinstance(value, type):
+        functions = {name: functions_in(item) for name, item in vars(value).items()}
+        known: Any = {name: [_constants(one.__code__) for one in found] for name, found in functions.items() if found}
+        return hashlib.sha256(repr(sorted(known.items())).encode()).hexdigest()[:16] if known else None
+    return _constants(value.__code__) if isinstance(value, types.FunctionType) else None
+
+
+def _constants(code: types.CodeType) -> str:
     constants = [
-        bytecode_digest(item)
+        _constants(item)
         if isinstance(item, types.CodeType)
         else repr(sorted(map(repr, item)) if isinstance(item, frozenset) else item)
         for item in code.co_consts
@@ -187,8 +195,8 @@ def _loaded(code: types.CodeType) -> set[str]:
 
 
 def _loaded_by_class(cls: type, node: ast.AST) -> set[str]:
-    functions = [function_in(item) for item in vars(cls).values()]
-    methods = (_loaded(function.__code__) for function in functions if function is not None)
+    functions = [function for item in vars(cls).values() for function in functions_in(item)]
+    methods = (_loaded(function.__code__) for function in functions)
     return _loaded_outside_functions(node).union(*methods)
 
 
@@ -198,20 +206,36 @@ def _loaded_outside_functions(node: ast.AST) -> set[str]:
     return found.union(*inner)
 
 
-def function_in(item: Any) -> types.FunctionType | None:
-    """Return the Python function of an attribute of a class: a method, a property, a static or class method."""
-    function = getattr(item, "fget", None) or getattr(item, "__func__", item)
-    return function if isinstance(function, types.FunctionType) else None
+def functions_in(item: Any) -> list[types.FunctionType]:
+    """Return the Python functions of an attribute of a class: a method, a property, and what they wrap."""
+    found: list[types.FunctionType] = []
+    seen: list[Any] = []
+    waiting = [item]
+    while waiting:
+        one = waiting.pop()
+        if any(one is other for other in seen):
+            continue
+        seen.append(one)
+        if isinstance(one, types.FunctionType):
+            found.append(one)
+        inner = (getattr(one, name, None) for name in ("fget", "fset", "__func__", "func", "__wrapped__"))
+        waiting.extend(each for each in inner if callable(each))
+    return found
 
 
 def _names(node: ast.AST) -> set[str]:
-    found = set()
-    for child in ast.walk(node):
-        name = _dotted(child)
-        if name is not None:
-            found.add(name)
+    found = {name for child in _computing(node) if (name := _dotted(child)) is not None}
     # Of "np.linalg.norm" the shorter "np.linalg" and "np" are part.
     return {name for name in found if not any(other.startswith(f"{name}.") for other in found)}
+
+
+def _computing(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield a node and those in it, but for annotations."""
+    yield node
+    for field, value in ast.iter_fields(node):
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST) and field not in _SKIPPED:
+                yield from _computing(child)
 
 
 def _dotted(node: ast.AST) -> str | None:

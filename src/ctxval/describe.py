@@ -1,16 +1,21 @@
 """Plain descriptions of objects: how a store knows the experiment that it belongs to.
 
-What is described is what is computed: values, and of a user's functions and classes the syntax tree without names and
-docstrings, with the outer values that it uses. Where a module lies does not matter.
+What is described is what is computed: values, and of a user's functions and classes the syntax tree without
+docstrings and annotations, with the outer values that it uses. Where a module lies does not matter.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
+import hashlib
 import inspect
 import math
+import numbers
+import re
 import sys
+import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -51,6 +56,10 @@ class _Description:
             return bool(value)
         if isinstance(value, float | np.number):
             return float(value) if math.isfinite(value) else str(value)
+        if isinstance(value, numbers.Number | range):
+            return repr(value)
+        if isinstance(value, bytes | bytearray | memoryview):
+            return {"bytes": len(value), "sha256": hashlib.sha256(value).hexdigest()}
         if depth == 0:
             return type(value).__qualname__
         if isinstance(value, np.ndarray):
@@ -73,54 +82,88 @@ class _Description:
                 "args": self.of(value.args, depth - 1),
                 "keywords": self.of(value.keywords, depth - 1),
             }
+        wrapped = getattr(value, "__wrapped__", None)
+        if callable(wrapped) and not inspect.isfunction(value) and not is_library(value):  # as by functools.cache
+            return {"function": _name(value), "wrapped": self.of(wrapped, depth - 1)}
         owner = getattr(value, "__self__", None)
         bound = {"of": self.of(owner, depth - 1)} if owner is not None and not inspect.ismodule(owner) else {}
         function = getattr(value, "__func__", value)
-        closed_over = inspect.getclosurevars(function).nonlocals if inspect.isfunction(function) else {}
-        enclosed = {key: self.of(item, depth - 1) for key, item in closed_over.items()}
+        enclosed = {key: self.of(item, depth - 1) for key, item in _closed_over(function).items()}
         defaults = (getattr(function, "__defaults__", None) or (), getattr(function, "__kwdefaults__", None) or {})
         if any(defaults):
             enclosed["defaults"] = self.of(defaults, depth - 1)
-        code = self._code(function, depth)
+        code = self._code(function)
         return {"function": _name(function), **bound, **enclosed, **code} if bound or enclosed or code else _name(value)
 
     def _object(self, value: Any, depth: int) -> Any:
-        own = getattr(value, "describe", None)
-        if callable(own) and not self.private:
-            fields = own()
-        else:
-            fields = {k: v for k, v in _attributes(value).items() if self.private or not k.startswith("_")}
-        described = {key: self.of(item, depth - 1) for key, item in fields.items()}
-        if not fields and self.private and hasattr(value, "__array__"):
-            described["values"] = _describe_array(np.asarray(value))
-        return {"type": type(value).__qualname__, **described, **self._class_code(type(value), depth)}
+        fields = None if self.private else _own_description(value)
+        if fields is None:
+            fields = {k: v for k, v in _attributes(value).items() if self.private or not str(k).startswith("_")}
+        described = {str(key): self.of(item, depth - 1) for key, item in fields.items()}
+        if not fields and self.private:
+            with contextlib.suppress(Exception):  # what is an array to numpy, such as a network's weights
+                described["values"] = _describe_array(np.asarray(value, dtype=np.float64))
+        return {"type": type(value).__qualname__, **described, **self._class_code(type(value))}
 
     # Code
 
-    def _class_code(self, cls: type, depth: int) -> dict[str, Any]:
-        found = [self._code(base, depth) for base in cls.__mro__ if base is not object]
+    def _class_code(self, cls: type) -> dict[str, Any]:
+        found = [self._code(base) for base in cls.__mro__ if base is not object]
         found = [code for code in found if code]
         return {"code": found} if found else {}
 
-    def _code(self, value: Any, depth: int) -> dict[str, Any]:
-        """Return the digest of a user's function or class, and what it uses."""
+    def _code(self, value: Any) -> dict[str, Any]:
+        """Return the digest of a user's function or class, and what it uses, however deep; each once."""
         if is_own(value) or is_library(value) or id(value) in self._known:
             return {}
         self._known.add(id(value))
         code = code_of(value)
         if code is not None:
-            used = {name: self._used(value, item, depth - 1) for name, item in _outer(value, code)}
+            used = {name: self._used(value, item) for name, item in _outer(value, code)}
             return {"digest": code.digest, **({"uses": used} if used else {})}
-        return {"digest": bytecode_digest(value.__code__)} if inspect.isfunction(value) else {}
+        digest = bytecode_digest(value)
+        return {} if digest is None else {"digest": digest}
 
-    def _used(self, user: Any, value: Any, depth: int) -> Any:
+    def _used(self, user: Any, value: Any) -> Any:
         if inspect.ismodule(value):
             return value.__name__
         if inspect.isroutine(value) or isinstance(value, type):
             if is_own(value) or (is_library(value) and not same_package(user, value)):
                 return _name(value)
-            return self._callable(value, depth) if depth > 0 else _name(value)
-        return self.of(value, max(depth, 0))
+            return self._callable(value, _DEPTH)
+        return type(value).__qualname__ if _is_tool(value) else self.of(value, _DEPTH)
+
+
+def _is_tool(value: Any) -> bool:
+    """Return whether a value that code uses is a tool of Python's library, such as a logger or a lock, and no data."""
+    module = type(value).__module__.partition(".")[0]
+    return module != "builtins" and module in sys.stdlib_module_names and not isinstance(value, _DATA)
+
+
+_DATA = (str, numbers.Number, Mapping, Sequence, set, frozenset, functools.partial, types.SimpleNamespace)
+
+
+def _closed_over(function: Any) -> dict[str, Any]:
+    """Return what a function closes over; a variable that has no value yet is left out."""
+    if not inspect.isfunction(function):
+        return {}
+    found = {}
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        with contextlib.suppress(ValueError):
+            found[name] = cell.cell_contents
+    return found
+
+
+def _own_description(value: Any) -> Mapping[str, Any] | None:
+    """Return what an object says of itself; None if it says nothing that can be used, or means something else by it."""
+    cls = type(value)
+    if not callable(getattr(cls, "describe", None)) or (is_library(cls) and not is_own(cls)):
+        return None
+    try:
+        found = value.describe()
+    except Exception:
+        return None
+    return found if isinstance(found, Mapping) else None
 
 
 def _outer(value: Any, code: Code) -> list[tuple[str, Any]]:
@@ -160,9 +203,13 @@ def _name(value: Any) -> str:
 
 def _describe_array(array: np.ndarray[Any, Any]) -> Any:
     if array.dtype.kind not in "biuf":
-        return [item if isinstance(item, str) else repr(item) for item in array.ravel().tolist()]
+        items = array.ravel().tolist()
+        return [item if isinstance(item, str) else re.sub(r" at 0x[0-9a-f]+", "", repr(item)) for item in items]
     if array.size <= _LISTED:
         return array.tolist()
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        finite = np.nan_to_num(array, nan=0.0, posinf=0.0, neginf=0.0)
+        return {"not finite": _describe_array(np.flatnonzero(~np.isfinite(array))), "finite": _describe_array(finite)}
     # The projection tells apart arrays of the same values in another order.
     projection = float(array.ravel() @ np.cos(np.arange(array.size)))
     summary = {"mean": float(array.mean()), "std": float(array.std()), "projection": projection}

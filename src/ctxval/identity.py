@@ -10,6 +10,7 @@ import numpy as np
 
 from ctxval.arrays import Array
 from ctxval.describe import describe, differences
+from ctxval.distance import Distance
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreMismatchError
 from ctxval.searches import Search
 from ctxval.store import Change, Store
@@ -37,6 +38,12 @@ def description_of(validation: Validation, search: Search, seed: int, name: str)
     described = {"name": name, "seed": seed, "search": describe(search), "validation": validation.describe()}
     plain: dict[str, Any] = json.loads(json.dumps({**described, "version": VERSION}))
     return plain
+
+
+def with_distance(description: dict[str, Any], distance: Distance) -> dict[str, Any]:
+    """Return a description with another distance; the rest stays as it was described."""
+    described = json.loads(json.dumps(describe(distance)))
+    return {**description, "validation": {**description["validation"], "distance": described}}
 
 
 def identify(
@@ -78,7 +85,7 @@ def identify(
         _require_same_distance(store, validation, trials, [s for p, s in found if p.startswith(_DISTANCE)], accept)
         others = [sentence for _, sentence in found]
     kept = _with_distance(description, stored) if remeasuring else description
-    if others:
+    if others or accept is not None:
         store.describe_anew(kept, Change("accepted", str(accept), {"differences": others, "trials": len(trials)}))
     elif "version" not in stored:
         store.describe_anew(kept, Change("described anew", "made by an older version", {}))

@@ -69,8 +69,14 @@ class Interrupts:
 
 
 def raised_by_signal(error: BaseException) -> bool:
-    """Return whether an exception comes from outside, by a signal, and not from the code that was running."""
-    handlers = [signal.getsignal(number) for number in signal.valid_signals()]
+    """Return whether an exception comes from outside, by a signal that ends processes, and not from the code itself.
+
+    An ordinary exception never does: a handler that raises one, of an alarm for instance, is the code's own.
+    """
+    if isinstance(error, Exception):
+        return False
+    ending = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
+    handlers = [signal.getsignal(number) for number in ending]
     codes = {function.__code__ for handler in handlers if (function := _function_of(handler)) is not None}
     if any(frame.f_code in codes for frame, _ in traceback.walk_tb(error.__traceback__)):
         return True

@@ -15,8 +15,8 @@ from ctxval.certificates import PLANNED
 from ctxval.describe import differences
 from ctxval.distance import Distance
 from ctxval.draws import IndependentDraws
-from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError
-from ctxval.identity import description_of, identify
+from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError, StoreError
+from ctxval.identity import description_of, identify, with_distance
 from ctxval.prediction import predict_distance
 from ctxval.recording import (
     as_told,
@@ -82,16 +82,14 @@ class Ledger:
         self.seed = int(seed)
         self.name = name
         self.store = store if isinstance(store, Store) else Store(store)
-        identify(self.store, validation, self._description(), accept_change, remeasure)
+        self._described = description_of(validation, self.search, self.seed, name)
+        identify(self.store, validation, self._described, accept_change, remeasure)
         self._draws = IndependentDraws(self.store, validation, self.seed)
         self._executing: set[int] = set()
         self._planned: int | None = None
         self._replay()
         if remeasure:
             self.remeasure()
-
-    def _description(self) -> dict[str, Any]:
-        return description_of(self.validation, self.search, self.seed, self.name)
 
     def _replay(self) -> None:
         """Bring the search to where the stored trials left it."""
@@ -186,7 +184,10 @@ class Ledger:
     def _refresh(self) -> None:
         """Learn what other processes have stored meanwhile."""
         own = (len(self._trials), sum(trial.state == "open" for trial in self._trials), self._changes)
-        if self.store.signature() != own:
+        stored = self.store.signature()
+        if stored[2] != self._changes:
+            identify(self.store, self.validation, self._described, None, False)
+        if stored != own:
             self._replay()
 
     def _open(self, given: tuple[Array, Origin] | None, attempts: int, because: str | None = None) -> OpenTrial:
@@ -213,9 +214,10 @@ class Ledger:
         try:
             plan = self._plan(trial)
         except CtxvalError as error:
-            self.store.record_failed_plan(replace(trial, state="failed", failure=text_of(error), attempts=0))
+            failed = replace(trial, state="failed", failure=text_of(error), attempts=0)
+            self.store.record_failed_plan(failed, changes=self._changes)
             raise
-        self.store.open_trial(trial, plan.model_trajectory)
+        self.store.open_trial(trial, plan.model_trajectory, changes=self._changes)
         self._trials.append(trial)
         if attempts:
             self._executing.add(trial.number)
@@ -305,7 +307,7 @@ class Ledger:
             trial = Trial(
                 *(len(self._trials), "manual", state, unit_point, names, 0, True, measured, failure),
             )
-            self.store.record_known(trial, plan.model_trajectory, trajectory)
+            self.store.record_known(trial, plan.model_trajectory, trajectory, changes=self._changes)
             self._trials.append(trial)
             self.search.tell(unit_point[None], [np.nan if measured is None else measured])
         return trial
@@ -349,7 +351,7 @@ class Ledger:
 
     def _begin_again(self, trial: Trial) -> Trial:
         begun = replace(trial, attempts=trial.attempts + 1)
-        self.store.begin_attempt(begun)
+        self.store.begin_attempt(begun, changes=self._changes)
         self._trials[trial.number] = begun
         self._executing.add(trial.number)
         return begun
@@ -424,8 +426,8 @@ class Ledger:
             seconds=seconds,
         )
         try:
-            self.store.close_trial(ended, trajectory)
-        except (StoreAccessError, InputError) as error:
+            self.store.close_trial(ended, trajectory, changes=self._changes)
+        except (StoreError, InputError) as error:
             raise rescued(ended, trajectory, self.store.path, error) from error
         self._executing.discard(trial.number)
         self._trials[trial.number] = ended
@@ -448,25 +450,29 @@ class Ledger:
             DistanceError: the distance of a trial that had one cannot be measured any more; nothing is changed.
             StoreAccessError: another process is running the store.
         """
-        validation = self.validation if distance is None else self.validation.with_distance(distance)
-        with self.store.sole_writer():
-            self._refresh()
-            before, self.validation = self.validation, validation
-            try:
-                changed = self._remeasured()
-            except CtxvalError:
-                self.validation = before
-                raise
-            self._replay()
+        before = self.validation, self._described
+        if distance is not None:
+            self.validation = self.validation.with_distance(distance)
+            self._described = with_distance(self._described, distance)
+        try:
+            with self.store.sole_writer():
+                while (changed := self._remeasured()) is None:
+                    pass  # somebody has told of a trial meanwhile
+        except BaseException:
+            self.validation, self._described = before
+            raise
+        self._replay()
         return changed
 
-    def _remeasured(self) -> list[Trial]:
-        description = self._description()
-        differing = differences(self.store.description(), description)
+    def _remeasured(self) -> list[Trial] | None:
+        """Store what is measured anew; return the trials that changed, None if the store has changed meanwhile."""
+        seen = self.store.signature()
+        self._replay()
+        differing = differences(self.store.description(), self._described)
         other = any(path.startswith("validation.distance") for path, _ in differing)
         changed = measured_again(self.validation, self._trials, self.trajectories, redefined=other)
-        if changed or other:
-            old = {str(trial.number): outcome_of(self._trials[trial.number]) for trial in changed}
-            why = "the distance has changed" if other else "asked for"
-            self.store.remeasure(changed, description, Change("remeasured", why, {"before": old}))
-        return changed
+        if not changed and not other:
+            return changed
+        old = {str(trial.number): outcome_of(self._trials[trial.number]) for trial in changed}
+        change = Change("remeasured", "the distance has changed" if other else "asked for", {"before": old})
+        return changed if self.store.remeasure(changed, self._described, change, seen) else None

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from ctxval import rows, schema
 from ctxval.disks import make_folder, on_network, warn_of_network
-from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
+from ctxval.errors import ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
 from ctxval.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
 from ctxval.migrations import MIGRATIONS
 from ctxval.rows import (
@@ -234,12 +234,19 @@ class Store:
             (_now(), change.what, change.why, json.dumps(change.content)),
         )
 
-    def remeasure(self, trials: Sequence[Trial], description: dict[str, Any], change: Change) -> None:
+    def remeasure(
+        self, trials: Sequence[Trial], description: dict[str, Any], change: Change, seen: tuple[int, int, int]
+    ) -> bool:
         """Store trials whose distances were computed anew, with the description of the distance, in one piece.
 
         What they were stays in the history.
+
+        Returns:
+            False if the store is not as :meth:`signature` was when the trials were read; nothing is stored then.
         """
         with self._transaction():
+            if self.signature() != seen:
+                return False
             for trial in trials:
                 self._connection.execute(
                     f"UPDATE trials SET {ENDED}, checksum = ? WHERE number = ?",
@@ -247,23 +254,46 @@ class Store:
                 )
             self._write_description(description)
             self._insert_change(change)
+        return True
+
+    def _require_unchanged(self, changes: int | None) -> None:
+        """Refuse what a campaign would write that has not seen a change of the experiment.
+
+        Raises:
+            StoreMismatchError: the store has other changes than the campaign has seen.
+        """
+        if changes is not None and self.signature()[2] != changes:
+            raise StoreMismatchError(
+                f"{self._name} was changed meanwhile, by remeasure or by a change that was accepted; open the campaign "
+                "again, with the experiment as it is now."
+            )
 
     # Trials
 
-    def open_trial(self, trial: Trial, model_trajectory: Trajectory) -> None:
+    def open_trial(self, trial: Trial, model_trajectory: Trajectory, *, changes: int | None = None) -> None:
         """Store a new trial with its model trajectory, before its execution starts."""
         with self._transaction():
+            self._require_unchanged(changes)
             self._insert(trial)
             self._write_trajectory(trial.number, "model", model_trajectory)
 
-    def record_failed_plan(self, trial: Trial) -> None:
+    def record_failed_plan(self, trial: Trial, *, changes: int | None = None) -> None:
         """Store a new trial that failed before S was touched."""
         with self._transaction():
+            self._require_unchanged(changes)
             self._insert(trial)
 
-    def record_known(self, trial: Trial, model_trajectory: Trajectory, system_trajectory: Trajectory | None) -> None:
+    def record_known(
+        self,
+        trial: Trial,
+        model_trajectory: Trajectory,
+        system_trajectory: Trajectory | None,
+        *,
+        changes: int | None = None,
+    ) -> None:
         """Store a new trial that has ended already, in one piece."""
         with self._transaction():
+            self._require_unchanged(changes)
             self._insert(trial)
             self._write_trajectory(trial.number, "model", model_trajectory)
             if system_trajectory is not None:
@@ -278,13 +308,14 @@ class Store:
             (*row, trial_checksum(row), _now(), closed_at),
         )
 
-    def begin_attempt(self, trial: Trial) -> None:
+    def begin_attempt(self, trial: Trial, *, changes: int | None = None) -> None:
         """Count one more start of a trial's execution, before it starts; the trial is as it will be then.
 
         Raises:
             InputError: the trial is not open any more.
         """
         with self._transaction():
+            self._require_unchanged(changes)
             changed = self._connection.execute(
                 "UPDATE trials SET attempts = ?, checksum = ? WHERE number = ? AND state = 'open'",
                 (trial.attempts, trial_checksum(row_of(trial)), trial.number),
@@ -292,13 +323,14 @@ class Store:
             if changed != 1:
                 raise self._not_open(trial.number)
 
-    def close_trial(self, trial: Trial, system_trajectory: Trajectory | None) -> None:
+    def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
         """Store how an open trial ended.
 
         Raises:
             InputError: the trial is not open; of two that tell, the first one wins.
         """
         with self._transaction():
+            self._require_unchanged(changes)
             changed = self._connection.execute(
                 f"UPDATE trials SET {ENDED}, seconds = ?, closed_at = ?, checksum = ? "
                 "WHERE number = ? AND state = 'open' AND attempts = ?",

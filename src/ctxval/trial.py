@@ -15,6 +15,10 @@ State = Literal["open", "completed", "failed", "unmeasured"]
 """Unmeasured: S was executed and its trajectory is stored, but the distance gave nothing usable."""
 
 
+TOLD_ALONE = "its distance was told without a trajectory, and the distance has changed since: execute the task again."
+"""Why a trial is unmeasured that can never be measured."""
+
+
 @dataclass(frozen=True, eq=False)
 class Trial:
     """One p with everything known of it.

@@ -283,13 +283,13 @@ class Validation:
             controller = self.synthesizer.design(task, self.model)
         except CtxvalError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise DesignError(f"the synthesizer failed: {reason_of(error)}.") from error
         try:
             trajectory = rollout(self.model.step, controller, task)
         except CtxvalError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ModelError(f"the closed loop on the model failed: {reason_of(error)}.") from error
         return Plan(parameters, task, controller, trajectory)
 
@@ -298,7 +298,7 @@ class Validation:
             task = self.task(parameters)
         except CtxvalError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise InputError(f"the task function failed: {reason_of(error)}.") from error
         _require("the task function's result", task, isinstance(task, Task), "a Task")
         return task
@@ -307,7 +307,9 @@ class Validation:
         try:
             with np.errstate(all="ignore"):
                 return np.asarray(self.distance(model, system, task), dtype=np.float64)
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
+            if raised_by_signal(error):
+                raise
             raise DistanceError(f"the distance failed: {reason_of(error)}.") from error
 
     def _refuse_distance(self, value: Array, point: Array) -> NoReturn:

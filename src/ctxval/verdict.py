@@ -71,7 +71,7 @@ def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
     found = []
     for change in changes:
         if change.what == "accepted":
-            different = "; ".join(change.content.get("differences", [])[:1])
+            different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
             found.append(
                 f"what was changed after {change.content.get('trials', 'some')} trials makes no difference to them, as "
                 f"you state: {change.why!r} ({different})"

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval.arrays import Array
 from ctxval.errors import CertificateError
-from ctxval.trial import Origin, State, Trial
+from ctxval.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.version import VERSION
 
 PLANNED = "draws"
@@ -92,7 +92,7 @@ class Sample:
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
         good = _made_good(trials)
-        left_out = {one.trial for one in good}
+        left_out = {one.trial for one in good} | _measured_later(trials)
         count = _in_order([trial for trial in trials if trial.number not in left_out])
         return cls(
             np.array([trial.unit_point for trial in count]),
@@ -177,7 +177,7 @@ def remeasure(sample: Sample) -> str:
     what = listed(unmeasured)
     return (
         f" {what[0].upper()}{what[1:]} {_was(unmeasured)} executed, but the distance could not be measured: mend the "
-        "distance, and `ctxval remeasure STORE` measures without executing again."
+        "distance, and `ctxval remeasure STORE` measures what was recorded; what was not is to be executed again."
     )
 
 
@@ -202,6 +202,16 @@ def _in_order(trials: list[Trial]) -> list[Trial]:
     for place, trial in zip(places, ordered, strict=True):
         found[place] = trial
     return found
+
+
+def _measured_later(trials: Sequence[Trial]) -> set[int]:
+    """Return the trials whose distance was told alone, in another definition, and whose tasks were executed again."""
+    known = [trial.unit_point for trial in trials if trial.distance is not None]
+    waiting = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
+    if not known or not waiting:
+        return set()
+    gaps = (np.abs(np.array(known) - trial.unit_point).max(axis=1).min() for trial in waiting)
+    return {trial.number for trial, gap in zip(waiting, gaps, strict=True) if gap <= _SAME_TASK}
 
 
 def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
