@@ -85,10 +85,10 @@ class Marked(Store):
 class Full(Marked):
     """A store whose disk is full when the third execution has ended."""
 
-    def close_trial(self, trial: Trial, system_trajectory: Trajectory | None) -> None:
+    def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
         if trial.number == 2:
             raise StoreAccessError(f"{self.path} cannot be written: the disk is full.")
-        super().close_trial(trial, system_trajectory)
+        super().close_trial(trial, system_trajectory, changes=changes)
 
 
 def content(connection: sqlite3.Connection) -> str:
