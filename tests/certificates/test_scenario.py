@@ -5,6 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from conftest import make_validation
+from ctxval import Campaign, Trial, searches
 from ctxval.certificates import (
     Certificate,
     Sample,
@@ -271,3 +273,21 @@ def test_an_unmeasured_draw_is_a_violation_that_can_be_measured() -> None:
     for certified in (certify_scenario, certify_audit):
         with pytest.raises(CertificateError, match=r"Trial 1 was executed.*`ctxval remeasure STORE`"):
             certified(trials)
+
+
+def test_an_audit_that_was_stopped_says_how_many_draws_were_planned() -> None:
+    validation = make_validation()
+    campaign = Campaign(validation, search=searches.GPUCB(), seed=1).run(5)
+    ended: list[int] = []
+
+    def stop(trial: Trial) -> None:
+        ended.append(trial.number)
+        if len(ended) == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        campaign.audit(20, stop)
+    said = certify_audit(Sample.of(campaign.trials)).assumptions[0]
+    assert "although 20 were planned and 4 are known" in said
+    whole = certify_audit(Sample.of(campaign.audit(20).trials)).assumptions[0]
+    assert whole.endswith("their number was chosen before they were executed")

@@ -105,7 +105,7 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
         volume=volume,
         trials=len(sample),
         assumptions=(
-            f"the trials are independent and uniform over the task space, and {_number(sample)}",
+            f"the trials are independent and uniform over the task space, and {_number(sample, len(sample))}",
             "the number discarded was chosen before the distances were known",
             _UNSEEN,
             "each task has one distance: the system is deterministic",
@@ -160,7 +160,7 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
         volume=volume,
         trials=len(drawn),
         assumptions=(
-            f"the audited tasks are independent and uniform over the task space, and {_number(drawn)}",
+            f"the audited tasks are independent and uniform over the task space, and {_number(drawn, len(everything))}",
             *_not_counted(everything, drawn),
             _UNSEEN,
             "each task has one distance: the system is deterministic",
@@ -192,16 +192,13 @@ def _not_counted(everything: Sample, drawn: Sample) -> tuple[str, ...]:
     )
 
 
-def _number(sample: Sample) -> str:
-    """Return what is known of when the number of draws was chosen."""
+def _number(sample: Sample, drawn: int) -> str:
+    """Return what is known of when the number of draws was chosen, of which there are so many in all."""
     planned = sample.planned[-1] if len(sample) else None
     if planned is None:
         return "their number was chosen before they were executed (the store does not know when)"
-    if planned > len(sample) and set(sample.origins) == {"iid"} and sample.numbers[0] == 0:
-        return (
-            f"their number did not depend on their distances, although {planned} were planned and {len(sample)} are "
-            "known"
-        )
+    if planned > drawn:
+        return f"their number did not depend on their distances, although {planned} were planned and {drawn} are known"
     return "their number was chosen before they were executed"
 
 
