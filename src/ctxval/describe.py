@@ -225,6 +225,15 @@ def _attributes(value: Any) -> dict[str, Any]:
         return {}
 
 
+def rounded(value: Any, digits: int, least: float = 0.0) -> Any:
+    """Return a description without the last digits of its floats, in which machines differ; up to least they are 0."""
+    if isinstance(value, float):
+        return "0" if abs(value) <= least else f"{value:.{digits}g}"
+    if isinstance(value, dict):
+        return {key: rounded(item, digits, least) for key, item in value.items()}
+    return [rounded(item, digits, least) for item in value] if isinstance(value, list) else value
+
+
 def first_difference(stored: Any, present: Any, path: str = "") -> str | None:
     """Return where two descriptions first differ, as ``"path: stored, present"``; None where they agree.
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval.arrays import Array
-from ctxval.describe import describe
+from ctxval.describe import describe, rounded
 from ctxval.errors import CtxvalError
 from ctxval.store import Store
 from ctxval.trial import Trial
@@ -68,14 +68,5 @@ def _digest_of_model(validation: Validation) -> int:
             loops.append([trajectory.states.ravel().tolist(), trajectory.inputs.ravel().tolist()])
         except CtxvalError as error:
             loops.append([str(type(error).__name__)])
-    content = json.dumps(_rounded([describe(validation.model, private=True), loops]), sort_keys=True)
+    content = json.dumps(rounded([describe(validation.model, private=True), loops], 5, least=1e-12), sort_keys=True)
     return int.from_bytes(hashlib.sha256(content.encode()).digest()[:8], "big")
-
-
-def _rounded(value: Any) -> Any:
-    """Return a description without the last digits of its numbers, in which machines differ."""
-    if isinstance(value, float):
-        return f"{value:.5g}" if abs(value) > 1e-12 else "0"
-    if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
-    return [_rounded(item) for item in value] if isinstance(value, list) else value

@@ -94,7 +94,7 @@ class Ledger:
     def _replay(self) -> None:
         """Bring the search to where the stored trials left it."""
         self._trials = self.store.trials()
-        self._changes = len(self.store.history())
+        self._changes = self.store.signature()[2]
         iid = getattr(self.search, "iid", False)
         seed = self._draws.search_seed(self._trials) if iid else self.seed
         self.search.reset(self.validation.space.dimension, seed)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import Bounds, differential_evolution, minimize
 
 from ctxval.arrays import Array
-from ctxval.describe import describe
+from ctxval.describe import describe, rounded
 from ctxval.errors import InputError
 from ctxval.space import Parameters
 from ctxval.validation import Validation
@@ -223,16 +223,7 @@ def cached_truth(
 def _fingerprint(validation: Validation, compute: Callable[[Validation], Truth]) -> str:
     # The signature has the defaults that the description of a function leaves out.
     known = [validation.describe(), describe(compute), str(inspect.signature(compute))]
-    return hashlib.sha256(json.dumps(_rounded(known), sort_keys=True).encode()).hexdigest()[:32]
-
-
-def _rounded(value: Any) -> Any:
-    """Return a description without the last bits of its floats, in which machines differ."""
-    if isinstance(value, float):
-        return f"{value:.9g}"
-    if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
-    return [_rounded(item) for item in value] if isinstance(value, list) else value
+    return hashlib.sha256(json.dumps(rounded(known, 9), sort_keys=True).encode()).hexdigest()[:32]
 
 
 def _read_truth(path: Path, validation: Validation) -> Truth | None:
