@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from ctxval import Task, Trajectory, systems
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from ctxval.cases import arm
 from ctxval.controllers import AffineFeedback
 

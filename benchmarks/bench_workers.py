@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, searches
-from ctxval.controller import Controller
-from ctxval.rollout import rollout
+from ctxval.core.controller import Controller
+from ctxval.core.rollout import rollout
 
 WORKERS = (2, 8)
 ROUNDS = 3

@@ -20,10 +20,10 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ctxval import cases
-from ctxval.arrays import Array, single_threaded
+from ctxval._util.arrays import Array, single_threaded
 from ctxval.certificates import Sample, certify_posterior, draw_maxima
 from ctxval.errors import CertificateError
-from ctxval.hyperposterior import Prior
+from ctxval.gp.hyperposterior import Prior
 from ctxval.reproduce.jobs import Job, Results
 from ctxval.searches import GPUCB
 

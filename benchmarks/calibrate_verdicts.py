@@ -17,11 +17,11 @@ import numpy as np
 from calibrate import FAMILIES, RESULTS, STORED, SYSTEMS, Values, all_of, append, lines, maximum
 from calibration_functions import DEVELOPMENT, REPORTING, generator
 from ctxval import Campaign, Trial, cases, searches
-from ctxval.arrays import Array, single_threaded
+from ctxval._util.arrays import Array, single_threaded
 from ctxval.certificates import RESOLUTION, covering
+from ctxval.certificates.stopping import standing
+from ctxval.certificates.verdict import counterexample
 from ctxval.reproduce.jobs import Job, Results
-from ctxval.standing import standing
-from ctxval.verdict import counterexample
 
 RULE = 2
 """Of coverage, by which campaigns are run now."""

@@ -14,8 +14,8 @@ from collections.abc import Callable
 import numpy as np
 
 from calibrate import Values, from_prior
-from ctxval.arrays import Array
-from ctxval.hyperposterior import Prior
+from ctxval._util.arrays import Array
+from ctxval.gp.hyperposterior import Prior
 
 Make = Callable[[int, np.random.Generator], Values]
 

@@ -31,8 +31,8 @@ from crash.campaigns import BUDGET, SCRIPTS, STORE, campaign, content, digest, r
 from crash.disk import Disk, Files, Mode  # noqa: E402
 from crash.recorder import Event, record  # noqa: E402
 from ctxval import Store  # noqa: E402
+from ctxval.core.trial import Trial  # noqa: E402
 from ctxval.errors import CtxvalError  # noqa: E402
-from ctxval.trial import Trial  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "results" / "crash_states.json"
 MODES: tuple[Mode, ...] = ("ordered", "strict")

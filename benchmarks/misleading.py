@@ -32,9 +32,9 @@ from ctxval import (
     searches,
     systems,
 )
-from ctxval.arrays import Array
-from ctxval.controller import Controller
-from ctxval.integrate import Derivative
+from ctxval._util.arrays import Array
+from ctxval.core.controller import Controller
+from ctxval.systems.integrate import Derivative
 from study_auto import Result, add_options, campaign, print_table, stored
 
 HORIZON, DT = 60, 0.05

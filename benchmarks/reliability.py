@@ -25,19 +25,20 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
+sys.path[:0] = [str(ROOT / folder) for folder in ("tests", "tests/campaign", "benchmarks")]
+
+from test_faults import check_damaged, everything  # noqa: E402
+from test_kill import BUDGET, content, resumed  # noqa: E402
+from test_workers import start as start_workers  # noqa: E402
+from test_workers import until  # noqa: E402
 
 import rig_cluster  # noqa: E402
 import rig_command  # noqa: E402
 from attack import FAMILIES  # noqa: E402
 from conftest import make_validation  # noqa: E402
 from ctxval import Campaign, Store, searches  # noqa: E402
-from ctxval.salvage import salvage  # noqa: E402
+from ctxval.storage.recovery import salvage  # noqa: E402
 from rig_workers import campaign as logged  # noqa: E402
-from test_faults import check_damaged, everything  # noqa: E402
-from test_kill import BUDGET, content, resumed  # noqa: E402
-from test_workers import start as start_workers  # noqa: E402
-from test_workers import until  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "results" / "reliability.json"
 CRASHES = RESULTS.with_name("crash_states.json")

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 import misleading
 from calibration_page import table
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from study_ablations import ABLATIONS
 from study_ablations import CASES as ABLATED
 from study_auto import ROOT, WITHIN, Result, first_within, shown

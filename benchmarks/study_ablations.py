@@ -15,9 +15,11 @@ import numpy as np
 
 import misleading
 import study_auto
-from ctxval import Experiment, gp, searches
-from ctxval.arrays import Array
-from ctxval.searches import Climbs, Prediction, Scalar, climbs
+from ctxval import Experiment, searches
+from ctxval._util.arrays import Array
+from ctxval.gp import regression as gp
+from ctxval.searches import Climbs, Prediction, Scalar
+from ctxval.searches import trust_region as climbs
 from study_auto import ROOT, Result, add_options, campaign, print_table, stored
 
 CASES = ("pendulum-no-data", "linear-5", "dubins-basin", "arm-fnn", *misleading.CASES)

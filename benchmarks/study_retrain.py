@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, searches, systems
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from ctxval.certificates import Options, Sample, certify
-from ctxval.verdict import judge_by
+from ctxval.certificates.verdict import judge_by
 
 PAGE_DATA = Path(__file__).parent / "results" / "retrain.json"
 

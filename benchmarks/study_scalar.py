@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from ctxval import Validation, searches
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from ctxval.distances import ComposedDistance
-from ctxval.searches.vector import predict_composed
+from ctxval.learning.vector import predict_composed
 from study_auto import Result, add_options, experiment, first_within, print_rows, stored, truth
 
 BUDGETS = {"pendulum": 25, "dubins-basin": 100, "dubins-heavy-tail": 100}

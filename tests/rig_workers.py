@@ -10,7 +10,7 @@ from pathlib import Path
 
 from conftest import make_validation
 from ctxval import Campaign, Task, Trajectory, searches
-from ctxval.controller import Controller
+from ctxval.core.controller import Controller
 
 
 class Logging:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from ctxval.certificates import RESOLUTION, diagnose
 from ctxval.cli import app
-from ctxval.hyperposterior import EXACT, Hyperparameters, condition
+from ctxval.gp.hyperposterior import EXACT, Hyperparameters, condition
 
 ROOT = Path(__file__).parents[1]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ctxval.config import Settings
+from ctxval.config.settings import Settings
 from ctxval.testing import check_search
 
 ROOT = Path(__file__).parents[1]

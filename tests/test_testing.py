@@ -7,9 +7,9 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Task, Trajectory, controllers, distances, models, searches, systems, testing
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
+from ctxval.core.rollout import rollout
 from ctxval.errors import ConformanceError
-from ctxval.rollout import rollout
 
 MODEL = models.Linear([[1.0, 0.1], [-0.2, 0.9]], [[0.0], [0.1]], [0.01, 0.0])
 TASKS = Task([np.linspace(-1, 1, 4), 0.0], goal=[0.5, 0.0], horizon=12, dt=0.1)

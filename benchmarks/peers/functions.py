@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ctxval import Validation
-from ctxval.arrays import Array
-from ctxval.validation import Outcome
+from ctxval._util.arrays import Array
+from ctxval.core.validation import Outcome
 from study_auto import ROOT, experiment, truth
 
 TRUTHS = ROOT / "runs" / "truth"

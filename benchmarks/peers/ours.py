@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from ctxval import Campaign, searches
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
+from ctxval.core.validation import Outcome
 from ctxval.distances import ComposedDistance
-from ctxval.searches.vector import predict_composed
-from ctxval.validation import Outcome
+from ctxval.learning.vector import predict_composed
 from peers.recorder import Recorder, Suggest, Suggesting
 
 

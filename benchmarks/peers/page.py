@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration_page import table
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from peers.functions import CASES, SEEDS
 from peers.methods import METHODS
 from peers.overhead import COUNTS, SUGGESTIONS

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ctxval.arrays import Array
-from ctxval.validation import Outcome
+from ctxval._util.arrays import Array
+from ctxval.core.validation import Outcome
 from peers.functions import Function
 
 Suggest = Callable[[Array, Array], Array]

@@ -22,7 +22,7 @@ from gpytorch.mlls import ExactMarginalLogLikelihood
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from peers.recorder import Suggest, Suggesting
 
 INITIAL = 5

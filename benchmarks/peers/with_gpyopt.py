@@ -8,7 +8,7 @@ import GPy
 import numpy as np
 from GPyOpt.methods import BayesianOptimization
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from peers.recorder import Recorder
 
 NEVER = -1.0

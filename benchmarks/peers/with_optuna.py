@@ -8,7 +8,7 @@ import numpy as np
 import optuna
 from optuna.distributions import FloatDistribution
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from peers.recorder import Suggest, Suggesting
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)

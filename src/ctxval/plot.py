@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctxval.arrays import Array
-from ctxval.campaign import Campaign
+from ctxval._util.arrays import Array
+from ctxval.campaign.campaign import Campaign
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Trial
 from ctxval.errors import InputError
-from ctxval.surrogate import Surrogate
-from ctxval.trajectory import Trajectory
-from ctxval.trial import Trial
+from ctxval.gp.surrogate import Surrogate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,16 +11,16 @@ from typing import Literal
 
 import numpy as np
 
-from ctxval.arrays import Array
-from ctxval.controller import Controller, Synthesizer
-from ctxval.distance import Distance
+from ctxval._util.arrays import Array
+from ctxval.core.controller import Controller, Synthesizer
+from ctxval.core.distance import Distance
+from ctxval.core.model import Model, linearize
+from ctxval.core.rollout import rollout
+from ctxval.core.system import System
+from ctxval.core.task import Task
+from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import ConformanceError
-from ctxval.model import Model, linearize
-from ctxval.rollout import rollout
 from ctxval.searches import Search
-from ctxval.system import System
-from ctxval.task import Task
-from ctxval.trajectory import COMPLETE, Trajectory
 
 _TOLERANCE = 1e-10
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, Experiment, Validation, cases, distances, grid_truth
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
+from ctxval._util.describe import describe, first_difference
 from ctxval.cases import arm
-from ctxval.describe import describe, first_difference
 from ctxval.errors import UnknownNameError
 
 SMALL = arm.Settings(rollouts=100, points=150, restarts=1, training=150)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from ctxval import Trial
 from ctxval.certificates import MadeGood, Sample
 from ctxval.certificates.base import Certificate, listed, with_error
-from ctxval.trial import Origin, State
+from ctxval.core.trial import Origin, State
 
 
 def trial(

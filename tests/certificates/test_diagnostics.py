@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import kstest, t
 
 from ctxval.certificates import Sample, certify_posterior, diagnose, draw_maxima
-from ctxval.hyperposterior import EXACT, Conditioned, Hyperparameters, condition
+from ctxval.gp.hyperposterior import EXACT, Conditioned, Hyperparameters, condition
 
 GRID = np.linspace(0, 1, 121)[:, None]
 KNOWN = Hyperparameters(1.5, np.array([np.log(0.3)]), float(np.log(EXACT)))

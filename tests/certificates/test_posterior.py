@@ -22,9 +22,9 @@ from ctxval.certificates import (
 )
 from ctxval.certificates.base import at_most
 from ctxval.certificates.posterior import _MOST
+from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, UnknownNameError
-from ctxval.hyperposterior import Prior
-from ctxval.trial import Trial
+from ctxval.gp.hyperposterior import Prior
 
 confidences = st.floats(0.01, 0.999)
 numbers = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=60)

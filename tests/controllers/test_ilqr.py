@@ -6,11 +6,11 @@ from scipy.optimize import minimize
 
 from ctxval import Task
 from ctxval.controllers import ILQR, LQR
+from ctxval.core.model import Function, Model
+from ctxval.core.rollout import rollout
 from ctxval.errors import DesignError, InputError, ModelError, ShapeError
-from ctxval.integrate import rk4
-from ctxval.model import Function, Model
 from ctxval.models import Linear
-from ctxval.rollout import rollout
+from ctxval.systems.integrate import rk4
 
 DT = 0.05
 

@@ -9,12 +9,12 @@ import pytest
 from scipy.optimize import lsq_linear, minimize
 
 from ctxval import Task, testing
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
+from ctxval._util.describe import describe
 from ctxval.controllers import ILQR, LQR, Limits
-from ctxval.describe import describe
+from ctxval.core.rollout import rollout
 from ctxval.errors import InputError
 from ctxval.models import Function, Linear
-from ctxval.rollout import rollout
 
 Q, R, Q_FINAL = [10.0, 1.0], [0.1], [50.0, 5.0]
 

@@ -5,10 +5,10 @@ import pytest
 
 from ctxval import Task
 from ctxval.controllers import LQR, StationaryLQR
+from ctxval.core.model import Function, linearize
+from ctxval.core.rollout import rollout
 from ctxval.errors import InputError, ShapeError
-from ctxval.model import Function, linearize
 from ctxval.models import Linear
-from ctxval.rollout import rollout
 
 SIZES = [(1, 1, 3), (2, 1, 10), (3, 2, 7), (4, 4, 5), (2, 3, 12)]
 

@@ -11,11 +11,11 @@ import pytest
 from scipy.optimize import lsq_linear, minimize
 
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, searches, systems
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from ctxval.controllers import LQR, MPC
+from ctxval.core.rollout import rollout
 from ctxval.errors import DesignError, InputError, ShapeError
 from ctxval.models import Function, Linear
-from ctxval.rollout import rollout
 
 pytest.importorskip("casadi")
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from ctxval import Task, testing
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
+from ctxval._util.describe import describe, first_difference
 from ctxval.controllers import OnnxPolicy
-from ctxval.describe import describe, first_difference
+from ctxval.core.rollout import rollout
 from ctxval.errors import InputError, ShapeError
 from ctxval.models import Linear
-from ctxval.rollout import rollout
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from ctxval import Task, testing
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from ctxval.controllers import LQR, StationaryLQR
+from ctxval.core.rollout import rollout
 from ctxval.errors import DesignError, InputError, ShapeError
 from ctxval.models import Function, Linear
-from ctxval.rollout import rollout
 
 CART = Linear([[1.0, 0.1], [0.0, 0.95]], [[0.0], [0.1]])
 WEIGHTS = ([10.0, 1.0], [0.1])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ctxval import Task, Transitions, controllers, models, testing
-from ctxval.describe import describe, first_difference
+from ctxval._util.describe import describe, first_difference
 from ctxval.errors import InputError, ShapeError
 from ctxval.models import gaussian_process
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from ctxval import Transitions, models, testing
-from ctxval.arrays import Array
-from ctxval.describe import describe, first_difference
+from ctxval._util.arrays import Array
+from ctxval._util.describe import describe, first_difference
 from ctxval.errors import InputError, ShapeError
 
 

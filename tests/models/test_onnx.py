@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from ctxval import Task, controllers, testing
-from ctxval.arrays import Array
-from ctxval.describe import describe, first_difference
+from ctxval._util.arrays import Array
+from ctxval._util.describe import describe, first_difference
+from ctxval.core.model import linearize
+from ctxval.core.rollout import rollout
 from ctxval.errors import InputError, ModelError, ShapeError
-from ctxval.model import linearize
 from ctxval.models import Onnx
-from ctxval.rollout import rollout
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

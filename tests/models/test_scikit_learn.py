@@ -14,11 +14,11 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 
 from ctxval import Task, Transitions, controllers, testing
-from ctxval.describe import describe, first_difference
+from ctxval._util.describe import describe, first_difference
+from ctxval.core.model import linearize
+from ctxval.core.rollout import rollout
 from ctxval.errors import InputError, ShapeError
-from ctxval.model import linearize
 from ctxval.models import Linear, ScikitLearn
-from ctxval.rollout import rollout
 
 TRUTH = Linear([[1.0, 0.1], [-0.2, 0.9]], [[0.0], [0.1]], [0.01, 0.0])
 

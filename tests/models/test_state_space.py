@@ -10,9 +10,9 @@ import pytest
 import scipy.signal
 
 from ctxval import Task, controllers, testing
+from ctxval.core.rollout import rollout
 from ctxval.errors import InputError, ShapeError
 from ctxval.models import state_space
-from ctxval.rollout import rollout
 
 control = pytest.importorskip("control")
 

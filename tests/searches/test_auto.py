@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from ctxval.errors import InputError
 from ctxval.searches import Auto, Prediction
 

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ctxval.acquisition import UpperConfidenceBound
 from ctxval.errors import InputError
-from ctxval.kernels import Matern
+from ctxval.gp.acquisition import UpperConfidenceBound
+from ctxval.gp.kernels import Matern
 from ctxval.searches import GPUCB, Random, Search
 
 Function = Callable[[np.ndarray], np.ndarray]

@@ -5,8 +5,8 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, Task, Trajectory
-from ctxval.arrays import Array
-from ctxval.controller import Controller
+from ctxval._util.arrays import Array
+from ctxval.core.controller import Controller
 from ctxval.errors import InputError
 from ctxval.searches import GPUCB, Auto, Prediction, Random, Repeated, Scalar, by_name
 from ctxval.testing import check_search

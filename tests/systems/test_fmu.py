@@ -36,9 +36,9 @@ from ctxval import (
     systems,
     testing,
 )
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
+from ctxval._util.describe import describe, first_difference
 from ctxval.cli import app
-from ctxval.describe import describe, first_difference
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 from ctxval.systems import FMU, fmu_process
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ctxval import Task, Trajectory, systems, testing
-from ctxval.arrays import Array
-from ctxval.controller import Controller
+from ctxval._util.arrays import Array
+from ctxval.core.controller import Controller
 from ctxval.errors import ExecutionError, InputError
 
 TASK = Task([1.0, -0.5], horizon=8, dt=0.1)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, Task, TaskSpace, Transitions, Validation, controllers, distances, models, searches, testing
-from ctxval.arrays import Array
-from ctxval.describe import describe, first_difference
+from ctxval._util.arrays import Array
+from ctxval._util.describe import describe, first_difference
 from ctxval.errors import InputError, ShapeError
 from ctxval.systems import Gymnasium
 

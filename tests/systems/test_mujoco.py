@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, searches, systems, testing
-from ctxval.arrays import Array
-from ctxval.describe import describe, first_difference
+from ctxval._util.arrays import Array
+from ctxval._util.describe import describe, first_difference
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 from ctxval.systems import mujoco as adapter
 

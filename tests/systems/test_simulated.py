@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ctxval import Task
+from ctxval.core.rollout import rollout
 from ctxval.models import Linear
-from ctxval.rollout import rollout
 from ctxval.systems import Simulated, System, rk4
 
 

@@ -18,8 +18,8 @@ import pytest
 
 import rig_command
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, searches, systems, testing
-from ctxval.arrays import Array
-from ctxval.controller import AffineFeedback
+from ctxval._util.arrays import Array
+from ctxval.core.controller import AffineFeedback
 from ctxval.errors import ExecutionError, InputError
 from ctxval.systems import Subprocess, supervised
 from ctxval.systems import subprocess as adapter

@@ -6,8 +6,8 @@ import importlib
 import inspect
 from typing import Any
 
+from ctxval import Experiment
 from ctxval.errors import UnknownNameError
-from ctxval.experiment import Experiment
 
 NAMES: dict[str, str] = {
     "pendulum": "inverted pendulum, learned linear model, iLQR to a goal angle (1-D)",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval import (
+    Array,
     Experiment,
     Parameters,
     Task,
@@ -19,7 +20,6 @@ from ctxval import (
     models,
     systems,
 )
-from ctxval.arrays import Array
 from ctxval.errors import UnknownNameError
 
 MODELS = ("fnn", "gp", "linear")

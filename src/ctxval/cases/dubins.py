@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval import (
+    Array,
     Experiment,
     Parameters,
     Task,
@@ -21,7 +22,6 @@ from ctxval import (
     search_truth,
     systems,
 )
-from ctxval.arrays import Array
 from ctxval.errors import UnknownNameError
 
 WAVES = 10

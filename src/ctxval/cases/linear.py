@@ -7,8 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from ctxval import Experiment, Parameters, Task, TaskSpace, Truth, Validation, controllers, distances, models, systems
-from ctxval.arrays import Array
+from ctxval import (
+    Array,
+    Experiment,
+    Parameters,
+    Task,
+    TaskSpace,
+    Truth,
+    Validation,
+    controllers,
+    distances,
+    models,
+    systems,
+)
 from ctxval.errors import InputError
 
 DIMENSIONS = range(1, 11)

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
+from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
-from ctxval.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.version import VERSION
 
 PLANNED = "draws"

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from ctxval.errors import CertificateError
 
 RESOLUTION = 0.125

@@ -19,9 +19,9 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 from scipy.special import ndtri, stdtr
 
-from ctxval.arrays import Array, Mask
+from ctxval._util.arrays import Array, Mask
 from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task
-from ctxval.hyperposterior import Conditioned
+from ctxval.gp.hyperposterior import Conditioned
 
 LEVEL = 0.01
 """How unlikely a surprise must be for the bound to be withdrawn."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve
 
-from ctxval.arrays import Array, single_threaded
+from ctxval._util.arrays import Array, single_threaded
 from ctxval.certificates.base import Sample
 from ctxval.certificates.posterior import Maxima
-from ctxval.hyperposterior import Conditioned
+from ctxval.gp.hyperposterior import Conditioned
 
 HORIZON = 200
 """Executions that are looked ahead at most."""

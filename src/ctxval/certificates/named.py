@@ -10,8 +10,8 @@ from ctxval.certificates.convergence import TheoremConstants, certify_convergenc
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.posterior import certify_posterior
 from ctxval.certificates.scenario import certify_audit, certify_scenario
+from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError, UnknownNameError
-from ctxval.trial import Origin
 
 KINDS = ("posterior", "audit", "scenario", "sampling-discarding", "convergence")
 """What can be certified, the bound that people will use first."""

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval.acquisition import UpperConfidenceBound, maximise
-from ctxval.arrays import Array, Rows, single_threaded
+from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval.certificates.base import (
     ERRORS,
     ONE_CAMPAIGN,
@@ -30,9 +29,10 @@ from ctxval.certificates.base import (
 from ctxval.certificates.covering import RESOLUTION, require_resolution, resolved_volume
 from ctxval.certificates.diagnostics import diagnose
 from ctxval.errors import CertificateError, InputError
-from ctxval.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
-from ctxval.paths import draw_paths, maxima
-from ctxval.surrogate import fit_surrogate
+from ctxval.gp.acquisition import UpperConfidenceBound, maximise
+from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
+from ctxval.gp.sample_paths import draw_paths, maxima
+from ctxval.gp.surrogate import fit_surrogate
 
 FEWEST = 4
 """Trials without which nothing is said."""

@@ -18,14 +18,14 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from ctxval.campaign import Campaign
+from ctxval._util.describe import describe
+from ctxval._util.texts import reason_of, shortened
+from ctxval.campaign.campaign import Campaign
+from ctxval.certificates.verdict import Verdict
 from ctxval.cli.screen import Commands, Screen, line
-from ctxval.describe import describe
-from ctxval.disks import StoreWarning
+from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
-from ctxval.texts import reason_of, shortened
-from ctxval.trial import Trial
-from ctxval.verdict import Verdict
+from ctxval.storage.disks import StoreWarning
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 _BAD = (InputError, StoreError, CertificateError)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval.campaign import Campaign
+from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import (
     KINDS,
     Certificate,
@@ -19,6 +19,16 @@ from ctxval.certificates import (
     require_possible,
     require_resolution,
     require_use,
+)
+from ctxval.certificates.verdict import (
+    Verdict,
+    counterexample,
+    judge,
+    judge_by,
+    remarks_on,
+    require_confidence,
+    require_threshold,
+    require_volume,
 )
 from ctxval.cli.base import (
     FALSIFIED,
@@ -34,22 +44,12 @@ from ctxval.cli.base import (
     progress,
 )
 from ctxval.cli.trust import AcceptChange, Named, Trust, open_store, settings_of
-from ctxval.config import CertificateTable, Settings, stored_settings
+from ctxval.config.settings import CertificateTable, Settings, stored_settings
+from ctxval.core.space import TaskSpace
+from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError, UnknownNameError
-from ctxval.siblings import other_stores
-from ctxval.space import TaskSpace
-from ctxval.store import Store
-from ctxval.trial import Trial
-from ctxval.verdict import (
-    Verdict,
-    counterexample,
-    judge,
-    judge_by,
-    remarks_on,
-    require_confidence,
-    require_threshold,
-    require_volume,
-)
+from ctxval.storage.other_stores import other_stores
+from ctxval.storage.store import Store
 
 
 @app.command("certify")

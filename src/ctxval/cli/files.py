@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval.check import Finding, check_experiment
 from ctxval.cli.base import BAD_INPUT, AsJson, app, command, out
-from ctxval.config import read_settings
+from ctxval.config.check import Finding, check_experiment
+from ctxval.config.settings import read_settings
 from ctxval.errors import InputError
 
 _EXPERIMENT = """\

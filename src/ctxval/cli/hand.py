@@ -9,16 +9,16 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval.campaign import Campaign, OpenTrial
+from ctxval.campaign.by_hand import parameters_from, read_recording, read_runs, write_files
+from ctxval.campaign.campaign import Campaign, OpenTrial
 from ctxval.cli.base import AsJson, app, command, out
 from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, open_store
-from ctxval.config import read_settings
+from ctxval.config.settings import read_settings
+from ctxval.core.experiment import Experiment
+from ctxval.core.trial import Trial
+from ctxval.core.validation import START
 from ctxval.errors import InputError
-from ctxval.experiment import Experiment
-from ctxval.hand import parameters_from, read_recording, read_runs, write_files
-from ctxval.store import Store
-from ctxval.trial import Trial
-from ctxval.validation import START
+from ctxval.storage.store import Store
 
 _WAIT = 60.0
 """Seconds to wait for other terminals: each of them holds the store while it chooses a task."""

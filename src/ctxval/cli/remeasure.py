@@ -9,7 +9,7 @@ import typer
 
 from ctxval.cli.base import AsJson, app, command, out, worst_of
 from ctxval.cli.trust import AcceptChange, Named, Trust, open_store
-from ctxval.store import Store
+from ctxval.storage.store import Store
 
 
 @app.command()

@@ -10,7 +10,9 @@ from typing import Annotated, Any
 import typer
 
 from ctxval import plot
-from ctxval.campaign import Campaign
+from ctxval._util.texts import reason_of
+from ctxval.campaign.campaign import Campaign
+from ctxval.certificates.verdict import Verdict, require_threshold
 from ctxval.cli.base import (
     CANNOT_GO_ON,
     FALSIFIED,
@@ -35,13 +37,11 @@ from ctxval.cli.base import (
 )
 from ctxval.cli.certify import decide
 from ctxval.cli.trust import AcceptChange
-from ctxval.config import Settings, read_settings
+from ctxval.config.settings import Settings, read_settings
+from ctxval.core.experiment import Experiment
+from ctxval.core.truth import Truth
 from ctxval.errors import InputError
-from ctxval.experiment import Experiment
-from ctxval.siblings import other_stores
-from ctxval.texts import reason_of
-from ctxval.truth import Truth
-from ctxval.verdict import Verdict, require_threshold
+from ctxval.storage.other_stores import other_stores
 
 
 @app.command()

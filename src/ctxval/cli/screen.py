@@ -11,7 +11,7 @@ from rich.segment import Segment
 from rich.text import Text
 from typer.core import TyperGroup
 
-from ctxval.texts import shortened, visible
+from ctxval._util.texts import shortened, visible
 
 _INDENT = "\n  "
 """Before further lines of a text, so that none looks like a line of ours."""

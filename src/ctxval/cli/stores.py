@@ -19,8 +19,8 @@ from ctxval.cli.base import (
     worst_of,
 )
 from ctxval.errors import StoreAccessError
-from ctxval.salvage import export, salvage
-from ctxval.store import Store
+from ctxval.storage.recovery import export, salvage
+from ctxval.storage.store import Store
 
 _SENTENCES = 20
 """Sentences on what is damaged that are printed."""

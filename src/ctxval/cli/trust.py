@@ -8,13 +8,13 @@ from typing import Annotated
 
 import typer
 
-from ctxval.campaign import Campaign
+from ctxval.campaign.campaign import Campaign
 from ctxval.cli.base import err
-from ctxval.config import Settings, trusted_settings
+from ctxval.config.settings import Settings, trusted_settings
+from ctxval.config.signatures import code_named, verifies, why_no_key
+from ctxval.core.experiment import Experiment
 from ctxval.errors import InputError
-from ctxval.experiment import Experiment
-from ctxval.store import Store
-from ctxval.trust import code_named, verifies, why_no_key
+from ctxval.storage.store import Store
 
 Trust = Annotated[
     bool,

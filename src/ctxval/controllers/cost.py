@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctxval.arrays import Array, ArrayLike, as_weight
+from ctxval._util.arrays import Array, ArrayLike, as_weight
+from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
-from ctxval.task import Task
 
 
 class QuadraticCost:

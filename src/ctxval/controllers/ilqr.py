@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array, ArrayLike, Mask, Rows
-from ctxval.controller import AffineFeedback, Limits, LimitsLike
+from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
 from ctxval.controllers.cost import QuadraticCost
+from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
+from ctxval.core.model import Model, linearize
+from ctxval.core.task import Task
 from ctxval.errors import DesignError, InputError
-from ctxval.model import Model, linearize
-from ctxval.task import Task
 
 _STEP_LENGTHS = 0.5 ** np.arange(12)
 _SUFFICIENT_DECREASE = 1e-4

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array, ArrayLike
-from ctxval.controller import AffineFeedback, Limits, LimitsLike
+from ctxval._util.arrays import Array, ArrayLike
 from ctxval.controllers.cost import QuadraticCost
+from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
+from ctxval.core.model import Model, linearize
+from ctxval.core.task import Task
 from ctxval.errors import DesignError, InputError
-from ctxval.model import Model, linearize
-from ctxval.task import Task
 
 
 class LQR:

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array, ArrayLike, Mask, as_floats
-from ctxval.controller import Limits, LimitsLike
+from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
 from ctxval.controllers.cost import QuadraticCost
+from ctxval.core.controller import Limits, LimitsLike
+from ctxval.core.model import Model, linearize
+from ctxval.core.task import Task
 from ctxval.errors import DesignError, InputError, ShapeError
-from ctxval.model import Model, linearize
-from ctxval.task import Task
 
 _SETTLED = 1e-9  # relative change of the cost at which the iteration stops
 _STEP_LENGTHS = 0.5 ** np.arange(10)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array
-from ctxval.controller import Limits, LimitsLike, describe_limits, given_limits
+from ctxval._util.arrays import Array
+from ctxval._util.onnx_network import OnnxNetwork
+from ctxval.core.controller import Limits, LimitsLike, describe_limits, given_limits
+from ctxval.core.model import Model
+from ctxval.core.task import Task
 from ctxval.errors import InputError
-from ctxval.model import Model
-from ctxval.onnx_network import OnnxNetwork
-from ctxval.task import Task
 
 Observe = Callable[[int, Array, Task], Array]
 

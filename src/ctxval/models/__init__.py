@@ -1,6 +1,6 @@
 """Learned models M: ready-made ones and adapters."""
 
-from ctxval.model import Function, Model, linearize
+from ctxval.core.model import Function, Model, linearize
 from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
 from ctxval.models.linear import Linear
 from ctxval.models.neural_network import FeedforwardReLU

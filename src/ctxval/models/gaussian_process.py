@@ -9,11 +9,11 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-from ctxval.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
-from ctxval.gp import log_likelihood_of_outputs
+from ctxval.gp.regression import log_likelihood_of_outputs
 from ctxval.models.scaling import IncrementScaling
-from ctxval.trajectory import Transitions
 
 _BLOCK = 2048
 """Points in one matrix of covariances: enough to be fast, few enough for the cache."""

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
-from ctxval.trajectory import Transitions
 
 _LARGEST_CONDITION = 1e8
 """Half of the digits of a double: beyond it the weights are those of rounding and of noise."""

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.scaling import IncrementScaling
-from ctxval.trajectory import Transitions
 
 
 class FeedforwardReLU:

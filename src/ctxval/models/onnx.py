@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
+from ctxval._util.onnx_network import OnnxNetwork
 from ctxval.errors import InputError, ShapeError
-from ctxval.onnx_network import OnnxNetwork
 
 
 class Onnx:

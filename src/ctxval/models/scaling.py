@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
+from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
-from ctxval.trajectory import Transitions
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
+from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
-from ctxval.trajectory import Transitions
 
 
 class ScikitLearn:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array, as_finite
+from ctxval._util.arrays import Array, as_finite
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.linear import Linear
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from ctxval.reproduce.jobs import Job, Result, Results, distances_of
 from ctxval.reproduce.study import (
     BLUE,

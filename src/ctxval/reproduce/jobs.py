@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from ctxval import cases, searches
-from ctxval.arrays import Array, single_threaded
-from ctxval.campaign import Campaign
+from ctxval._util.arrays import Array, single_threaded
+from ctxval.campaign.campaign import Campaign
+from ctxval.core.experiment import Experiment
 from ctxval.errors import InputError
-from ctxval.experiment import Experiment
 
 Result = dict[str, Any]
 
@@ -134,7 +134,7 @@ def _profile(job: Job) -> Result:
 
 def _frameworks(job: Job) -> Result:
     """Return the four frameworks of the paper's Example 1."""
-    from ctxval.cases.frameworks import frameworks
+    from ctxval.reproduce.frameworks import frameworks
 
     found = frameworks(job.seed, per_axis=job.budget)
     return {

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctxval import cases, plot
-from ctxval.arrays import Array
-from ctxval.cases.frameworks import closed_loops
+from ctxval._util.arrays import Array
+from ctxval.core.trajectory import Trajectory
+from ctxval.gp.surrogate import Surrogate, fit_surrogate
+from ctxval.reproduce.frameworks import closed_loops
 from ctxval.reproduce.jobs import Job, Result, Results, distances_of
 from ctxval.reproduce.study import (
     BLACK,
@@ -26,8 +28,6 @@ from ctxval.reproduce.study import (
     running_estimate,
     spread,
 )
-from ctxval.surrogate import Surrogate, fit_surrogate
-from ctxval.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from ctxval.reproduce.jobs import DISCARDED, Job, Results
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from ctxval.errors import InputError, UnknownNameError
 from ctxval.searches.annealing import Annealing
 from ctxval.searches.auto import Auto
 from ctxval.searches.base import Note, Prediction, Search, SequentialSearch
-from ctxval.searches.climbs import Climbs
+from ctxval.searches.bayesian_optimisation import Scalar
 from ctxval.searches.cma_es import CMAES
 from ctxval.searches.gp_ucb import GPUCB
 from ctxval.searches.random import Random, SamplingDiscarding
 from ctxval.searches.repeated import Repeated
-from ctxval.searches.scalar import Scalar
+from ctxval.searches.trust_region import Climbs
 
 __all__ = [
     "CMAES",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctxval.arrays import Array
+from ctxval._util.arrays import Array
 from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch
 

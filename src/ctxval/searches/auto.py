@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from ctxval.errors import InputError
 from ctxval.searches.base import Prediction
-from ctxval.searches.climbs import Climbs
+from ctxval.searches.trust_region import Climbs
 
 
 class Auto(Climbs):

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ctxval.arrays import Array, ArrayLike, Rows, as_floats
+from ctxval._util.arrays import Array, ArrayLike, Rows, as_floats
 from ctxval.errors import InputError, ShapeError
 
 Note = dict[str, Any]

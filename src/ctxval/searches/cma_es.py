@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctxval.arrays import Array, single_threaded
+from ctxval._util.arrays import Array, single_threaded
 from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctxval import gp
-from ctxval.acquisition import Uncertainty, UpperConfidenceBound, maximise
-from ctxval.arrays import Array, single_threaded
+from ctxval._util.arrays import Array, single_threaded
 from ctxval.errors import InputError
-from ctxval.kernels import Kernel, Matern
+from ctxval.gp import regression as gp
+from ctxval.gp.acquisition import Uncertainty, UpperConfidenceBound, maximise
+from ctxval.gp.kernels import Kernel, Matern
+from ctxval.gp.subset import kept_rows
+from ctxval.gp.surrogate import Surrogate, fit_surrogate
 from ctxval.searches.base import SequentialSearch, best_first
-from ctxval.searches.history import kept_rows
-from ctxval.surrogate import Surrogate, fit_surrogate
 
 _NEGLIGIBLE = 1e-3
 """The least promised improvement worth an execution, in standard deviations of the values."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctxval.arrays import Array, Rows
+from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
 from ctxval.searches.base import Note, Prediction, Search, SequentialSearch
 

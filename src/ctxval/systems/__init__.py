@@ -1,10 +1,10 @@
 """True systems S: ready-made ones and adapters."""
 
-from ctxval.integrate import rk4
-from ctxval.system import System
+from ctxval.core.system import System
 from ctxval.systems.fmu import FMU
 from ctxval.systems.function import Function
 from ctxval.systems.gymnasium import Gymnasium
+from ctxval.systems.integrate import rk4
 from ctxval.systems.manual import Manual
 from ctxval.systems.mujoco import MuJoCo
 from ctxval.systems.simulated import Simulated

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ctxval.arrays import Array
-from ctxval.controller import Controller
+from ctxval._util.arrays import Array
+from ctxval.core.controller import Controller
+from ctxval.core.task import Task
+from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import InputError, ShapeError
-from ctxval.task import Task
-from ctxval.trajectory import COMPLETE, Trajectory
 
 SAME_STATE = 1e-6
 """By how much a system may miss the task's initial state, relative to the larger of 1 and that state."""

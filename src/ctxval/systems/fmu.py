@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array
-from ctxval.controller import Controller
+from ctxval._util.arrays import Array
+from ctxval._util.files import require_regular_file
+from ctxval._util.temporary import Scratch
+from ctxval.core.controller import Controller
+from ctxval.core.task import Task
+from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import ExecutionError, InputError, UnknownNameError
-from ctxval.files import require_regular_file
-from ctxval.scratch import Scratch
 from ctxval.systems.episode import require_one, require_started, run_episode
 from ctxval.systems.subprocess import signal_name
-from ctxval.task import Task
-from ctxval.trajectory import COMPLETE, Trajectory
 
 _PROGRAM = Path(__file__).with_name("fmu_process.py")
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ctxval.arrays import as_floats
-from ctxval.controller import Controller
+from ctxval._util.arrays import as_floats
+from ctxval.core.controller import Controller
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ExecutionError, InputError
-from ctxval.task import Task
-from ctxval.trajectory import Trajectory
 
 
 class Function:

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ctxval.arrays import Array, as_floats
-from ctxval.controller import Controller
+from ctxval._util.arrays import Array, as_floats
+from ctxval.core.controller import Controller
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError
 from ctxval.systems.episode import require_one, require_started, require_time_step, run_episode
-from ctxval.task import Task
-from ctxval.trajectory import Trajectory
 
 StateGetter = Callable[[Any], Any]
 StateSetter = Callable[[Any, Array], None]

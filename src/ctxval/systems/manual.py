@@ -7,9 +7,9 @@ from typing import NoReturn
 
 import numpy as np
 
-from ctxval.controller import Controller
+from ctxval.core.controller import Controller
+from ctxval.core.task import Task
 from ctxval.errors import ExecutionError, InputError
-from ctxval.task import Task
 
 
 class Manual:

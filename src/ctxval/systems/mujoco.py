@@ -9,13 +9,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ctxval.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
-from ctxval.controller import Controller
+from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
+from ctxval._util.files import read_bytes
+from ctxval.core.controller import Controller
+from ctxval.core.rollout import rollout
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError, UnknownNameError
-from ctxval.files import read_bytes
-from ctxval.rollout import rollout
-from ctxval.task import Task
-from ctxval.trajectory import Trajectory
 
 _SAME_POSITION = 1e-6
 """Metres by which the given position of a site may miss the actual one in an initial state."""

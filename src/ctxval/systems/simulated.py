@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from ctxval.controller import Controller
-from ctxval.model import Function, Model, Step
-from ctxval.rollout import rollout
-from ctxval.task import Task
-from ctxval.trajectory import Trajectory
+from ctxval.core.controller import Controller
+from ctxval.core.model import Function, Model, Step
+from ctxval.core.rollout import rollout
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
 
 
 class Simulated:

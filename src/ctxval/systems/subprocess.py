@@ -14,14 +14,14 @@ from typing import IO
 
 import numpy as np
 
-from ctxval.controller import Controller
+from ctxval._util.temporary import scratch
+from ctxval.core.controller import Controller
+from ctxval.core.exchange import write_controller, write_task
+from ctxval.core.task import Task
+from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import CtxvalError, ExecutionError, InputError
-from ctxval.exchange import write_controller, write_task
-from ctxval.scratch import scratch
 from ctxval.systems.episode import require_one
 from ctxval.systems.supervised import run_supervised
-from ctxval.task import Task
-from ctxval.trajectory import COMPLETE, Trajectory
 
 _TIMES = 0.01
 """By how much the times of a trajectory may miss the task's, in steps."""
@@ -34,7 +34,7 @@ class Subprocess:
     """A command that executes one task as the true system.
 
     Every execution has a fresh folder, with ``task.json`` and the controller as ``controller.json`` and
-    ``controller.npz`` (see :mod:`ctxval.exchange`). The command is run with that folder as its last argument, and
+    ``controller.npz`` (see :mod:`ctxval.core.exchange`). The command is run with that folder as its last argument, and
     writes ``trajectory.npz`` (times, states, inputs, perhaps ended) or ``trajectory.csv`` (columns ``t, x0, ..., u0,
     ...``, no inputs in the last row) into it, as a regular file. It runs in the folder that was the current one when
     this object was made. An exit status other than 0 is a failed execution, whose reason is the

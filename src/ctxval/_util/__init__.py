@@ -1,0 +1,1 @@
+"""What knows nothing of validation: arrays, files, texts, processes."""

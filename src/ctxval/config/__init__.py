@@ -1,0 +1,1 @@
+"""An experiment from a file or from a name."""

@@ -1,0 +1,241 @@
+"""What can be known of an experiment before the system is executed, and what two executions more would show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.texts import reason_of
+from ctxval.core.experiment import Experiment, labels_of
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.validation import Plan, Validation
+from ctxval.errors import ConformanceError, CtxvalError
+from ctxval.testing import check_distance, check_model, check_synthesizer
+
+_TASKS = 8
+"""Random tasks that are planned beside the corners' and the middle one."""
+
+_SAME_START = 1e-6
+"""By how much an execution may miss the task's initial state."""
+
+State = Literal["ok", "noted", "failed", "skipped"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found.
+
+    Attributes:
+        check: what was looked at.
+        state: failed is a fault; noted is worth knowing.
+        text: one sentence.
+    """
+
+    check: str
+    state: State
+    text: str
+
+
+def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int = 0) -> list[Finding]:
+    """Check the parts of an experiment against each other; S is executed only where that is asked for, twice.
+
+    Args:
+        experiment: what to check.
+        execute: whether to execute the middle task twice.
+        seed: of the tasks that are tried.
+    """
+    validation = experiment.validation
+    findings = [_space(validation)]
+    plans: list[Plan] = []
+    findings += _guarded("tasks", lambda: _tasks(validation, seed, plans))
+    if not plans:
+        return findings
+    checks: list[tuple[str, Callable[[], Iterator[Finding]]]] = [
+        ("names", lambda: _names(experiment, plans[0])),
+        ("system", lambda: _system(validation, plans[0])),
+        ("model", lambda: _model(validation, plans[0])),
+        ("batches", lambda: _batches(validation, plans)),
+        ("distance", lambda: _distance(validation, plans)),
+        ("execution", lambda: _executions(validation, plans[1], execute)),
+    ]
+    for name, check in checks:
+        findings += _guarded(name, check)
+    return findings
+
+
+def _guarded(name: str, check: Callable[[], Iterator[Finding]]) -> list[Finding]:
+    found: list[Finding] = []
+    try:
+        found.extend(check())
+    except CtxvalError as error:
+        found.append(Finding(name, "failed", str(error)))
+    except Exception as error:
+        # A user's own part may raise anything.
+        found.append(Finding(name, "failed", reason_of(error)))
+    return found
+
+
+def _space(validation: Validation) -> Finding:
+    space = validation.space
+    without = [name for name, label in zip(space.names, space.labels, strict=True) if name == label]
+    text = f"{space.dimension} task parameters: {', '.join(space.labels)}"
+    if without:
+        return Finding("space", "noted", f"{text}; no unit for {', '.join(without)}")
+    return Finding("space", "ok", text)
+
+
+def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Finding]:
+    """Plan tasks: the lowest corner, the middle, the highest corner and random ones; the paper's Aspect-1."""
+    space = validation.space
+    points = np.concatenate(
+        [
+            np.stack([space.low, 0.5 * (space.low + space.high), space.high]),
+            space.iid(_TASKS, np.random.default_rng(seed)),
+        ]
+    )
+    made = [validation.plan(point) for point in points]
+    plans.extend(made)
+    task = made[0].task
+    n, m = made[0].model_trajectory.states.shape[-1], made[0].model_trajectory.inputs.shape[-1]
+    yield Finding(
+        "tasks",
+        "ok",
+        f"{len(made)} tasks planned: {n} states, {m} inputs, {task.horizon} steps of {task.dt:g} s",
+    )
+    errors = [np.abs(plan.model_trajectory.final_state - plan.task.goal).sum() for plan in made]
+    starts = [np.abs(plan.task.initial_state - plan.task.goal).sum() for plan in made]
+    worst = int(np.argmax(errors))
+    where = ", ".join(f"{k} = {_short(v)}" for k, v in space.describe_point(points[worst]).items())
+    reached = errors[worst] <= 0.1 * max(starts)
+    yield Finding(
+        "controller on the model",
+        "ok" if reached else "noted",
+        f"ends at most {errors[worst]:.3g} from the goal (1-norm of the states), at {where}"
+        + ("" if reached else "; a controller that fails on the model itself is no use on the system"),
+    )
+
+
+def _short(value: Any) -> str:
+    return "[" + ", ".join(f"{v:.4g}" for v in value) + "]" if isinstance(value, list) else f"{value:.4g}"
+
+
+def _names(experiment: Experiment, plan: Plan) -> Iterator[Finding]:
+    counts = plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1]
+    for kind, labels, count in zip(("states", "inputs"), (experiment.states, experiment.inputs), counts, strict=True):
+        if labels and len(labels) != count:
+            sentence = f"there are {count} {kind}, but names for {len(labels)}: {', '.join(labels)}"
+            yield Finding("names", "failed", sentence)
+    for kind, named in zip(("states", "inputs"), experiment.names(*counts), strict=True):
+        bare = [name for name, unit in named.items() if not unit]
+        text = ", ".join(labels_of(named))
+        missing = f"; no unit for {', '.join(bare)}" if bare else ""
+        yield Finding("names", "noted" if bare else "ok", f"{kind}: {text}{missing}")
+    if not experiment.units:
+        yield Finding("names", "noted", "the distance has no units")
+
+
+def _system(validation: Validation, plan: Plan) -> Iterator[Finding]:
+    """Hold what a system says of itself against the task and the controller."""
+    system, task = validation.system, plan.task
+    dt = getattr(system, "dt", None)
+    if isinstance(dt, int | float) and not np.isclose(dt, task.dt, rtol=1e-9, atol=0):
+        yield Finding("system", "failed", f"its time step is {dt:g} s, the task's {task.dt:g} s")
+    counts = plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1]
+    for kind, count in zip(("states", "inputs"), counts, strict=True):
+        own = getattr(system, kind, None)
+        if isinstance(own, dict | list | tuple) and len(own) != count:
+            yield Finding(
+                "system", "failed", f"it has {len(own)} {kind}, the model {count}: {', '.join(map(str, own))}"
+            )
+
+
+def _model(validation: Validation, plan: Plan) -> Iterator[Finding]:
+    states, inputs = plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1]
+    try:
+        check_model(validation.model, states=states, inputs=inputs)
+        yield Finding("model", "ok", "takes batches as single states; its Jacobian, if it has one, is its derivative")
+    except ConformanceError:
+        check_model(validation.model, states=states, inputs=inputs, tolerance=1e-5)
+        yield Finding("model", "noted", "agrees with itself in single precision only")
+
+
+def _batches(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]:
+    points = np.stack([plan.parameters.points for plan in plans])
+    try:
+        batch = validation.task(validation.space.parameters(points))
+        same = isinstance(batch, Task) and batch.batch_shape == (len(points),)
+    except Exception:
+        same = False
+    if not same:
+        yield Finding("batches", "noted", "the task function takes one point at a time: true maxima are slower to find")
+        return
+    for index, plan in enumerate(plans):
+        one = batch[index]
+        if not np.array_equal(one.reference, plan.task.reference) or not np.array_equal(
+            one.initial_state, plan.task.initial_state
+        ):
+            yield Finding("batches", "failed", f"the task function makes another task {index} in a batch than alone")
+            return
+    check_synthesizer(validation.synthesizer, _first(batch, 4), validation.model)
+    yield Finding("batches", "ok", "task function and synthesizer do in a batch what they do alone")
+
+
+def _first(batch: Task, count: int) -> Task:
+    return Task(batch.initial_state[:count], horizon=batch.horizon, dt=batch.dt, reference=batch.reference[:count])
+
+
+def _distance(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]:
+    trajectories = [plan.model_trajectory for plan in plans]
+    model = _stacked(trajectories, 0.0)
+    task = Task(
+        np.stack([plan.task.initial_state for plan in plans]),
+        horizon=plans[0].task.horizon,
+        dt=plans[0].task.dt,
+        reference=np.stack([plan.task.reference for plan in plans]),
+    )
+    try:
+        check_distance(validation.distance, model, _stacked(trajectories, 0.01), task)
+        yield Finding("distance", "ok", "finite, not negative, and the same in a batch as alone")
+    except Exception:
+        for plan, trajectory in zip(plans, trajectories, strict=True):
+            validation.measure(plan, trajectory)
+        yield Finding("distance", "noted", "takes one task at a time, so true maxima are slower to find")
+    own = [validation.measure(plan, trajectory) for plan, trajectory in zip(plans, trajectories, strict=True)]
+    if max(own) > 0:
+        yield Finding("distance", "noted", f"up to {max(own):.3g} already between the model and itself")
+
+
+def _stacked(trajectories: Sequence[Trajectory], shift: float) -> Trajectory:
+    states: Array = np.stack([one.states for one in trajectories])
+    return Trajectory(trajectories[0].times, states + shift, np.stack([one.inputs for one in trajectories]))
+
+
+def _executions(validation: Validation, plan: Plan, execute: bool) -> Iterator[Finding]:
+    """Execute one task twice: does the system start where the task says, and do the same again?"""
+    if getattr(validation.system, "manual", False):
+        yield Finding("execution", "skipped", "people execute this system: see `ctxval ask`")
+        return
+    if not execute:
+        yield Finding("execution", "skipped", "say --execute to execute one task twice")
+        return
+    first, second = validation.execute(plan), validation.execute(plan)
+    for trajectory in (first, second):
+        gap = float(np.abs(trajectory.states[0] - plan.task.initial_state).max())
+        if gap > _SAME_START:
+            yield Finding("execution", "failed", f"it starts {gap:.3g} away from the task's initial state")
+    noise = float(np.abs(first.states - second.states).max())
+    distances = [validation.measure(plan, trajectory) for trajectory in (first, second)]
+    if noise == 0:
+        yield Finding("execution", "ok", f"two executions of one task are the same; the distance is {distances[0]:.4g}")
+        return
+    yield Finding(
+        "execution",
+        "noted",
+        f"two executions of one task differ by up to {noise:.3g} in a state and {abs(distances[0] - distances[1]):.3g} "
+        "in the distance: the system is stochastic; say so in [certificate]",
+    )

@@ -1,0 +1,310 @@
+"""The parts of an experiment by name, as experiment files give them; nothing in them is code but ``module:attr``."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, get_type_hints
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.errors import PydanticUserError
+from pydantic_core import SchemaError
+
+from ctxval import controllers, distances, models, systems
+from ctxval._util.files import read_bytes
+from ctxval._util.npz import Archive
+from ctxval._util.texts import reason_of
+from ctxval.config.references import accepts, is_function, reference, require_function, require_part
+from ctxval.core.model import Model
+from ctxval.core.space import Parameters, TaskSpace
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
+
+_ROOMS: dict[str, tuple[ModuleType, tuple[str, ...]]] = {
+    "system": (systems, ("FMU", "Function", "Gymnasium", "Manual", "MuJoCo", "Simulated", "Subprocess")),
+    "model": (models, ("Function", "GaussianProcessModel", "Linear", "Onnx", "ScikitLearn", "state_space")),
+    "synthesizer": (controllers, ("ILQR", "LQR", "MPC", "OnnxPolicy", "Policy", "StationaryLQR")),
+    "distance": (distances, ("FinalState", "GoalError", "MeanDeviation", "WholeTrajectory")),
+}
+
+DATA_ONLY: dict[str, tuple[str, ...]] = {
+    "system": ("Function", "Manual", "MuJoCo", "Simulated"),
+    "model": _ROOMS["model"][1],
+    "synthesizer": _ROOMS["synthesizer"][1],
+    "distance": _ROOMS["distance"][1],
+}
+"""Parts that run no code but what ``{ref = "module:attr"}`` gives them; the others run programs or foreign code."""
+
+_FILES = {"FMU": "path", "MuJoCo": "mjcf", "Onnx": "source", "OnnxPolicy": "source"}
+"""Arguments that are files, by part."""
+
+_FUNCTIONS = {
+    "step": (2, "(x, u) -> x_next"),
+    "execute": (2, "(controller, task) -> trajectory"),
+    "get_state": (1, "environment -> x"),
+    "set_state": (2, "(environment, x)"),
+    "observe": (3, "(t, x, task) -> observations"),
+    "policy": (3, "(t, x, task) -> u"),
+}
+"""Arguments of built-in parts that are functions: of how many arguments, and which."""
+
+
+def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) -> Any:
+    """Return a system, model, synthesizer or distance.
+
+    Args:
+        kind: which of them.
+        given: ``module:attr``; or a table with ``type``, a built-in name or ``module:attr``, and its arguments. An
+            argument ``{ref = "module:attr"}`` is what that names. A model with ``data``, files of trajectories, is
+            learned from them.
+        folder: where files and modules are sought; the current folder by default.
+
+    Raises:
+        UnknownNameError: there is no such part, or it takes no such argument.
+        InputError: it cannot be made so; the message says why.
+    """
+    table = {"type": given} if isinstance(given, str) else dict(given)
+    name = table.pop("type", None)
+    if not isinstance(name, str):
+        raise InputError(f"[{kind}] needs a type, such as {_ROOMS[kind][1][0]!r} or 'module:attr'.")
+    what = f"the {kind} {name}"
+    if ":" in name:
+        arguments = {key: argument(value, folder) for key, value in table.items()}
+        return _own(kind, what, reference(name, folder), arguments, folder)
+    room, names = _ROOMS[kind]
+    if name not in names:
+        raise UnknownNameError.among(kind, name, names)
+    arguments = {key: argument(value, folder) for key, value in _beside(name, table, folder).items()}
+    for key, value in arguments.items():
+        if key in _FUNCTIONS and isinstance(table[key], Mapping) and not isinstance(value, Model):
+            require_function(f"{key} of {what}", value, *_FUNCTIONS[key])
+    return _built(kind, what, getattr(room, name), arguments, folder)
+
+
+def _own(kind: str, what: str, found: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
+    """Return the part that a reference names: an object, or what a class or a function makes; checked before a call."""
+    if isinstance(found, type):
+        return require_part(kind, what, _built(kind, what, require_part(kind, what, found), arguments, folder))
+    if inspect.isfunction(found) and (arguments or not _is_part(kind, found)):
+        if not arguments and not accepts(found, 0):
+            require_part(kind, what, found)  # says what is wrong
+        return require_part(kind, what, _built(kind, what, found, arguments, folder))
+    if arguments:
+        raise InputError(f"{what} is an object already, so it takes no arguments, got {', '.join(arguments)}.")
+    return require_part(kind, what, found)
+
+
+def _is_part(kind: str, found: Any) -> bool:
+    """Return whether a function is a part itself, and does not make one."""
+    return kind in ("model", "distance") and is_function(found) and accepts(found, 2 if kind == "model" else 3)
+
+
+def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
+    if kind == "model" and "data" in arguments and hasattr(build, "fit"):
+        build, arguments = build.fit, {**arguments, "data": recorded(arguments["data"], folder)}
+    return made(what, build, arguments)
+
+
+def _beside(name: str, table: Mapping[str, Any], folder: Path | None) -> dict[str, Any]:
+    """Return a built-in part's arguments, with the files that it names in the folder."""
+    found = dict(table)
+    if folder is None:
+        return found
+    if name == "Subprocess":
+        found["folder"] = str(folder / str(found.get("folder", "")))
+    file = found.get(_FILES.get(name, ""))
+    if isinstance(file, str) and "<" not in file:  # which begins a model of MuJoCo as text
+        found[_FILES[name]] = str(folder / file)
+    return found
+
+
+def made(what: str, build: Any, arguments: Mapping[str, Any]) -> Any:
+    """Call what makes a part.
+
+    Raises:
+        UnknownNameError: it takes no such argument.
+        InputError: it refuses these arguments.
+    """
+    try:
+        signature = inspect.signature(build)
+        if not any(p.kind is p.VAR_KEYWORD for p in signature.parameters.values()):
+            for key in arguments:
+                if key not in signature.parameters:
+                    raise UnknownNameError.among(f"argument of {what}", key, signature.parameters)
+        return build(**arguments)
+    except CtxvalError:
+        raise
+    except Exception as error:
+        raise InputError(f"{what} cannot be made: {reason_of(error)}.") from error
+
+
+def argument(value: Any, folder: Path | None = None) -> Any:
+    """Return an argument as it is, or what ``{ref = "module:attr"}`` names.
+
+    Raises:
+        InputError: what is named cannot be loaded, or is a builtin function, a method or a module.
+    """
+    if isinstance(value, Mapping):
+        if set(value) == {"ref"}:
+            return _referred(str(value["ref"]), folder)
+        return {key: argument(item, folder) for key, item in value.items()}
+    return value
+
+
+def _referred(text: str, folder: Path | None) -> Any:
+    found = reference(text, folder)
+    if inspect.ismodule(found) or (inspect.isroutine(found) and not inspect.isfunction(found)):
+        raise InputError(f"{text} must be an object, a class or a function written in Python, got {found!r}.")
+    return found
+
+
+def recorded(files: Any, folder: Path | None = None) -> Transitions:
+    """Return the transitions in recorded trajectories, CSV or NPZ, or in an NPZ file with x, u and x_next.
+
+    Args:
+        files: one or several.
+        folder: where they are sought; the current folder by default.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    paths = [files] if isinstance(files, str) else files
+    if not isinstance(paths, list) or not paths or not all(isinstance(path, str) for path in paths):
+        raise InputError(f"data must be files of recorded trajectories, got {files!r}.")
+    return Transitions.joined([_transitions(Path(folder or "", path)) for path in paths])
+
+
+def _transitions(path: Path) -> Transitions:
+    if path.suffix != ".npz":
+        return Trajectory.from_csv(path).transitions()
+    try:
+        arrays = Archive(read_bytes(path))
+        if "x_next" in arrays:
+            return Transitions(*(arrays.numbers(name) for name in ("x", "u", "x_next")))
+    except ShapeError:
+        raise
+    except InputError as error:
+        raise InputError(f"{path} cannot be read as recorded data: {error}.") from error
+    return Trajectory.from_npz(path).transitions()
+
+
+# Tasks
+
+
+@dataclass(frozen=True)
+class TaskTable:
+    """A task function without code: every component is a number, or a task parameter by name.
+
+    Attributes:
+        initial_state, goal: ``1.5``, ``"name"``, ``"-name"`` or ``"name[2]"``; no goal is zero.
+        horizon: number of steps.
+        dt: seconds in a step.
+    """
+
+    initial_state: tuple[float | str, ...]
+    goal: tuple[float | str, ...] | None
+    horizon: int
+    dt: float
+
+    def __call__(self, p: Parameters) -> Task:
+        """Return the task, or the batch of tasks."""
+        start = [_component(entry, p) for entry in self.initial_state]
+        goal = None if self.goal is None else [_component(entry, p) for entry in self.goal]
+        return Task(start, goal=goal, horizon=self.horizon, dt=self.dt)
+
+
+def _component(entry: float | str, p: Parameters) -> Any:
+    if not isinstance(entry, str):
+        return entry
+    name, _, index = entry.removeprefix("-").partition("[")
+    value = p[name.strip()]
+    if index:
+        value = value[..., int(index.removesuffix("]"))]
+    return -value if entry.startswith("-") else value
+
+
+_TASK_KEYS = ("initial_state", "goal", "horizon", "dt")
+
+
+def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any, folder: Path | None = None) -> Any:
+    """Return the map p -> task of an experiment file: ``module:attr``, or a table.
+
+    Raises:
+        InputError: the table misses something, or names what is no task parameter.
+    """
+    if isinstance(given, str):
+        return require_function(f"the task {given}", reference(given, folder), 1, "p -> Task")
+    for key in given:
+        if key not in _TASK_KEYS:
+            raise UnknownNameError.among("entry of [task]", key, _TASK_KEYS)
+    table = {"dt": getattr(system, "dt", None), **given}
+    missing = [key for key in ("initial_state", "horizon", "dt") if table.get(key) is None]
+    if missing:
+        raise InputError(f"[task] needs {', '.join(missing)}.")
+    goal = table.get("goal")
+    found = TaskTable(
+        _components("initial_state", table["initial_state"]),
+        None if goal is None else _components("goal", goal),
+        table["horizon"],
+        table["dt"],
+    )
+    try:
+        found(space.parameters(space.low))
+    except CtxvalError:
+        raise
+    except (ValueError, IndexError, TypeError) as error:
+        raise InputError(f"[task] cannot be used: {error}.") from error
+    return found
+
+
+def _components(name: str, entries: Any) -> tuple[float | str, ...]:
+    valid = isinstance(entries, list) and entries
+    if not valid or not all(isinstance(e, int | float | str) and not isinstance(e, bool) for e in entries):
+        raise InputError(f"{name} of [task] must be a list of numbers and of names of parameters, got {entries!r}.")
+    return tuple(entries)
+
+
+# Options of plain types
+
+
+def require_types(what: str, function: Any, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options, lists made tuples where the function wants tuples.
+
+    Raises:
+        InputError: an option has another type than the function's annotation says.
+    """
+    target = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
+    try:
+        hints = get_type_hints(target)
+    except (NameError, TypeError):
+        return dict(options)
+    return {name: _typed(f"{what}: {name}", hints.get(name, Any), value) for name, value in options.items()}
+
+
+def _typed(what: str, hint: Any, value: Any) -> Any:
+    try:
+        adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
+    except (PydanticUserError, SchemaError, TypeError):
+        # A protocol, which no plain value has.
+        if isinstance(value, str | int | float | list | dict):
+            raise InputError(f"{what}: it is an object of Python, {{ ref = 'module:attr' }}, got {value!r}.") from None
+        return value
+    given = tuple(value) if isinstance(value, list) else value
+    try:
+        return adapter.validate_python(given, strict=True)
+    except ValidationError as error:
+        message = error.errors()[0]["msg"].lower()
+        raise InputError(f"{what}: {message}, got {value!r}.") from error
+
+
+def space_of(bounds: Mapping[str, Sequence[Any]]) -> TaskSpace:
+    """Return a task space from ``name = [low, high, "unit"]``.
+
+    Raises:
+        InputError: bounds cannot be used.
+    """
+    return TaskSpace(**{name: tuple(bound) for name, bound in bounds.items()})

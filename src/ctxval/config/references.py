@@ -1,0 +1,232 @@
+"""What ``module:attr`` names: where its module is sought, and what it must be before it is called."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import Any
+
+from ctxval._util.texts import reason_of
+from ctxval.errors import CtxvalError, InputError
+
+_METHODS = {"system": "execute", "model": "step", "synthesizer": "design", "distance": "__call__"}
+"""The method that makes an object a part of an experiment, by kind."""
+
+_added: set[str] = set()
+"""Folders of experiments that were put on the path of modules here."""
+
+
+def reference(text: str, folder: Path | None = None) -> Any:
+    """Import ``module:attr``; this runs the module's code.
+
+    Args:
+        text: the reference.
+        folder: where the module is sought first, before installed ones; the current folder by default. A module in
+            the current folder is not found if another folder is given.
+
+    Raises:
+        InputError: it is no reference, cannot be loaded, is of Python's standard library, or another module of this
+            name is in use already.
+    """
+    module, colon, attribute = text.partition(":")
+    if not (colon and attribute and all(name.isidentifier() for name in module.split("."))):
+        raise InputError(f"a reference must be module:attr, such as 'my_rig:experiment', got {text!r}.")
+    with _sought_in(os.path.realpath(folder or _here())) as home:
+        _require_place(text, module.partition(".")[0], home)
+        _require_apart(text, home)
+        try:
+            return getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError, ValueError, TypeError) as error:
+            raise InputError(f"{text} cannot be loaded: {error}.") from error
+        except CtxvalError:
+            raise
+        except Exception as error:
+            raise InputError(f"{module} failed while it was loaded: {reason_of(error)}.") from error
+
+
+@contextmanager
+def _sought_in(home: str) -> Iterator[str]:
+    """Put a folder first on the path of modules, where it stays: a module may import others when it is called.
+
+    Meanwhile neither the current folder, which ``python -m`` puts there, nor that of another experiment is searched.
+    """
+    before = list(sys.path)
+    if home not in before:
+        _added.add(home)
+    sys.path[:] = [home, *(entry for entry in before if _is_searched(entry, home))]
+    try:
+        yield home
+    finally:
+        sys.path.extend(entry for entry in before if entry not in sys.path)
+
+
+def _is_searched(entry: str, home: str) -> bool:
+    real, wanted = os.path.realpath(entry or _here()), os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    if real in {os.path.realpath(path) for path in wanted if path}:
+        return True
+    return real not in {home, os.path.realpath(_here()), *_added}
+
+
+def _here() -> str:
+    try:
+        return os.getcwd()
+    except OSError:  # it was deleted
+        return os.devnull
+
+
+def _require_place(text: str, module: str, home: str) -> None:
+    """Check that importing a top-level module gives the one that would be found now, and none that was loaded before.
+
+    Raises:
+        InputError: it is not found, or is another.
+    """
+    importlib.invalidate_caches()
+    found = _found(module)
+    own = found is not None and os.path.dirname(found) in (home, os.path.join(home, module))
+    if module in sys.stdlib_module_names and not own:
+        raise InputError(f"{text} is of Python's standard library, which has no part of an experiment.")
+    loaded = sys.modules.get(module)
+    if loaded is None:
+        if found is None:
+            raise InputError(
+                f"{text} cannot be loaded: no module named {module!r} is in {home} or installed; what an experiment "
+                "file names is sought in the file's folder, and elsewhere what is named is sought in the current one."
+            )
+        return
+    used = _place(getattr(loaded, "__file__", None), getattr(loaded, "__path__", None))
+    if used is not None and used != found:
+        other = f"none of this name is in {home} or installed" if found is None else f"the one that is meant is {found}"
+        raise _in_use(text, module, used, other)
+
+
+def _require_apart(text: str, home: str) -> None:
+    """Check that no module of another experiment's folder would be taken for one of this folder by those it imports.
+
+    Raises:
+        InputError: a module of the same name is in use from there.
+    """
+    others = _added - {home}
+    for name, loaded in list(sys.modules.items()):
+        used = getattr(loaded, "__file__", None)
+        folder = os.path.dirname(used or "")
+        if "." in name or used is None or not {folder, os.path.dirname(folder)} & others:
+            continue
+        if PathFinder.find_spec(name, [home]) is not None:
+            raise _in_use(text, name, used, f"there is one in {home} too")
+
+
+def _in_use(text: str, name: str, used: str, other: str) -> InputError:
+    return InputError(
+        f"{text} cannot be loaded: a module named {name!r} is in use already, {used}, and {other}; give one of them "
+        "another name, or use another process."
+    )
+
+
+def _found(module: str) -> str | None:
+    """Return the file or folder that would be imported; None if there is none, as for what is built into Python."""
+    for finder in sys.meta_path:
+        spec = finder.find_spec(module, None)
+        if spec is not None:
+            return _place(spec.origin if spec.has_location else None, spec.submodule_search_locations)
+    return None
+
+
+def _place(file: str | None, folders: Any) -> str | None:
+    where = file or next(iter(folders or ()), None)
+    return None if where is None else os.path.realpath(where)
+
+
+# What is expected of it
+
+
+def require_part(kind: str, what: str, found: Any) -> Any:
+    """Return an object or a class if it has the method of its kind, a model or a distance also if it is a function.
+
+    Args:
+        kind: system, model, synthesizer or distance.
+        what: how the object is called in the message.
+        found: the object or the class, which is not called here.
+
+    Raises:
+        InputError: it has not.
+    """
+    method = _METHODS[kind]
+    if isinstance(found, type):
+        has = any(callable(vars(base).get(method)) for base in found.__mro__)
+    elif kind == "distance":
+        has = is_function(found) and accepts(found, 3)
+    else:
+        has = callable(getattr(found, method, None)) or (kind == "model" and is_function(found) and accepts(found, 2))
+    if not has:
+        if kind == "distance":
+            wanted = "a function (model_trajectory, system_trajectory, task) -> d written in Python"
+            raise InputError(f"{what} must be {wanted}, got {_named(found)}.")
+        raise InputError(f"{what} must be a {kind}, got {_named(found)}, which has no {method}.")
+    return found
+
+
+def require_function(what: str, found: Any, count: int, form: str) -> Any:
+    """Return a function that takes so many arguments; it is not called here.
+
+    Args:
+        what: how it is called in the message.
+        found: the function.
+        count: of its positional arguments.
+        form: how the message describes it, such as ``p -> Task``.
+
+    Raises:
+        InputError: it is no function written in Python, or takes other arguments.
+    """
+    if not is_function(found):
+        raise InputError(f"{what} must be a function {form} written in Python, got {_named(found)}.")
+    if not accepts(found, count):
+        raise InputError(f"{what} must be a function {form}; it takes {inspect.signature(found)}.")
+    return found
+
+
+def is_function(found: Any) -> bool:
+    """Return whether it is a function written in Python, or an object whose class has such a ``__call__``.
+
+    Builtin functions and methods of other libraries' objects are none: they are no part of anybody's experiment.
+    """
+    if isinstance(found, functools.partial):
+        return is_function(found.func)
+    if inspect.isfunction(_unwrapped(found)):
+        return True
+    if isinstance(found, type):
+        return False
+    return any(inspect.isfunction(_unwrapped(vars(base).get("__call__"))) for base in type(found).__mro__)
+
+
+def _unwrapped(found: Any) -> Any:
+    """Return the function below decorators such as those of compilers."""
+    try:
+        return inspect.unwrap(found)
+    except (ValueError, AttributeError):
+        return found
+
+
+def accepts(function: Any, count: int, /, **named: Any) -> bool:
+    """Return whether a function can be called with so many positional arguments, and with these named ones."""
+    try:
+        inspect.signature(function).bind(*range(count), **named)
+    except TypeError:
+        return False
+    except ValueError:  # it does not say
+        return True
+    return True
+
+
+def _named(found: Any) -> str:
+    if isinstance(found, type):
+        return f"the class {found.__module__}.{found.__qualname__}"
+    if inspect.isroutine(found):
+        return f"the {'function' if inspect.isfunction(found) else 'builtin or method'} {found.__name__}"
+    return f"an object of the class {type(found).__module__}.{type(found).__qualname__}"

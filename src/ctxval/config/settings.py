@@ -1,0 +1,417 @@
+"""Experiments by name: cases, experiment files and ``module:attr`` references."""
+
+from __future__ import annotations
+
+import importlib
+import shlex
+import tomllib
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import PydanticCustomError
+
+from ctxval import cases
+from ctxval._util.texts import reason_of
+from ctxval.campaign.campaign import Campaign
+from ctxval.certificates import KINDS, RESOLUTION, USES, require_use
+from ctxval.certificates.verdict import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME
+from ctxval.config.parts import argument, part, require_types, space_of, task_function
+from ctxval.config.references import accepts, is_function, reference
+from ctxval.config.signatures import code_named, signed, unsigned, verifies
+from ctxval.core.experiment import Experiment, labels_of
+from ctxval.core.validation import Validation
+from ctxval.errors import CertificateError, CtxvalError, InputError, UnknownNameError
+from ctxval.searches import NAMES as SEARCHES
+from ctxval.searches import Search, by_name
+from ctxval.storage.store import Store
+
+DEFAULT_SEARCH = "auto"
+
+
+class SearchTable(BaseModel):
+    """The table ``[search]``: a name, and the options of that search.
+
+    Attributes:
+        name: of the search.
+        repeats: how often each task is executed, of a noisy system.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    name: str = DEFAULT_SEARCH
+    repeats: int = Field(default=1, ge=1)
+
+    def build(self, folder: Path | None = None) -> Search:
+        """Return the search; modules that its options name are sought in the folder, the current one by default.
+
+        Raises:
+            UnknownNameError: there is no such search.
+            InputError: it does not take these options.
+        """
+        options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
+        if self.name in SEARCHES:
+            options = require_types(f"search {self.name!r}", SEARCHES[self.name], options)
+        return by_name(self.name, repeats=self.repeats, **options)
+
+
+class CertificateTable(BaseModel):
+    """The table ``[certificate]``: what a validation is to rest on, chosen before it is run.
+
+    Attributes:
+        kind: which certificate.
+        stochastic: whether two executions of one task may differ.
+        volume: share of the task space that may exceed the threshold.
+        resolution: how far from every trial a task may be, in diagonals of the task space.
+        discard, constant: of some kinds.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    kind: str = "posterior"
+    stochastic: bool = False
+    volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
+    resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
+    discard: int | None = Field(default=None, ge=0)
+    constant: float | None = None
+
+    @field_validator("kind")
+    @classmethod
+    def _known(cls, kind: str) -> str:
+        if kind not in KINDS:
+            raise PydanticCustomError("kind", f"the kind must be one of {', '.join(KINDS)}")
+        return kind
+
+    @model_validator(mode="after")
+    def _used(self) -> CertificateTable:
+        changed = {name for name in USES if hasattr(self, name) and getattr(self, name) != _default(self, name)}
+        try:
+            require_use(self.kind, sorted(changed))
+        except CertificateError as error:
+            raise PydanticCustomError("use", str(error).removesuffix(".")) from error
+        return self
+
+
+def _default(table: BaseModel, name: str) -> Any:
+    return type(table).model_fields[name].default
+
+
+Part = str | dict[str, Any]
+"""``module:attr``, or a table with a type and its arguments."""
+
+_WHOLE = ("space", "task", "system", "model", "synthesizer")
+
+
+class Settings(BaseModel):
+    """What to run: the content of an experiment file, with the command line's options over it.
+
+    It names an experiment that is made elsewhere, or describes the whole of it.
+
+    Attributes:
+        experiment: a case, or ``module:attr`` of an experiment or of a function of a seed that makes one.
+        options: passed on to the case or function.
+        name: of an experiment that is described here, and so are
+        space: ``name = [low, high, "unit"]`` of each task parameter,
+        task: ``module:attr`` of a function, or a table of an initial state, a goal, a horizon and a time step,
+        system, model, synthesizer, distance: ``module:attr``, or a table with a type and its arguments,
+        states, inputs: names and units,
+        units: of the distance.
+        budget, threshold, seed, store: None where the experiment decides.
+        confidence: of a validation.
+        certificate: what a validation rests on.
+        search: which search, and its options.
+        folder: where modules and files are sought, that of the experiment file; the current one if it is not known.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    experiment: str | None = None
+    options: dict[str, Any] = Field(default_factory=dict)
+    name: str | None = None
+    space: dict[str, list[Any]] | None = None
+    task: Part | None = None
+    system: Part | None = None
+    model: Part | None = None
+    synthesizer: Part | None = None
+    distance: Part | None = None
+    states: dict[str, str] = Field(default_factory=dict)
+    inputs: dict[str, str] = Field(default_factory=dict)
+    units: str | None = None
+    budget: int | None = Field(default=None, ge=1)
+    threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
+    confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
+    certificate: CertificateTable = Field(default_factory=CertificateTable)
+    seed: int = Field(default=0, ge=0)
+    store: Path | None = None
+    search: SearchTable = Field(default_factory=SearchTable)
+    folder: Path | None = None
+
+    def load(self) -> Experiment:
+        """Return the experiment.
+
+        Raises:
+            InputError: it cannot be found or made.
+        """
+        if self.experiment is None:
+            return self._described()
+        given = [name for name in (*_WHOLE, "distance", "name") if getattr(self, name) is not None]
+        if given:
+            raise InputError(
+                f"an experiment that is made elsewhere has its own {given[0]}; leave it out, or experiment."
+            )
+        if "seed" in self.options:
+            raise InputError("the seed stands beside [options], not in it.")
+        if ":" in self.experiment:
+            return _from_reference(self.experiment, self.seed, self.options, self.folder)
+        return _case(self.experiment, self.seed, self.options)
+
+    def _described(self) -> Experiment:
+        missing = [name for name in _WHOLE if getattr(self, name) is None]
+        if missing:
+            raise InputError(
+                "the file must name an experiment, as in experiment = 'pendulum', or describe one: "
+                f"it has no {', '.join(missing)}."
+            )
+        if self.options:
+            raise InputError("[options] are for an experiment that is made elsewhere; this file describes its own.")
+        space, system = space_of(self.space or {}), part("system", self.system or {}, self.folder)
+        validation = Validation(
+            space=space,
+            task=task_function(self.task or {}, space, system, self.folder),
+            system=system,
+            model=part("model", self.model or {}, self.folder),
+            synthesizer=part("synthesizer", self.synthesizer or {}, self.folder),
+            distance=part("distance", self.distance or "FinalState", self.folder),
+        )
+        return Experiment(
+            self.name or "experiment",
+            validation,
+            units=self.units or "",
+            states=labels_of(self.states),
+            inputs=labels_of(self.inputs),
+        )
+
+    def campaign(
+        self,
+        experiment: Experiment,
+        store: Store | Path,
+        *,
+        accept_change: str | None = None,
+        remeasure: bool = False,
+    ) -> Campaign:
+        """Return the campaign of what :meth:`load` gave, into a store that then knows how it was made.
+
+        Args:
+            experiment: of these settings.
+            store: the store, or where it is.
+            accept_change, remeasure: as :class:`ctxval.Campaign` takes them.
+
+        What the store is told is signed by this user, so that its code is run again without a question.
+
+        Raises:
+            StoreError: the store cannot be used, or was made by another experiment.
+            InputError: there is no such search, or the key of this user is damaged.
+        """
+        search = self.search.build(self.folder)
+        campaign = Campaign(
+            experiment.validation,
+            search=search,
+            store=store,
+            seed=self.seed,
+            name=experiment.name,
+            accept_change=accept_change,
+            remeasure=remeasure,
+        )
+        plain = self.model_dump(mode="json", exclude={"store"})
+        if self.folder is None and code_named(plain):
+            plain["folder"] = str(Path().resolve())  # from where it is just now
+        campaign.store.keep_settings(signed(plain, campaign.store.settings()))
+        return campaign
+
+    def certified_as(self, stated: dict[str, Any]) -> Settings:
+        """Return these settings with what the command line states of the certificate over what the file says.
+
+        Raises:
+            InputError: a value is not allowed.
+        """
+        try:
+            table = CertificateTable.model_validate({**self.certificate.model_dump(), **stated})
+        except ValidationError as error:
+            raise InputError(_sentence("certificate", error)) from error
+        return self.model_copy(update={"certificate": table})
+
+    def store_path(self, name: str) -> Path:
+        """Return where the trials go: the given store, or a file under ``runs/`` named after what is run."""
+        if self.store is not None:
+            return self.store
+        options = [f"{key}-{value}" for key, value in self.options.items()]
+        return Path("runs") / f"{'-'.join([name, *options, self.search.name])}-seed{self.seed}.sqlite"
+
+
+def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
+    """Return what to run, from a case's name, an experiment file or ``module:attr``.
+
+    Args:
+        target: ``pendulum``, ``experiment.toml`` or ``my_module:my_experiment``.
+        overrides: options of the command line, over what the file says; None where not given.
+
+    Raises:
+        InputError: the file cannot be read, or a value in it is not allowed; the message names it.
+    """
+    is_file = target.endswith(".toml")
+    content = _read_toml(Path(target)) if is_file else {"experiment": target}
+    if "folder" in content:
+        raise InputError(f"{target}: no setting is called 'folder'; what the file names is sought beside it.")
+    if "experiment" not in content and not any(key in content for key in _WHOLE):
+        raise InputError(
+            f"{target} must say what to run: experiment = 'pendulum', or 'module:attr', or the whole of it."
+        )
+    given = {key: value for key, value in overrides.items() if value is not None}
+    options = {**_table(content, "options"), **given.pop("options", {})}
+    search = _table(content, "search")
+    named = given.pop("search", None)
+    if named is not None and named != search.get("name", DEFAULT_SEARCH):
+        search = {"name": named}  # the options in the file were those of another search
+    whole = {**content, **given, "options": options, "search": search}
+    if is_file or ":" in target:
+        whole["folder"] = (Path(target).parent if is_file else Path()).resolve()
+    try:
+        return Settings.model_validate(whole)
+    except ValidationError as error:
+        raise InputError(_sentence(target, error)) from error
+
+
+def stored_settings(store: Store) -> Settings:
+    """Return what was run into a store, whoever wrote it; its code may be built only by :func:`trusted_settings`.
+
+    Raises:
+        InputError: the store does not say it, or what it says is not allowed.
+    """
+    return _of_store(store.settings())
+
+
+def _of_store(kept: dict[str, Any]) -> Settings:
+    if not kept:
+        raise InputError(
+            "the store does not say what was run into it, as it was not made by a command; name its experiment where a "
+            "command needs it: --experiment FILE.toml."
+        )
+    try:
+        return Settings.model_validate(unsigned(kept))
+    except ValidationError as error:
+        raise InputError(_sentence("the store's settings", error)) from error
+
+
+def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool = False) -> Settings:
+    """Return the settings from which a store's experiment may be built.
+
+    Args:
+        store: the store; if its settings name code, this user must have signed them.
+        experiment: a case, a file or ``module:attr`` that the user names instead. The seed remains the store's, and so
+            does the search if it names no code.
+        trust: take the store's settings whoever wrote them.
+
+    Raises:
+        InputError: the settings name code, and nobody says that they may; the message shows what would be run.
+    """
+    kept = store.settings()
+    if experiment is not None:
+        return _named_again(kept, experiment)
+    settings, code = _of_store(kept), code_named(kept)
+    if not code or (settings.folder is not None and verifies(kept)):
+        return settings
+    folder = settings.folder or Path().resolve()
+    if trust:
+        return settings.model_copy(update={"folder": folder})
+    more = f" and {len(code) - _SHOWN} more" if len(code) > _SHOWN else ""
+    raise InputError(
+        f"{store.path} would import or run code: {'; '.join(code[:_SHOWN])}{more}, sought in "
+        f"{ascii(str(folder))[:200]}. You did not make the store on this computer, or it was changed since, or an "
+        "older version made it. If you know what it is of, say so by --experiment FILE.toml (or module:attr); if you "
+        "trust what it names, say --trust. The store is then signed for you, and you are not asked again."
+    )
+
+
+_SHOWN = 8
+"""Things that would be imported or run which are shown: as many as a message has room for."""
+
+
+def _named_again(kept: dict[str, Any], experiment: str) -> Settings:
+    settings = read_settings(experiment, {})
+    try:
+        stored = _of_store(kept)
+    except InputError:
+        return settings
+    same: dict[str, Any] = {"seed": stored.seed}
+    if not code_named({"search": kept.get("search", {})}):
+        same["search"] = stored.search
+    return settings.model_copy(update=same)
+
+
+def _table(content: dict[str, Any], key: str) -> dict[str, Any]:
+    table = content.get(key, {})
+    if not isinstance(table, dict):
+        raise InputError(f"[{key}] must be a table, got {table!r}.")
+    return table
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:
+            return tomllib.load(file)
+    except FileNotFoundError:
+        name = shlex.quote(str(path))
+        raise InputError(
+            f"there is no experiment file {path}; `ctxval init {name}` writes one to begin with."
+        ) from None
+    except OSError as error:
+        raise InputError(f"the experiment file {path} cannot be read: {error.strerror}.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{path} is not valid TOML: {error}.") from error
+
+
+def _sentence(target: str, error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "use":
+        return f"{target}: {first['msg']}."
+    if first["type"] == "extra_forbidden":
+        table = CertificateTable if first["loc"][:-1] == ("certificate",) else Settings
+        return f"{target}: {UnknownNameError.among('setting', str(first['loc'][-1]), table.model_fields)}"
+    return f"{target}: {where}: {first['msg'].lower()}, got {str(first['input'])[:100]!r}."
+
+
+def _case(name: str, seed: int, options: dict[str, Any]) -> Experiment:
+    """Return a case; its options are plain values."""
+    if name in cases.NAMES and options:
+        build = importlib.import_module(f"ctxval.cases.{name}").experiment
+        options = require_types(f"case {name!r}", build, options)
+    return cases.by_name(name, seed, **options)
+
+
+def _from_reference(text: str, seed: int, options: dict[str, Any], folder: Path | None) -> Experiment:
+    """Return what ``module:attr`` names or makes; this runs the module's code."""
+    found = reference(text, folder)
+    if is_function(found) and not isinstance(found, Validation | Experiment):
+        found = _called(text, found, seed, options)
+    if isinstance(found, Validation):
+        return Experiment(text.partition(":")[2], found)
+    if not isinstance(found, Experiment):
+        raise InputError(
+            f"{text} must be an Experiment or a Validation, or a function of a seed that makes one, "
+            f"got {type(found).__name__}."
+        )
+    return found
+
+
+def _called(text: str, make: Any, seed: int, options: dict[str, Any]) -> Any:
+    if not accepts(make, 1, **options):
+        given = f" {', '.join(options)}" if options else ""
+        raise InputError(f"{text} must be callable with a seed and its options{given}; it takes {signature(make)}.")
+    try:
+        return make(seed, **options)
+    except CtxvalError:
+        raise
+    except Exception as error:
+        raise InputError(f"{text} failed: {reason_of(error)}.") from error

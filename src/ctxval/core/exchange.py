@@ -1,0 +1,227 @@
+"""Tasks and controllers as files, for a rig or a program that is not this one.
+
+A file is JSON, or for a controller also NPZ with the same names; it says by itself what is in it. Numbers come back
+bit for bit. Nothing in such a file is ever run, and one that is damaged or made up gives an :class:`InputError`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ctxval._util.arrays import Array, as_finite, as_floats
+from ctxval._util.files import read_bytes, read_json
+from ctxval._util.npz import Archive
+from ctxval.core.controller import AffineFeedback, Limits
+from ctxval.core.task import Task
+from ctxval.errors import InputError, ShapeError
+
+CONTROLLER_FORMAT, TASK_FORMAT, VERSION = "ctxval controller", "ctxval task", 1
+
+LAW = "u = min(max(inputs[t] + gains[t] (x - states[t]), low), high) at the steps t = 0, ..., horizon - 1"
+
+Content = TypeVar("Content")
+
+Names = Mapping[str, str]
+"""The names of states or inputs, and their units."""
+
+_UNREADABLE = (
+    *(ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, MemoryError, RecursionError),
+)
+"""What is raised for content of other types than are expected."""
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerFile:
+    """A controller as it was read from a file.
+
+    Attributes:
+        controller: the feedback of one task.
+        dt: seconds in a step.
+        states, inputs: names and units, in the order of the components.
+    """
+
+    controller: AffineFeedback
+    dt: float
+    states: dict[str, str]
+    inputs: dict[str, str]
+
+
+def write_controller(
+    path: str | Path, controller: Any, *, dt: float, states: Names | None = None, inputs: Names | None = None
+) -> None:
+    """Write the controller of one task as ``.json`` or ``.npz``.
+
+    Args:
+        path: the file; its suffix says which kind.
+        controller: affine feedback, such as LQR and iLQR design.
+        dt: seconds in a step.
+        states, inputs: names and units of the components; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
+
+    Raises:
+        InputError: the controller is of another kind, of a batch or not finite, or the file cannot be written.
+    """
+    if not isinstance(controller, AffineFeedback):
+        raise InputError(
+            f"only affine feedback, such as LQR and iLQR design, can be written to a file, got {controller!r}."
+        )
+    if controller.gains.ndim != 3 or controller.inputs.ndim != 2:
+        raise ShapeError(f"a file holds the controller of one task, got gains of shape {controller.gains.shape}.")
+    horizon, m, n = controller.gains.shape
+    about = {
+        "format": CONTROLLER_FORMAT,
+        "version": VERSION,
+        "law": LAW,
+        "dt": _seconds(dt),
+        "horizon": horizon,
+        **_named("state", states, n),
+        **_named("input", inputs, m),
+    }
+    arrays = {
+        "gains": as_finite("the controller's gains", controller.gains),
+        "inputs": as_finite("the controller's inputs", controller.inputs),
+        "states": as_finite("the controller's states", controller.states[:horizon]),
+    }
+    if controller.limits is not None:
+        limits = Limits.of(controller.limits, m)
+        arrays |= {"low": limits.low, "high": limits.high}
+    _write(Path(path), about, arrays)
+
+
+def read_controller(path: str | Path) -> ControllerFile:
+    """Read a controller from a ``.json`` or ``.npz`` file.
+
+    Raises:
+        InputError: the file is none, or damaged; the message says what is wrong.
+    """
+    return _read(Path(path), CONTROLLER_FORMAT, _controller)
+
+
+def write_task(path: str | Path, task: Task, *, states: Names | None = None) -> None:
+    """Write one task as JSON: its initial state, reference, horizon and time step.
+
+    Raises:
+        ShapeError: it is a batch.
+        InputError: the file cannot be written.
+    """
+    if task.batch_shape:
+        raise ShapeError(f"a file holds one task, got a batch of shape {task.batch_shape}.")
+    about = {
+        "format": TASK_FORMAT,
+        "version": VERSION,
+        "dt": task.dt,
+        "horizon": task.horizon,
+        **_named("state", states, task.initial_state.size),
+    }
+    _write(Path(path), about, {"initial_state": task.initial_state, "reference": task.reference})
+
+
+def read_task(path: str | Path) -> Task:
+    """Read one task from a JSON file.
+
+    Raises:
+        InputError: the file is none, or damaged; the message says what is wrong.
+    """
+    return _read(Path(path), TASK_FORMAT, _task)
+
+
+def _write(path: Path, about: dict[str, Any], arrays: Mapping[str, Array]) -> None:
+    try:
+        if path.suffix == ".npz":
+            with path.open("wb") as file:
+                np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
+        elif path.suffix == ".json":
+            content = about | {name: _listed(array) for name, array in arrays.items()}
+            lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in content.items())
+            path.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+        else:
+            raise InputError(f"the file must end in .json or .npz, got {str(path)!r}.")
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _read(path: Path, expected: str, build: Callable[[Mapping[str, Any]], Content]) -> Content:
+    try:
+        content = _npz_content(path) if path.suffix == ".npz" else read_json(path)
+        if not isinstance(content, Mapping):
+            raise InputError("it must be an object with names.")
+        if content["format"] != expected:
+            raise InputError(f"its format must be {expected!r}, got {str(content['format'])[:40]!r}.")
+        if content["version"] != VERSION:
+            raise InputError(f"this version of ctxval reads version {VERSION}, got {str(content['version'])[:40]}.")
+        return build(content)
+    except _UNREADABLE as error:
+        reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {str(error)[:100]}"
+        raise InputError(f"{path} cannot be read as a {expected}: {reason.removesuffix('.')}.") from error
+
+
+def _npz_content(path: Path) -> Any:
+    arrays = Archive(read_bytes(path))
+    about = json.loads(arrays.text("about"))
+    return {**about, **{name: arrays.numbers(name) for name in arrays.names if name != "about"}}
+
+
+def _controller(content: Mapping[str, Any]) -> ControllerFile:
+    gains, inputs, states = (as_finite(name, content[name]) for name in ("gains", "inputs", "states"))
+    if gains.ndim != 3 or inputs.shape != gains.shape[:2] or states.shape != (len(gains), gains.shape[2]):
+        raise ShapeError(
+            "it needs gains (H, m, n), inputs (H, m) and states (H, n), "
+            f"got {gains.shape}, {inputs.shape} and {states.shape}."
+        )
+    horizon, m, n = gains.shape
+    if content["horizon"] != horizon:
+        raise InputError(f"it says that its horizon is {str(content['horizon'])[:40]}, its gains are {horizon}.")
+    limits = None
+    if content.get("low") is not None or content.get("high") is not None:
+        limits = Limits.of(Limits(_bound(content["low"], -np.inf), _bound(content["high"], np.inf)), m)
+    return ControllerFile(
+        AffineFeedback(gains, inputs, states, limits),
+        _seconds(content["dt"]),
+        _names("state", content, n),
+        _names("input", content, m),
+    )
+
+
+def _task(content: Mapping[str, Any]) -> Task:
+    return Task(
+        as_finite("initial_state", content["initial_state"]),
+        horizon=content["horizon"],
+        dt=content["dt"],
+        reference=content["reference"],
+    )
+
+
+def _listed(array: Array) -> Any:
+    """Return an array as JSON, in which an infinite limit is null."""
+    return [value if np.isfinite(value) else None for value in array.tolist()] if array.ndim == 1 else array.tolist()
+
+
+def _bound(values: Any, infinite: float) -> Array:
+    return as_floats("limits", [infinite if value is None else value for value in values])
+
+
+def _seconds(dt: Any) -> float:
+    if not isinstance(dt, int | float | np.number) or isinstance(dt, bool) or not (np.isfinite(dt) and dt > 0):
+        raise InputError(f"dt must be a positive number of seconds, got {str(dt)[:40]}.")
+    return float(dt)
+
+
+def _named(kind: str, names: Names | None, count: int) -> dict[str, list[str]]:
+    named = {f"{'x' if kind == 'state' else 'u'}{i}": "" for i in range(count)} if names is None else dict(names)
+    if len(named) != count:
+        raise ShapeError(f"there must be {count} names of {kind}s, got {', '.join(named) or 'none'}.")
+    return {f"{kind}_names": list(named), f"{kind}_units": list(named.values())}
+
+
+def _names(kind: str, content: Mapping[str, Any], count: int) -> dict[str, str]:
+    names, units = content[f"{kind}_names"], content[f"{kind}_units"]
+    if not all(isinstance(text, str) for text in (*names, *units)) or not len(set(names)) == len(units) == count:
+        raise InputError(
+            f"it needs the names and units of {count} {kind}s, got {str(names)[:60]} and {str(units)[:60]}."
+        )
+    return dict(zip(names, units, strict=True))

@@ -1,0 +1,65 @@
+"""A validation with a name, the budget that suits it, and its truth if that can be known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from ctxval.core.truth import Truth
+from ctxval.core.validation import Validation
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """What ``ctxval run`` runs.
+
+    Attributes:
+        name: a short name, for files and displays.
+        validation: the map p -> d(p).
+        budget: executions of S, unless said otherwise.
+        threshold: tau, unless said otherwise; no verdict without one.
+        truth: finds d*, for simulated systems.
+        units: the distance's units.
+        states, inputs: names of the states and inputs with their units, for pictures.
+    """
+
+    name: str
+    validation: Validation
+    budget: int = 25
+    threshold: float | None = None
+    truth: Callable[[], Truth] | None = None
+    units: str = ""
+    states: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+
+    def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
+        """Return the names of n states and m inputs with their units, for files.
+
+        They are those of the experiment, or of its system; ``x0, x1, ...`` and ``u0, u1, ...`` where neither says.
+        """
+        system = self.validation.system
+        return (
+            _named(self.states, getattr(system, "states", None), "x", states),
+            _named(self.inputs, getattr(system, "inputs", None), "u", inputs),
+        )
+
+
+def _named(labels: tuple[str, ...], own: object, letter: str, count: int) -> dict[str, str]:
+    if len(labels) == count and len({_parted(label)[0] for label in labels}) == count:
+        return dict(_parted(label) for label in labels)
+    if isinstance(own, Mapping) and len(own) == count:
+        return {str(name): str(unit) for name, unit in own.items()}
+    if isinstance(own, list | tuple) and len(set(map(str, own))) == count:
+        return {str(name): "" for name in own}
+    return {f"{letter}{i}": "" for i in range(count)}
+
+
+def labels_of(named: Mapping[str, str]) -> tuple[str, ...]:
+    """Return ``name [unit]`` for each name and its unit, the name alone where there is none."""
+    return tuple(f"{name} [{unit}]" if unit else name for name, unit in named.items())
+
+
+def _parted(label: str) -> tuple[str, str]:
+    """Return the name and the unit of ``name [unit]``."""
+    name, _, unit = label.partition("[")
+    return name.strip(), unit.strip().removesuffix("]")

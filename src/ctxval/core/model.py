@@ -1,0 +1,83 @@
+"""The learned model M, and its linearisation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval.errors import InputError, ModelError
+
+Step = Callable[[Array, Array], Array]
+
+
+@runtime_checkable
+class Model(Protocol):
+    """A learned abstraction M of the system, cheap to run.
+
+    A model that can differentiate itself also has ``jacobian(x, u) -> (A, B)``, shapes ``(..., n, n)`` and
+    ``(..., n, m)``, or without the batch axes where they do not depend on x and u.
+    """
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
+
+
+class Function:
+    """A plain function ``(x, u) -> x_next`` as a model.
+
+    Args:
+        step: called with one state ``(n,)`` and one input ``(m,)`` at a time, unless ``vectorized``, where it is
+            called with whole batches ``(..., n)`` and ``(..., m)``.
+    """
+
+    def __init__(self, step: Step, *, vectorized: bool = False) -> None:
+        if not callable(step):
+            raise InputError(f"a model must have a step method or be a function (x, u) -> x_next, got {step!r}.")
+        self.function = step
+        self.vectorized = vectorized
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
+        if self.vectorized or x.ndim == 1:
+            return np.asarray(self.function(x, u), dtype=np.float64)
+        batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+        states = np.broadcast_to(x, (*batch, x.shape[-1])).reshape(-1, x.shape[-1])
+        inputs = np.broadcast_to(u, (*batch, u.shape[-1])).reshape(-1, u.shape[-1])
+        rows = [np.asarray(self.function(xi, ui), dtype=np.float64) for xi, ui in zip(states, inputs, strict=True)]
+        return np.stack(rows).reshape(*batch, -1)
+
+
+def as_model(model: Model | Step) -> Model:
+    """Return a model as it is, and a plain function as a model."""
+    return model if isinstance(model, Model) else Function(model)
+
+
+def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
+    """Return the Jacobians A = df/dx and B = df/du of a model at (x, u).
+
+    Its own ``jacobian`` if it has one, central differences otherwise. Shapes ``(..., n), (..., m) ->
+    (..., n, n), (..., n, m)``; the batch axes may be missing where the Jacobians do not depend on them.
+
+    Raises:
+        ModelError: they are not finite.
+    """
+    jacobian = getattr(model, "jacobian", None)
+    A, B = jacobian(x, u) if jacobian is not None else _central_differences(model, x, u)
+    if not (np.isfinite(A).all() and np.isfinite(B).all()):
+        raise ModelError("the model's Jacobian is not finite along its own trajectory.")
+    return A, B
+
+
+def _central_differences(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
+    n = x.shape[-1]
+    z = np.concatenate([x, u], axis=-1)
+    # The cube root of the machine precision balances truncation against rounding.
+    h = np.cbrt(np.finfo(np.float64).eps) * np.maximum(1.0, np.abs(z))
+    moves = np.eye(z.shape[-1]) * h[..., None, :]
+    up, down = z[..., None, :] + moves, z[..., None, :] - moves
+    difference = model.step(up[..., :n], up[..., n:]) - model.step(down[..., :n], down[..., n:])
+    jacobian = np.swapaxes(difference / (2 * h[..., :, None]), -1, -2)
+    return jacobian[..., :n], jacobian[..., n:]

@@ -1,0 +1,236 @@
+"""The task space P: a named box of parameters, and its map to the unit cube."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats, require_shape
+from ctxval.errors import InputError, ShapeError, UnknownNameError
+
+Point = float | list[float]
+
+
+class Parameters:
+    """Task parameters p by name, one task or a batch of tasks.
+
+    ``p.goal`` is a scalar parameter, shape ``(...)``; ``p.amplitudes`` a vector one, shape ``(..., k)``.
+    """
+
+    __slots__ = ("_space", "points")
+
+    def __init__(self, space: TaskSpace, points: Array) -> None:
+        self._space = space
+        self.points = points
+        """The parameters as rows, shape ``(..., d)``, in the space's own units."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return self[name]
+
+    def __getitem__(self, name: str) -> Any:
+        columns = self._space.columns(name)
+        if isinstance(columns, int):
+            return self.points[..., columns]
+        return self.points[..., columns]
+
+    def __repr__(self) -> str:
+        return (
+            f"Parameters({self._space.describe_point(self.points)})" if self.points.ndim == 1 else "Parameters(batch)"
+        )
+
+
+class TaskSpace:
+    """A named box of task parameters.
+
+    Each keyword is ``name=(low, high)`` or ``name=(low, high, "unit")``; arrays as bounds make a vector parameter.
+
+    >>> space = TaskSpace(goal=(-3.14, 3.14, "rad"), offset=([0, 0], [1, 2]))
+    >>> space.names
+    ('goal', 'offset[0]', 'offset[1]')
+
+    Raises:
+        InputError: no parameter at all; a name that is taken; bounds reversed, equal, NaN or infinite.
+    """
+
+    def __init__(self, **bounds: tuple[Any, ...]) -> None:
+        if not bounds:
+            raise InputError("a task space needs at least one parameter, such as TaskSpace(goal=(-1, 1)).")
+        self._columns: dict[str, int | slice] = {}
+        self._units: dict[str, str] = {}
+        names: list[str] = []
+        lows: list[Array] = []
+        highs: list[Array] = []
+        for name, bound in bounds.items():
+            if name == "points" or name.startswith("_"):
+                raise InputError(f"a task parameter cannot be called {name!r}; that name is taken.")
+            low, high, self._units[name] = _bounds(name, bound)
+            start = len(names)
+            if low.ndim == 0:
+                self._columns[name] = start
+                names.append(name)
+            else:
+                self._columns[name] = slice(start, start + low.size)
+                names.extend(f"{name}[{i}]" for i in range(low.size))
+            lows.append(np.atleast_1d(low))
+            highs.append(np.atleast_1d(high))
+        self.names: tuple[str, ...] = tuple(names)
+        self.low: Array = np.concatenate(lows)
+        self.high: Array = np.concatenate(highs)
+        self._decimals = _decimals(self.low, self.high)
+
+    @property
+    def dimension(self) -> int:
+        """The number of scalar parameters, the paper's |P|."""
+        return len(self.names)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The unit of each parameter by its name, empty if it has none."""
+        return dict(self._units)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """One axis label a scalar parameter: its name and its unit."""
+        units = [self._units[name.partition("[")[0]] for name in self.names]
+        return tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, units, strict=True))
+
+    def __repr__(self) -> str:
+        inside = ", ".join(
+            f"{name}=({low:g}, {high:g})" for name, low, high in zip(self.names, self.low, self.high, strict=True)
+        )
+        return f"TaskSpace({inside})"
+
+    def describe(self) -> dict[str, list[float | str]]:
+        """Return ``{scalar name: [low, high]}``, and the unit if it has one: what identifies this space in a store."""
+        units = (self._units[name.partition("[")[0]] for name in self.names)
+        return {
+            name: [float(low), float(high), *([unit] if unit else [])]
+            for name, low, high, unit in zip(self.names, self.low, self.high, units, strict=True)
+        }
+
+    def columns(self, name: str) -> int | slice:
+        """Return where a parameter stands in a row of points.
+
+        Raises:
+            UnknownNameError: the space has no such parameter.
+        """
+        try:
+            return self._columns[name]
+        except KeyError:
+            raise UnknownNameError.among("task parameter", name, self._columns) from None
+
+    # Between points, the unit cube and names
+
+    def to_unit(self, points: ArrayLike) -> Array:
+        """Map points ``(..., d)`` of the space to the unit cube."""
+        rows = require_shape("points", as_floats("points", points), (self.dimension,))
+        return (rows - self.low) / (self.high - self.low)
+
+    def from_unit(self, unit: ArrayLike) -> Array:
+        """Map points ``(..., d)`` of the unit cube to the space; of numbers that are one point there, the shortest."""
+        rows = require_shape("points", as_floats("points", unit), (self.dimension,))
+        points = np.clip(self.low + rows * (self.high - self.low), self.low, self.high)
+        # What a person typed as 0.2 comes back as 0.2, and not as 0.19999999999999996.
+        short = np.clip(np.rint(points * self._decimals) / self._decimals + 0.0, self.low, self.high)
+        return np.where((short - self.low) / (self.high - self.low) == rows, short, points)
+
+    def parameters(self, points: ArrayLike) -> Parameters:
+        """Return points ``(..., d)`` of the space as named parameters.
+
+        Raises:
+            ShapeError: the last axis is not d.
+        """
+        return Parameters(self, require_shape("points", as_floats("points", points), (self.dimension,)))
+
+    def point(self, values: Mapping[str, Any]) -> Array:
+        """Return the point ``(d,)`` with these values by name.
+
+        Raises:
+            UnknownNameError: a name is not of this space.
+            ShapeError: a value has not the shape of its parameter.
+            InputError: a name is missing, or a value is outside the box.
+        """
+        point = np.full(self.dimension, np.nan)
+        for name, value in values.items():
+            columns, given = self.columns(name), as_finite(name, value)
+            if given.shape != np.shape(point[columns]):
+                raise ShapeError(f"{name} must have shape {np.shape(point[columns])}, got {given.shape}.")
+            point[columns] = given
+        missing = [name for name, value in zip(self.names, point, strict=True) if np.isnan(value)]
+        if missing:
+            raise InputError(f"no value is given for {', '.join(missing)}.")
+        outside = (point < self.low) | (point > self.high)
+        if outside.any():
+            i = int(np.argmax(outside))
+            raise InputError(
+                f"{self.names[i]} = {point[i]:g} is outside the task space, [{self.low[i]:g}, {self.high[i]:g}]."
+            )
+        return point
+
+    def describe_point(self, point: Array) -> dict[str, Point]:
+        """Return one point ``(d,)`` as ``{name: number or list}``, ready for JSON."""
+        return {name: point[columns].tolist() for name, columns in self._columns.items()}
+
+    def unit_function(self, function: Callable[[Parameters], ArrayLike]) -> Callable[[Array], Array]:
+        """Return a function of named parameters as a function of unit-cube points ``(n, d)``.
+
+        A search knows no parameters, only points: this turns a known distance into its prior mean.
+        """
+
+        def of_points(unit: Array) -> Array:
+            values = as_floats("prior mean", function(self.parameters(self.from_unit(unit))))
+            return np.broadcast_to(values, unit.shape[:-1])
+
+        return of_points
+
+    # Points to look at
+
+    def iid(self, n: int, rng: np.random.Generator) -> Array:
+        """Return n points drawn independently and uniformly, shape ``(n, d)``."""
+        return self.from_unit(rng.random((n, self.dimension)))
+
+    def sobol(self, n: int, seed: int) -> Array:
+        """Return n points of a scrambled Sobol sequence, shape ``(n, d)``."""
+        from scipy.stats import qmc  # imported here: it is slow to load, and few need it
+
+        sampler = qmc.Sobol(self.dimension, rng=np.random.default_rng(seed))
+        return self.from_unit(sampler.random_base2(max(0, int(np.ceil(np.log2(max(n, 1))))))[:n])
+
+    def grid(self, per_axis: int) -> Array:
+        """Return a full grid with both ends, shape ``(per_axis ** d, d)``.
+
+        Raises:
+            InputError: fewer than 2 points an axis.
+        """
+        if per_axis < 2:
+            raise InputError(f"a grid needs at least 2 points an axis, got {per_axis}.")
+        return np.stack(list(self._grid_axes(per_axis)), axis=-1).reshape(-1, self.dimension)
+
+    def _grid_axes(self, per_axis: int) -> Iterator[Array]:
+        axes = [np.linspace(low, high, per_axis) for low, high in zip(self.low, self.high, strict=True)]
+        return iter(np.meshgrid(*axes, indexing="ij"))
+
+
+def _decimals(low: Array, high: Array) -> Array:
+    """Return, for each column, the power of ten whose multiples have twelve digits; it is exact as a float."""
+    digits = np.ceil(np.log10(np.maximum(np.abs(low), np.abs(high))))
+    return np.asarray(10.0 ** np.clip(12 - digits, 0, 22))
+
+
+def _bounds(name: str, bound: Any) -> tuple[Array, Array, str]:
+    if not isinstance(bound, tuple | list) or len(bound) not in (2, 3):
+        raise InputError(f"bounds of {name} must be (low, high) or (low, high, unit), got {bound!r}.")
+    unit = bound[2] if len(bound) == 3 else ""
+    if not isinstance(unit, str):
+        raise InputError(f"the unit of {name} must be a string, got {unit!r}.")
+    low = as_finite(f"lower bound of {name}", bound[0])
+    high = as_finite(f"upper bound of {name}", bound[1])
+    if low.shape != high.shape or low.ndim > 1 or low.size == 0:
+        raise InputError(f"bounds of {name} must be two numbers or two equally long lists, got {bound!r}.")
+    if not (low < high).all():
+        raise InputError(f"bounds of {name} must have low < high, got {bound!r}.")
+    return low, high, unit

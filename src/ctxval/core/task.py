@@ -1,0 +1,104 @@
+"""A task: from where, to where, for how long."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array, as_floats
+from ctxval.errors import InputError, ShapeError
+
+
+class Task:
+    """One control task, or a batch of them.
+
+    Args:
+        initial_state: the n components of the first state, each a number or an array ``(...)`` over the batch;
+            or one array ``(..., n)``.
+        horizon: number of steps H.
+        dt: length of a step, seconds.
+        goal: the state to reach, given like ``initial_state``; a goal is a constant reference.
+        reference: the states to follow, array ``(..., H + 1, n)``; give this or ``goal``, not both.
+
+    Raises:
+        InputError: H is not a positive integer, dt not a positive number, or a value not finite.
+        ShapeError: goal or reference do not fit the initial state.
+    """
+
+    def __init__(self, initial_state: Any, *, horizon: int, dt: float, goal: Any = None, reference: Any = None) -> None:
+        if not isinstance(horizon, int | np.integer) or isinstance(horizon, bool) or horizon < 1:
+            raise InputError(f"horizon must be a positive integer, got {horizon!r}.")
+        if not isinstance(dt, int | float | np.number) or isinstance(dt, bool) or not (np.isfinite(dt) and dt > 0):
+            raise InputError(f"dt must be a positive number of seconds, got {dt!r}.")
+        if goal is not None and reference is not None:
+            raise InputError("a task has a goal or a reference, not both.")
+        self.horizon = int(horizon)
+        self.dt = float(dt)
+        state = _components("initial_state", initial_state)
+        n = state.shape[-1]
+        if goal is not None:
+            target = _components("goal", goal)
+            if target.shape[-1] != n:
+                raise ShapeError(f"goal must have {n} components like initial_state, got {target.shape[-1]}.")
+            target = target[..., None, :]
+        elif reference is not None:
+            target = as_floats("reference", reference)
+            if target.shape[-2:] != (self.horizon + 1, n):
+                raise ShapeError(f"reference must have shape (..., {self.horizon + 1}, {n}), got {target.shape}.")
+        else:
+            target = np.zeros((1, n))
+        if not (np.isfinite(state).all() and np.isfinite(target).all()):
+            raise InputError("a task must have a finite initial_state and a finite goal or reference.")
+        try:
+            self.batch_shape: tuple[int, ...] = np.broadcast_shapes(state.shape[:-1], target.shape[:-2])
+        except ValueError:
+            raise ShapeError(
+                f"goal or reference are of a batch {target.shape[:-2]}, initial_state of another, {state.shape[:-1]}."
+            ) from None
+        self.initial_state: Array = np.broadcast_to(state, (*self.batch_shape, n))
+        """Shape ``(..., n)``."""
+        self.reference: Array = np.broadcast_to(target, (*self.batch_shape, self.horizon + 1, n))
+        """Shape ``(..., H + 1, n)``; all zero if the task has neither goal nor reference."""
+
+    @property
+    def goal(self) -> Array:
+        """The last state of the reference, shape ``(..., n)``."""
+        return self.reference[..., -1, :]
+
+    @property
+    def times(self) -> Array:
+        """Shape ``(H + 1,)``, seconds."""
+        return np.asarray(np.arange(self.horizon + 1) * self.dt)
+
+    def __getitem__(self, index: int) -> Task:
+        """Return one task of the batch."""
+        return Task(self.initial_state[index], horizon=self.horizon, dt=self.dt, reference=self.reference[index])
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies one task in a store."""
+        return {
+            "horizon": self.horizon,
+            "dt": self.dt,
+            "initial_state": self.initial_state.tolist(),
+            "reference": self.reference,
+        }
+
+    def __repr__(self) -> str:
+        return (
+            f"Task(batch={self.batch_shape}, states={self.initial_state.shape[-1]}, "
+            f"horizon={self.horizon}, dt={self.dt:g})"
+        )
+
+
+def _components(name: str, value: Any) -> Array:
+    if isinstance(value, list | tuple) and len(value):
+        parts = [as_floats(f"{name}[{i}]", part) for i, part in enumerate(value)]
+        try:
+            return np.stack(np.broadcast_arrays(*parts), axis=-1)
+        except ValueError:
+            raise ShapeError(f"components of {name} do not fit: shapes {[part.shape for part in parts]}.") from None
+    array = as_floats(name, value)
+    if array.ndim == 0 or array.size == 0:
+        raise ShapeError(f"{name} must be a list of components or an array (..., n), got {value!r}.")
+    return array

@@ -1,0 +1,383 @@
+"""Trajectories of a closed loop, the transitions in them, and their files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Mask, as_floats
+from ctxval._util.files import MOST_BYTES, csv_rows, read_bytes
+from ctxval._util.npz import Archive
+from ctxval._util.texts import guarded, unguarded, visible
+from ctxval.errors import InputError, ShapeError
+
+COMPLETE = "complete"
+
+
+@dataclass(frozen=True, eq=False)
+class Transitions:
+    """Recorded steps of a system: at state x, input u led to x_next.
+
+    Shapes ``(N, n)``, ``(N, m)``, ``(N, n)``.
+
+    Raises:
+        ShapeError: the three do not fit together.
+    """
+
+    x: Array
+    u: Array
+    x_next: Array
+
+    def __post_init__(self) -> None:
+        for name in ("x", "u", "x_next"):
+            array = as_floats(name, getattr(self, name))
+            object.__setattr__(self, name, array)
+        if self.x.ndim != 2 or self.u.ndim != 2 or self.x.shape != self.x_next.shape or len(self.x) != len(self.u):
+            raise ShapeError(
+                "transitions need x (N, n), u (N, m) and x_next (N, n), "
+                f"got {self.x.shape}, {self.u.shape} and {self.x_next.shape}."
+            )
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    @staticmethod
+    def joined(parts: Sequence[Transitions]) -> Transitions:
+        """Return several sets of transitions as one."""
+        return Transitions(
+            np.concatenate([part.x for part in parts]),
+            np.concatenate([part.u for part in parts]),
+            np.concatenate([part.x_next for part in parts]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """What a closed loop did, for one task or a batch of tasks.
+
+    Attributes:
+        times: shape ``(H + 1,)``, seconds.
+        states: shape ``(..., H + 1, n)``.
+        inputs: shape ``(..., H, m)``.
+        ended: how it ended: ``"complete"``, or the reason why it stopped before its horizon.
+
+    Raises:
+        ShapeError: the three arrays do not fit together.
+    """
+
+    times: Array
+    states: Array
+    inputs: Array
+    ended: str = COMPLETE
+
+    def __post_init__(self) -> None:
+        for name in ("times", "states", "inputs"):
+            object.__setattr__(self, name, as_floats(name, getattr(self, name)))
+        _require_fitting(self.times.shape, self.states.shape, self.inputs.shape)
+
+    @property
+    def horizon(self) -> int:
+        """The number of steps H."""
+        return len(self.times) - 1
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """The leading axes; ``()`` for one task."""
+        return self.states.shape[:-2]
+
+    @property
+    def final_state(self) -> Array:
+        """The last state, shape ``(..., n)``."""
+        return self.states[..., -1, :]
+
+    @property
+    def finite(self) -> Mask:
+        """Whether every state and input is finite, shape ``(...)``."""
+        whole = np.isfinite(self.states).all(axis=(-1, -2)) & np.isfinite(self.inputs).all(axis=(-1, -2))
+        return np.asarray(whole)
+
+    def __getitem__(self, index: int) -> Trajectory:
+        """Return one trajectory of the batch; how the batch ended is said of those that are not finite."""
+        one = Trajectory(self.times, self.states[index], self.inputs[index])
+        return one if self.ended == COMPLETE or one.finite.all() else replace(one, ended=self.ended)
+
+    def transitions(self) -> Transitions:
+        """Return every step as a transition, all tasks of a batch in one."""
+        n, m = self.states.shape[-1], self.inputs.shape[-1]
+        return Transitions(
+            self.states[..., :-1, :].reshape(-1, n), self.inputs.reshape(-1, m), self.states[..., 1:, :].reshape(-1, n)
+        )
+
+    # Files
+
+    def to_npz(self) -> bytes:
+        """Return the trajectory as the bytes of an NPZ file."""
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer, times=self.times, states=self.states, inputs=self.inputs, ended=np.array(self.ended)
+        )
+        return buffer.getvalue()
+
+    @staticmethod
+    def from_npz(
+        source: bytes | str | Path, *, shape: tuple[int, int] | None = None, most: int = MOST_BYTES
+    ) -> Trajectory:
+        """Read a trajectory from NPZ bytes or an NPZ file; no code in it is ever run.
+
+        Sizes are compared before any number is read.
+
+        Args:
+            source: the bytes, or a regular file.
+            shape: that the states of a complete trajectory must have, ``(H + 1, n)``; None for any.
+            most: bytes that the file, and the numbers in it, may have.
+
+        Raises:
+            InputError: it is not such a file, or too large.
+            ShapeError: its arrays do not fit together, or to ``shape``.
+        """
+        name = "these bytes" if isinstance(source, bytes) else str(source)
+        try:
+            arrays = Archive(source if isinstance(source, bytes) else read_bytes(source, most), most)
+            ended = arrays.text("ended") if "ended" in arrays else COMPLETE
+            shapes = [arrays.shape(part) for part in _ARRAYS]
+            _require_fitting(*shapes)
+            if shape is not None and ended == COMPLETE and shapes[1] != shape:
+                raise ShapeError(f"the trajectory must have states of shape {shape}, got {shapes[1]}.")
+            times, states, inputs = (arrays.numbers(part) for part in _ARRAYS)
+            return Trajectory(times, states, inputs, ended)
+        except ShapeError:
+            raise
+        except InputError as error:
+            raise InputError(
+                f"{name} cannot be read as a trajectory: an NPZ with times, states and inputs is needed; {error}."
+            ) from error
+
+    def to_csv(
+        self, path: str | Path, *, states: Sequence[str] | None = None, inputs: Sequence[str] | None = None
+    ) -> None:
+        """Write one trajectory as CSV with the columns ``t, x0.., u0..``, or named ones; the last row has no inputs.
+
+        Raises:
+            ShapeError: it is a batch, or there are not as many names as columns.
+        """
+        if self.batch_shape:
+            raise ShapeError(f"a CSV file holds one trajectory, got a batch of shape {self.batch_shape}.")
+        n, m = self.states.shape[-1], self.inputs.shape[-1]
+        header = ["t", *_column_names("x", states, n), *_column_names("u", inputs, m)]
+        with open(path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow([guarded(visible(name)) for name in header])
+            for k, (time, state) in enumerate(zip(self.times.tolist(), self.states.tolist(), strict=True)):
+                row = self.inputs[k].tolist() if k < self.horizon else [""] * m
+                writer.writerow([time, *state, *row])
+
+    @staticmethod
+    def from_csv(
+        path: str | Path,
+        *,
+        states: Sequence[str] | None = None,
+        inputs: Sequence[str] | None = None,
+        most_rows: int | None = None,
+    ) -> Trajectory:
+        """Read one trajectory from CSV with the columns ``t, x0.., u0..``, or with named ones.
+
+        Units in brackets, as in ``angle [rad]``, may be left out, but must agree where both have one. Further columns
+        do not matter, nor do the inputs in the last row.
+
+        Args:
+            path: the file.
+            states, inputs: names of the columns, with units or without; those that are numbered are taken where none of
+                the names is there.
+            most_rows: more rows than these are refused before they are read; None for as many as fit.
+
+        Raises:
+            InputError: the file cannot be read, is no regular file or too large, a column is missing or has another
+                unit, or a cell is no number.
+        """
+        rows = _csv_rows(path)
+        header = [unguarded(name) for name in next(rows, (0, []))[1]]
+        columns = {_bare(name): name for name in header if _bare(name)}
+        # Time stands in its own column; a state may be called "time" all the same.
+        time = columns.get("t") or columns.get("time")
+        x, u = _chosen(path, columns, "x", states), _chosen(path, columns, "u", inputs)
+        if header and (time is None or not x):
+            raise InputError(
+                f"{path} must have the columns t, {', '.join(states or ('x0', '...'))}, "
+                f"{', '.join(inputs or ('u0', '...'))}; it has {_listed(header)}."
+            )
+        return _Columns(path, header, [time or "", *x], u).read(rows, most_rows)
+
+    def resampled(self, times: Array) -> Trajectory:
+        """Return one recorded trajectory at other times after its first: states between, inputs as last applied.
+
+        Args:
+            times: shape ``(H + 1,)``, seconds, from 0 on.
+
+        Raises:
+            InputError: it is a batch, its own times do not increase, or it ends before the last of them.
+        """
+        own, wanted = self.times - self.times[0], as_floats("times", times)
+        if self.batch_shape or not (np.diff(own) > 0).all():
+            raise InputError("only one trajectory whose times increase can be resampled.")
+        if not own[-1] >= wanted[-1] - _TIMES * (wanted[1] - wanted[0]):
+            raise InputError(f"the recording ends after {own[-1]:g} s, and {wanted[-1]:g} s are needed.")
+        states = np.stack([np.interp(wanted, own, column) for column in self.states.T], axis=-1)
+        # A sample that was meant for a time may have been taken just after it.
+        slack = 1e-6 * (wanted[1] - wanted[0])
+        held = np.clip(np.searchsorted(own, wanted[:-1] + slack, side="right") - 1, 0, self.horizon - 1)
+        return Trajectory(wanted, states, self.inputs[held], self.ended)
+
+
+_TIMES = 0.01
+"""By how much the times of a recording may miss a task's, in steps."""
+
+
+def require_times(trajectory: Trajectory, times: Array) -> None:
+    """Check that a trajectory has these times ``(H + 1,)``, counted from its first.
+
+    Raises:
+        InputError: it has another number of them or another step; the message says which.
+    """
+    dt = times[1] - times[0]
+    if len(trajectory.times) != len(times):
+        raise InputError(
+            f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, "
+            f"got {len(trajectory.times)}."
+        )
+    own = trajectory.times - trajectory.times[0]
+    misses = np.abs(own - times)
+    if not (misses <= _TIMES * dt).all():
+        k = int(np.argmax(~(misses <= _TIMES * dt)))
+        raise InputError(
+            f"the trajectory must have steps of {dt:g} s: time {k} must be {times[k]:g} s after the first, "
+            f"got {own[k]:g} s."
+        )
+
+
+_ARRAYS = ("times", "states", "inputs")
+
+
+def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tuple[int, ...]) -> None:
+    """Check that the shapes are those of one trajectory."""
+    if (
+        len(times) != 1
+        or len(states) < 2
+        or len(inputs) != len(states)
+        or states[:-2] != inputs[:-2]
+        or states[-2] != times[0]
+        or inputs[-2] != times[0] - 1
+    ):
+        raise ShapeError(
+            "a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), "
+            f"got {times}, {states} and {inputs}."
+        )
+
+
+def _column_names(letter: str, names: Sequence[str] | None, count: int) -> list[str]:
+    if names is None:
+        return [f"{letter}{i}" for i in range(count)]
+    if len(names) != count:
+        raise ShapeError(f"there must be {count} names of columns, got {', '.join(names) or 'none'}.")
+    return list(names)
+
+
+def _csv_rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
+    try:
+        yield from csv_rows(path)
+    except InputError as error:
+        raise InputError(f"{path} cannot be read as CSV: {error}.") from error
+
+
+class _Columns:
+    """The columns of a file that are wanted, whose cells become numbers row by row.
+
+    Args:
+        path: for messages.
+        header: the names of all columns.
+        always: names of the columns that have a number in every row.
+        held: names of those that need none in the last row.
+    """
+
+    def __init__(self, path: str | Path, header: list[str], always: list[str], held: list[str]) -> None:
+        self.path, self.always, self.held = path, always, held
+        self.places = {name: place for place, name in enumerate(header)}
+
+    def read(self, rows: Iterator[tuple[int, list[str]]], most: int | None) -> Trajectory:
+        always, held, count = array("d"), array("d"), 0
+        before: tuple[int, list[str]] | None = None
+        for line, row in rows:
+            if before is not None:
+                held.extend(self._numbers(*before, self.held))
+            always.extend(self._numbers(line, row, self.always))
+            before, count = (line, row), count + 1
+            if most is not None and count > most:
+                raise InputError(f"{self.path} must have {most} rows below its header, and has more.")
+            if 8 * (len(always) + len(held)) > MOST_BYTES:
+                raise InputError(f"{self.path} has too many numbers: {MOST_BYTES} bytes may be read.")
+        if count < 2:
+            raise InputError(f"{self.path} must have a header and at least two rows.")
+        block = np.array(always).reshape(count, -1)
+        return Trajectory(block[:, 0], block[:, 1:], np.array(held).reshape(count - 1, len(self.held)))
+
+    def _numbers(self, line: int, row: list[str], names: list[str]) -> Iterator[float]:
+        for name in names:
+            place = self.places[name]
+            cell = row[place] if place < len(row) else None
+            try:
+                yield float(cell or "")
+            except ValueError:
+                shown = repr(cell if cell is None else cell[:60])
+                raise InputError(f"{self.path}, line {line}: {name} must be a number, got {shown}.") from None
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names for a message, not more of them than can be read."""
+    return ", ".join(name[:60] for name in names[:20]) + (", ..." if len(names) > 20 else "")
+
+
+def _bare(name: str) -> str:
+    """Return a column's name without its unit."""
+    return name.partition("[")[0].strip()
+
+
+def _chosen(path: str | Path, columns: dict[str, str], letter: str, names: Sequence[str] | None) -> list[str]:
+    """Return which columns are the states, or the inputs."""
+    named = [_bare(name) for name in names or ()]
+    if not any(name in columns for name in named):
+        return [columns[name] for name in _numbered_columns(columns, letter)]
+    missing = [name for name in named if name not in columns]
+    if missing:
+        raise InputError(f"{path} has no column {missing[0]}; there are {_listed(list(columns))}.")
+    for wanted in names or ():
+        _require_unit(path, columns[_bare(wanted)], wanted)
+    return [columns[name] for name in named]
+
+
+def _require_unit(path: str | Path, column: str, wanted: str) -> None:
+    has, needs = _unit(column), _unit(wanted)
+    if has and needs and has != needs:
+        raise InputError(
+            f"{path} has {_bare(column)} in {has}, and {needs} is needed; convert it, or if only the unit is written "
+            "in another way, write it so or leave it out."
+        )
+
+
+def _unit(name: str) -> str:
+    """Return a column's unit, empty where it has none; signs of products do not matter."""
+    return re.sub(r"[\s*·.]", "", name.partition("[")[2].rpartition("]")[0])
+
+
+def _numbered_columns(columns: dict[str, str], letter: str) -> list[str]:
+    found = [name for name in columns if name[0] == letter and name[1:].isdigit()]
+    names = [f"{letter}{i}" for i in range(len(found))]
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise InputError(f"the column {missing[0]} is missing; there are {_listed(found)}.")
+    return names

@@ -1,0 +1,253 @@
+"""The true maximum d*, for systems that are simulated and so may be executed as often as one likes."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import math
+import os
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import Bounds, differential_evolution, minimize
+
+from ctxval._util.arrays import Array
+from ctxval._util.describe import describe, rounded
+from ctxval.core.space import Parameters
+from ctxval.core.validation import Validation
+from ctxval.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The largest distance over the task space, as well as a method can find it.
+
+    Attributes:
+        distance: d*.
+        parameters: a task that attains it.
+        method: how it was found.
+    """
+
+    distance: float
+    parameters: Parameters
+    method: str
+
+
+def grid_truth(validation: Validation, per_axis: int = 2001, refinements: int = 6) -> Truth:
+    """Return the maximum on a dense grid, refined around its best points. Executes S for each grid point.
+
+    Args:
+        validation: the map p -> d(p).
+        per_axis: grid points on each axis.
+        refinements: how often a finer grid is laid around the best points.
+
+    Raises:
+        InputError: every execution failed.
+    """
+    space = validation.space
+    points = space.grid(per_axis)
+    values = validation.distances(points)
+    if np.isnan(values).all():
+        raise InputError("the truth is unknown: every execution on the grid failed.")
+    cell = (space.high - space.low) / (per_axis - 1)
+    best, best_value = points[np.nanargmax(values)], float(np.nanmax(values))
+    centres = points[np.argsort(-np.nan_to_num(values, nan=-np.inf))[:8]]
+    for _ in range(refinements):
+        points = _around(centres, cell, space.low, space.high)
+        values = validation.distances(points)
+        cell = cell / 4
+        centres = points[np.argsort(-np.nan_to_num(values, nan=-np.inf))[:8]]
+        if np.nanmax(values) > best_value:
+            best, best_value = points[np.nanargmax(values)], float(np.nanmax(values))
+    count = f"{per_axis:,} points" + (" an axis" if space.dimension > 1 else "")
+    return Truth(best_value, space.parameters(best), f"dense grid of {count}, refined {refinements} times")
+
+
+def _around(centres: Array, cell: Array, low: Array, high: Array) -> Array:
+    """Return a grid of a quarter of the cell around each centre, inside the box."""
+    offsets = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * len(cell), indexing="ij"), axis=-1)
+    points = centres[:, None, :] + offsets.reshape(-1, len(cell)) * cell
+    return np.clip(points.reshape(-1, len(cell)), low, high)
+
+
+def search_truth(
+    validation: Validation,
+    *,
+    seed: int = 0,
+    agreement: float = 1e-3,
+    repeats: int = 6,
+    population: int = 20,
+    generations: int = 150,
+    climbs: int = 60,
+) -> Truth:
+    """Return the best value known after a large search, for spaces with too many dimensions for a grid.
+
+    Differential evolution (Storn and Price 1997), a climb from its best point, and climbs from random ones, as
+    evolution can agree with itself on a basin that is wide but not the highest; repeated with other random numbers
+    until the two best repeats agree. Executes S some hundred thousand times, in batches.
+
+    Args:
+        validation: the map p -> d(p).
+        seed: of the random numbers.
+        agreement: relative difference of the two best repeats at which the search ends.
+        repeats: how many there are at most.
+        population: points in a generation, for each dimension.
+        generations: the most in one repeat.
+        climbs: from random starts, each the best of sixteen points, in one repeat.
+
+    Raises:
+        InputError: every execution failed.
+    """
+    search = _TruthSearch(validation, population, generations, climbs)
+    found: list[tuple[float, Array]] = []
+    while len(found) < repeats and not _gap(found) <= agreement:
+        found.append(search.repeat(np.random.default_rng(np.random.SeedSequence([seed, len(found)]))))
+    distance, unit_point = max(found, key=lambda repeat: repeat[0])
+    if not math.isfinite(distance):
+        raise InputError("the truth is unknown: every execution of the search failed.")
+    doubt = "" if _gap(found) <= agreement else ", so the maximum may well be larger"
+    method = (
+        f"best known value of {search.evaluations:,} evaluations: differential evolution and {climbs} climbs from "
+        f"elsewhere, {len(found)} repeats, of which the two best differ by {_gap(found):.2%}{doubt}"
+    )
+    return Truth(distance, validation.space.parameters(validation.space.from_unit(unit_point)), method)
+
+
+class _TruthSearch:
+    """Maximises d over the unit cube, a whole generation in one batch."""
+
+    def __init__(self, validation: Validation, population: int, generations: int, climbs: int) -> None:
+        self.validation = validation
+        self.population, self.generations, self.climbs = population, generations, climbs
+        self.dimension = validation.space.dimension
+        self.evaluations = 0
+
+    def values(self, unit_points: Array) -> Array:
+        """Return d at points ``(N, d)`` of the cube, minus infinity where the execution fails."""
+        self.evaluations += len(unit_points)
+        values = self.validation.distances(self.validation.space.from_unit(unit_points))
+        return np.where(np.isnan(values), -np.inf, values)
+
+    def repeat(self, rng: np.random.Generator) -> tuple[float, Array]:
+        """Return the largest value of one search, and its point ``(d,)``."""
+        tops = [self._evolve(rng)] + [self._random_start(rng) for _ in range(self.climbs)]
+        points = np.array([self._climb(*top) for top in tops])
+        # A loop that diverges amplifies the rounding of a batch: what counts is the task executed alone.
+        alone = np.array([self.values(point[None])[0] for point in points])
+        return float(alone.max()), points[np.argmax(alone)]
+
+    def _evolve(self, rng: np.random.Generator) -> tuple[float, Array]:
+        def losses(columns: Array) -> Any:
+            return -self.values(columns.T)
+
+        evolved = differential_evolution(
+            losses,
+            Bounds(np.zeros(self.dimension), np.ones(self.dimension)),
+            popsize=self.population,
+            maxiter=self.generations,
+            tol=1e-4,
+            polish=False,
+            updating="deferred",
+            vectorized=True,
+            rng=rng,
+        )
+        return -float(evolved.fun), np.asarray(evolved.x)
+
+    def _random_start(self, rng: np.random.Generator) -> tuple[float, Array]:
+        points = rng.random((16, self.dimension))
+        values = self.values(points)
+        return float(values.max()), points[np.argmax(values)]
+
+    def _climb(self, value: float, point: Array) -> Array:
+        scale = value if 0 < value < np.inf else 1.0  # L-BFGS-B's tolerances suit values about 1
+
+        def negative(x: Array) -> tuple[float, Array]:
+            return self._loss_and_slope(x, scale)
+
+        bounds = [(0.0, 1.0)] * self.dimension
+        with np.errstate(all="ignore"):
+            climbed = minimize(negative, point, jac=True, method="L-BFGS-B", bounds=bounds)
+        return np.asarray(climbed.x) if -float(climbed.fun) * scale > value else point
+
+    def _loss_and_slope(self, point: Array, scale: float) -> tuple[float, Array]:
+        moves = 1e-6 * np.eye(self.dimension)
+        up, down = np.clip(point + moves, 0, 1), np.clip(point - moves, 0, 1)
+        losses = -self.values(np.concatenate([point[None], up, down])) / scale
+        widths = np.diagonal(up) - np.diagonal(down)
+        slope = (losses[1 : self.dimension + 1] - losses[self.dimension + 1 :]) / widths
+        return float(losses[0]), np.where(np.isfinite(slope), slope, 0.0)
+
+
+def _gap(found: list[tuple[float, Array]]) -> float:
+    """Return by what share of the best value the second best differs; infinity where there are not two."""
+    values = sorted((value for value, _ in found if math.isfinite(value)), reverse=True)
+    if len(values) < 2:
+        return math.inf
+    return (values[0] - values[1]) / values[0] if values[0] > 0 else 0.0
+
+
+# A truth found once
+
+
+def cached_truth(
+    validation: Validation, compute: Callable[[Validation], Truth], folder: str | Path = "runs/truth"
+) -> Truth:
+    """Return a truth from its file in a folder, or find it and write that file.
+
+    The file's name is a hash of what identifies the validation and the method. A stored truth is believed only where
+    executing S once more, at its task, gives its distance again.
+
+    Args:
+        validation: the map p -> d(p).
+        compute: finds the truth; its settings, such as those of ``functools.partial(search_truth, seed=1)``, are
+            part of the hash.
+        folder: made if it is missing.
+    """
+    path = Path(folder) / f"{_fingerprint(validation, compute)}.json"
+    stored = _read_truth(path, validation)
+    if stored is not None:
+        return stored
+    truth = compute(validation)
+    # A folder that cannot be written costs the next caller time, but not this one the answer.
+    with suppress(OSError):
+        _write_truth(path, truth, validation)
+    return truth
+
+
+def _fingerprint(validation: Validation, compute: Callable[[Validation], Truth]) -> str:
+    # The signature has the defaults that the description of a function leaves out.
+    known = [validation.describe(), describe(compute), str(inspect.signature(compute))]
+    return hashlib.sha256(json.dumps(rounded(known, 9), sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _read_truth(path: Path, validation: Validation) -> Truth | None:
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        distance, method = float(stored["distance"]), str(stored["method"])
+        point = validation.space.point(dict(stored["parameters"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if not math.isclose(validation.distances(point[None])[0], distance, rel_tol=1e-6, abs_tol=1e-12):
+        return None
+    return Truth(distance, validation.space.parameters(point), method)
+
+
+def _write_truth(path: Path, truth: Truth, validation: Validation) -> None:
+    """Write a file that is whole or not there, also when two processes write it at once."""
+    parameters = validation.space.describe_point(truth.parameters.points)
+    content = {"distance": truth.distance, "parameters": parameters, "method": truth.method}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            json.dump(content, file, indent=1)
+        os.replace(temporary, path)
+    except OSError:
+        os.unlink(temporary)
+        raise

@@ -1,0 +1,354 @@
+"""The pure map from task parameters to the distance d(p) (lines 6 to 9 of the paper's Algorithm 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+
+from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats, require_shape
+from ctxval._util.describe import describe
+from ctxval._util.interrupts import raised_by_signal
+from ctxval._util.texts import reason_of
+from ctxval.core.controller import Controller, Synthesizer
+from ctxval.core.distance import Distance
+from ctxval.core.model import Model, Step, as_model
+from ctxval.core.rollout import rollout
+from ctxval.core.space import Parameters, TaskSpace
+from ctxval.core.system import System
+from ctxval.core.task import Task
+from ctxval.core.trajectory import COMPLETE, Trajectory, require_times
+from ctxval.errors import (
+    CtxvalError,
+    DesignError,
+    DistanceError,
+    ExecutionError,
+    InputError,
+    ModelError,
+    ShapeError,
+)
+
+START = 0.05
+"""By how much a recording may miss the start of its task, as a share of what the model's trajectory covers."""
+
+_CHUNK = 4096
+"""Tasks in one batched call: enough to be fast, few enough for memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Everything about a task that can be known before S is executed; one task or a batch.
+
+    Attributes:
+        parameters: p.
+        task: the task g_p.
+        controller: pi(x; g_p, M).
+        model_trajectory: the closed loop on the model.
+    """
+
+    parameters: Parameters
+    task: Task
+    controller: Controller
+    model_trajectory: Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A plan after the execution of S.
+
+    Attributes:
+        plan: what was known before.
+        system_trajectory: the closed loop on the system.
+        distance: d(p).
+    """
+
+    plan: Plan
+    system_trajectory: Trajectory
+    distance: float
+
+
+class Validation:
+    """A system, a model of it, and what the model is for: the map p -> d(p).
+
+    Args:
+        space: the task space P.
+        task: ``p -> Task``; called with named parameters, of one task or of a batch.
+        system: the true system S.
+        model: the model M, or a function ``(x, u) -> x_next``.
+        synthesizer: how controllers are designed on M.
+        distance: d between the trajectories of M and S.
+        start_tolerance: by how much each state may miss the task's initial state where an execution starts, as a share
+            of that state's range in the model's trajectory, or of its initial value where that is larger.
+
+    Raises:
+        InputError: one of them is not what it should be; the message says which and what is missing.
+    """
+
+    def __init__(
+        self,
+        *,
+        space: TaskSpace,
+        task: Callable[[Parameters], Task],
+        system: System,
+        model: Model | Step,
+        synthesizer: Synthesizer,
+        distance: Distance,
+        start_tolerance: float = START,
+    ) -> None:
+        _require("space", space, isinstance(space, TaskSpace), "a TaskSpace")
+        _require("task", task, callable(task), "a function p -> Task")
+        _require("system", system, isinstance(system, System), "a System with execute(controller, task)")
+        _require(
+            "synthesizer", synthesizer, isinstance(synthesizer, Synthesizer), "a Synthesizer with design(task, model)"
+        )
+        _require(
+            "distance", distance, callable(distance), "a function (model_trajectory, system_trajectory, task) -> d"
+        )
+        _require("start_tolerance", start_tolerance, _is_share(start_tolerance), "a finite number >= 0")
+        self.space = space
+        self.task = task
+        self.system = system
+        self.model = as_model(model)
+        self.synthesizer = synthesizer
+        self.distance = distance
+        self.start_tolerance = float(start_tolerance)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this validation in a store."""
+        parts = ("space", "task", "system", "model", "synthesizer", "distance")
+        # A function's name says nothing of the constants in it, three of its tasks do.
+        probes = np.stack([self.space.low, 0.5 * (self.space.low + self.space.high), self.space.high])
+        tasks = [describe(self._task(self.space.parameters(point))) for point in probes]
+        return {**{part: describe(getattr(self, part)) for part in parts}, "tasks": tasks}
+
+    def with_distance(self, distance: Distance) -> Validation:
+        """Return this validation with another distance.
+
+        Raises:
+            InputError: it is no function.
+        """
+        return Validation(
+            space=self.space,
+            task=self.task,
+            system=self.system,
+            model=self.model,
+            synthesizer=self.synthesizer,
+            distance=distance,
+            start_tolerance=self.start_tolerance,
+        )
+
+    # One task, step by step
+
+    def plan(self, point: ArrayLike) -> Plan:
+        """Design the controller for the task at ``(d,)`` and run it on the model; S is not touched.
+
+        Raises:
+            InputError: the task function does not make one task of the point.
+            DesignError: the synthesizer failed.
+            ModelError: the model failed or its closed loop is not finite.
+        """
+        plan = self._plan(self.space.parameters(point))
+        if plan.task.batch_shape:
+            raise ShapeError(f"the task function made a batch of shape {plan.task.batch_shape} of one point.")
+        if not plan.model_trajectory.finite:
+            where = self.space.describe_point(plan.parameters.points)
+            raise ModelError(f"the model's closed loop {plan.model_trajectory.ended} for the task {where}.")
+        return plan
+
+    def execute(self, plan: Plan) -> Trajectory:
+        """Execute S once.
+
+        Raises:
+            ExecutionError: the system raised or tried to exit, or what it returned is no execution of the plan; the
+                message says why.
+        """
+        try:
+            trajectory = self.system.execute(plan.controller, plan.task)
+        except BaseException as error:
+            if raised_by_signal(error):
+                raise
+            raise ExecutionError(reason_of(error)) from error
+        try:
+            self.require(plan, trajectory)
+        except InputError as error:
+            raise ExecutionError(str(error)) from error
+        return trajectory
+
+    def require(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> None:
+        """Check that a trajectory, wherever it comes from, is a whole and finite execution of a plan.
+
+        Args:
+            plan: of the task.
+            trajectory: what the system returned, or a recording.
+            start_tolerance: in place of this validation's own.
+
+        Raises:
+            ExecutionError: it is no whole and finite execution.
+            InputError: it is of another task: it has other dimensions, other times, or starts elsewhere.
+        """
+        if not isinstance(trajectory, Trajectory):
+            raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
+        if trajectory.ended != COMPLETE:
+            raise ExecutionError(trajectory.ended)
+        if not trajectory.finite.all():
+            raise ExecutionError("the system's trajectory is not finite")
+        _require_task(plan, trajectory, self.start_tolerance if start_tolerance is None else start_tolerance)
+
+    def measure(self, plan: Plan, trajectory: Trajectory) -> float:
+        """Return d(p).
+
+        Raises:
+            DistanceError: the distance raised, or is no finite number that is not negative.
+        """
+        return self._measured(plan.parameters, plan.task, plan.model_trajectory, trajectory)
+
+    def remeasure(self, point: ArrayLike, model_trajectory: Trajectory, system_trajectory: Trajectory) -> float:
+        """Return d(p) between trajectories that are known, without designing a controller.
+
+        Raises:
+            DistanceError: as in :meth:`measure`.
+        """
+        parameters = self.space.parameters(point)
+        return self._measured(parameters, self._task(parameters), model_trajectory, system_trajectory)
+
+    def _measured(self, parameters: Parameters, task: Task, model: Trajectory, system: Trajectory) -> float:
+        value = self._distance(task, model, system)
+        if value.shape != () or not np.isfinite(value) or value < 0:
+            self._refuse_distance(value, parameters.points)
+        return float(value)
+
+    def outcome(self, point: ArrayLike) -> Outcome:
+        """Plan, execute and measure the task at ``(d,)``."""
+        plan = self.plan(point)
+        trajectory = self.execute(plan)
+        return Outcome(plan, trajectory, self.measure(plan, trajectory))
+
+    # Many tasks
+
+    @property
+    def batched(self) -> bool:
+        """Whether system and synthesizer take a batch of tasks in one call."""
+        return bool(getattr(self.system, "batched", False) and getattr(self.synthesizer, "batched", False))
+
+    def distances(self, points: ArrayLike) -> Array:
+        """Return d at points ``(N, d)``, shape ``(N,)``; NaN where the execution fails. Executes S N times.
+
+        Raises:
+            InputError, DesignError, ModelError: as in :meth:`plan`.
+            DistanceError: the distance raised or has the wrong shape.
+        """
+        rows = require_shape("points", as_floats("points", points), (self.space.dimension,))
+        if not self.batched or not len(rows):
+            return np.array([self._distance_or_nan(row) for row in rows])
+        chunks = [rows[i : i + _CHUNK] for i in range(0, len(rows), _CHUNK)]
+        return np.concatenate([self._batch_distances(chunk) for chunk in chunks])
+
+    def _distance_or_nan(self, point: Array) -> float:
+        try:
+            return self.outcome(point).distance
+        except ExecutionError:
+            return np.nan
+
+    def _batch_distances(self, points: Array) -> Array:
+        plan = self._plan(self.space.parameters(points))
+        if plan.task.batch_shape != (len(points),):
+            raise ShapeError(
+                f"the task function must make a batch of {len(points)} tasks of as many points, "
+                f"got shape {plan.task.batch_shape}; use the parameters in the task, or broadcast them."
+            )
+        if not plan.model_trajectory.finite.all():
+            where = self.space.describe_point(points[np.argmin(plan.model_trajectory.finite)])
+            raise ModelError(f"the model's closed loop is not finite for the task {where}.")
+        try:
+            trajectory = self.system.execute(plan.controller, plan.task)
+        except Exception:
+            # Which task it was, only one by one can tell.
+            return np.array([self._distance_or_nan(point) for point in points])
+        values = self._distance(plan.task, plan.model_trajectory, trajectory)
+        if values.shape != (len(points),):
+            raise DistanceError(f"the distance must have shape ({len(points)},) over the batch, got {values.shape}.")
+        executed = _executed(plan.model_trajectory, trajectory)
+        wrong = executed & ~(np.isfinite(values) & (values >= 0))
+        if wrong.any():
+            self._refuse_distance(values[np.argmax(wrong)], points[np.argmax(wrong)])
+        return np.where(executed, values, np.nan)
+
+    # What both share
+
+    def _plan(self, parameters: Parameters) -> Plan:
+        task = self._task(parameters)
+        try:
+            controller = self.synthesizer.design(task, self.model)
+        except CtxvalError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise DesignError(f"the synthesizer failed: {reason_of(error)}.") from error
+        try:
+            trajectory = rollout(self.model.step, controller, task)
+        except CtxvalError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise ModelError(f"the closed loop on the model failed: {reason_of(error)}.") from error
+        return Plan(parameters, task, controller, trajectory)
+
+    def _task(self, parameters: Parameters) -> Task:
+        try:
+            task = self.task(parameters)
+        except CtxvalError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise InputError(f"the task function failed: {reason_of(error)}.") from error
+        _require("the task function's result", task, isinstance(task, Task), "a Task")
+        return task
+
+    def _distance(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
+        try:
+            with np.errstate(all="ignore"):
+                return np.asarray(self.distance(model, system, task), dtype=np.float64)
+        except BaseException as error:
+            if raised_by_signal(error):
+                raise
+            raise DistanceError(f"the distance failed: {reason_of(error)}.") from error
+
+    def _refuse_distance(self, value: Array, point: Array) -> NoReturn:
+        where = self.space.describe_point(point)
+        raise DistanceError(f"the distance must be one finite number >= 0, got {value} for the task {where}.")
+
+
+def _require_task(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> None:
+    expected = plan.model_trajectory
+    require_times(trajectory, plan.task.times)
+    if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:
+        raise ShapeError(
+            f"the trajectory must have states {expected.states.shape} and inputs {expected.inputs.shape}, "
+            f"got {trajectory.states.shape} and {trajectory.inputs.shape}."
+        )
+    start = plan.task.initial_state
+    ranges = np.ptp(expected.states, axis=0)
+    scale = np.maximum(np.maximum(ranges, np.abs(start)), max(0.05 * ranges.max(), 1e-6))
+    misses = np.abs(trajectory.states[0] - start)
+    if not (misses <= start_tolerance * scale).all():
+        i = int(np.argmax(~(misses <= start_tolerance * scale)))
+        raise InputError(
+            f"the trajectory starts elsewhere: state {i} must start at {start[i]:g} within "
+            f"{start_tolerance * scale[i]:.3g}, got {trajectory.states[0, i]:g}; is it of this trial?"
+        )
+
+
+def _executed(expected: Trajectory, batch: Trajectory) -> Mask:
+    """Return which tasks of a batch have a whole and finite trajectory, shape ``(N,)``."""
+    same = batch.states.shape == expected.states.shape and batch.inputs.shape == expected.inputs.shape
+    # Where the batch ended early but nothing in it is broken, it is not known which task that was.
+    unknown = batch.ended != COMPLETE and bool(batch.finite.all())
+    return batch.finite if same and not unknown else np.zeros(expected.finite.shape, dtype=bool)
+
+
+def _is_share(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < float("inf")
+
+
+def _require(name: str, value: object, valid: bool, wanted: str) -> None:
+    if not valid:
+        raise InputError(f"{name} must be {wanted}, got {value!r}.")

@@ -1,0 +1,24 @@
+"""The distance between the final states of M and S."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ctxval._util.arrays import Array
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.distances.base import ErrorNorm, selected
+
+
+@dataclass(frozen=True)
+class FinalState(ErrorNorm):
+    """Norm of the difference between the final states (the paper's eq. 5, with ``norm=1``).
+
+    Attributes:
+        norm: 1, 2 or infinity.
+        components: indices of the states that count; all of them by default.
+    """
+
+    def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        """Return the difference, shape ``(..., k)``."""
+        return selected(system_trajectory.final_state - model_trajectory.final_state, self.components)

@@ -1,0 +1,24 @@
+"""How far the system ends from its goal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ctxval._util.arrays import Array
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.distances.base import ErrorNorm, selected
+
+
+@dataclass(frozen=True)
+class GoalError(ErrorNorm):
+    """Norm of the difference between the system's final state and the goal: both aspects of Remark 1 in one.
+
+    Attributes:
+        norm: 1, 2 or infinity.
+        components: indices of the states that count; all of them by default.
+    """
+
+    def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        """Return the difference, shape ``(..., k)``."""
+        return selected(system_trajectory.final_state - task.goal, self.components)

@@ -1,0 +1,34 @@
+"""The distance between the states of M and S, averaged over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, as_norm_order, vector_norm
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.distances.base import selected
+
+
+@dataclass(frozen=True)
+class MeanDeviation:
+    """Mean over the times 1..H of the norm of the difference between the states, e.g. an average in metres.
+
+    Attributes:
+        norm: 1, 2 or infinity, over the states at one time.
+        components: indices of the states that count; all of them by default.
+    """
+
+    norm: float = 2
+    components: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        as_norm_order(self.norm)
+
+    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        """Return the distance, shape ``(...)``."""
+        gap = selected(system_trajectory.states - model_trajectory.states, self.components)
+        return np.asarray(vector_norm(gap[..., 1:, :], self.norm).mean(axis=-1))

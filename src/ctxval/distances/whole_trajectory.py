@@ -1,0 +1,40 @@
+"""The distance between whole trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, as_norm_order, vector_norm
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.distances.base import selected
+
+
+@dataclass(frozen=True)
+class WholeTrajectory:
+    """Norm of the difference between whole trajectories, as one long vector.
+
+    ``norm=inf`` is the distance of the paper's OLDT and CCDT; ``norm=2, per_step=True`` is the one printed for the
+    Dubins car, ``1/H ||xi_S - xi_M||_2``.
+
+    Attributes:
+        norm: 1, 2 or infinity, over times and states together.
+        components: indices of the states that count; all of them by default.
+        per_step: divide by the horizon H.
+    """
+
+    norm: float = np.inf
+    components: Sequence[int] | None = None
+    per_step: bool = False
+
+    def __post_init__(self) -> None:
+        as_norm_order(self.norm)
+
+    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        """Return the distance, shape ``(...)``."""
+        gap = selected(system_trajectory.states - model_trajectory.states, self.components)
+        whole = vector_norm(gap.reshape(*gap.shape[:-2], -1), self.norm)
+        return whole / task.horizon if self.per_step else whole

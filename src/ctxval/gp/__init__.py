@@ -1,0 +1,1 @@
+"""Gaussian processes; they know numbers alone."""

@@ -1,0 +1,236 @@
+"""Acquisition functions over the unit cube, and how to maximise one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
+from scipy.special import erfcx, log_ndtr, ndtr
+
+from ctxval._util.arrays import Array, Mask, Rows
+from ctxval.gp.regression import GaussianProcess
+
+
+class Acquisition(Protocol):
+    """How much an execution at a point is worth."""
+
+    def __call__(self, X: Array) -> Array:
+        """Return the values at points ``(m, d)`` of the unit cube, shape ``(m,)``."""
+
+    def with_gradient(self, X: Array) -> tuple[Array, Array]:
+        """Return the values ``(m,)`` and their gradients ``(m, d)``."""
+
+
+_DISTINCT, _APART = 1e-6, 0.02
+"""How far a proposal is from every known point, in one coordinate at least; and from each that it shall keep away from,
+as a share of the cube's diagonal."""
+
+_FAR_BELOW = -1e3
+"""Standard deviations below the best value from which on series replace differences of large logarithms."""
+_CERTAIN = 1e-9
+"""The least standard deviation that an improvement is expected from."""
+_LOG_ROOT_2PI = 0.5 * float(np.log(2 * np.pi))
+
+
+@dataclass(frozen=True, eq=False)
+class UpperConfidenceBound:
+    """``alpha(p) = mu(p) + beta^(1/2) sigma(p)`` (the paper's eq. 11, GP-UCB).
+
+    Attributes:
+        process: the surrogate.
+        beta: the confidence parameter; the paper takes 2.
+    """
+
+    process: GaussianProcess
+    beta: float = 2.0
+
+    def __call__(self, X: Array) -> Array:
+        """Return the bound at ``(m, d)``, shape ``(m,)``."""
+        mean, variance = self.process.predict(X)
+        return np.asarray(mean + np.sqrt(self.beta * variance))
+
+    def with_gradient(self, X: Array) -> tuple[Array, Array]:
+        """Return the bound ``(m,)`` and its gradient ``(m, d)``; that of the mean where the variance vanishes."""
+        mean, variance, d_mean, d_variance = self.process.predict_with_gradient(X)
+        sigma = np.sqrt(variance)[:, None]
+        d_sigma = np.divide(d_variance, 2 * sigma, out=np.zeros_like(d_mean), where=sigma > 0)
+        value = mean + np.sqrt(self.beta) * sigma[:, 0]
+        return np.asarray(value), np.asarray(d_mean + np.sqrt(self.beta) * d_sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class LogExpectedImprovement:
+    """``log E max(f(p) - best, 0)``, also where that is far too small for a float (Ament et al. 2023, eqs. 8 and 9).
+
+    Attributes:
+        process: the surrogate.
+        best: the value to improve on, in the process's units.
+    """
+
+    process: GaussianProcess
+    best: float
+
+    def __call__(self, X: Array) -> Array:
+        """Return the logarithm at ``(m, d)``, shape ``(m,)``."""
+        mean, variance = self.process.predict(X)
+        sigma = np.maximum(np.sqrt(variance), _CERTAIN)
+        return np.asarray(log_improvement((mean - self.best) / sigma) + np.log(sigma))
+
+    def with_gradient(self, X: Array) -> tuple[Array, Array]:
+        """Return the logarithm ``(m,)`` and its gradient ``(m, d)``."""
+        mean, variance, d_mean, d_variance = self.process.predict_with_gradient(X)
+        sigma = np.maximum(np.sqrt(variance), _CERTAIN)
+        d_sigma = np.where(np.sqrt(variance) > _CERTAIN, d_variance.T / (2 * sigma), 0.0).T
+        z = (mean - self.best) / sigma
+        slope = _log_improvement_slope(z)
+        gradient = (slope * d_mean.T + (1 - z * slope) * d_sigma.T) / sigma
+        return np.asarray(log_improvement(z) + np.log(sigma)), np.asarray(gradient.T)
+
+
+def log_improvement(z: Array) -> Array:
+    """Return ``log(phi(z) + z Phi(z))``, the expected improvement of a standard normal variate over ``-z``."""
+    z = np.asarray(z, dtype=np.float64)
+    near, middle = np.maximum(z, -1.0), np.clip(z, _FAR_BELOW, -1.0)
+    direct = np.log(np.exp(-0.5 * near**2 - _LOG_ROOT_2PI) + near * ndtr(near))
+    # phi(z) (1 - |z| Phi(z) / phi(z)), where erfcx is that ratio without its small parts.
+    ratio = np.sqrt(np.pi / 2) * erfcx(-middle / np.sqrt(2))
+    scaled = -0.5 * middle**2 - _LOG_ROOT_2PI + np.log1p(middle * ratio)
+    far = np.minimum(z, _FAR_BELOW)
+    series = -0.5 * far**2 - _LOG_ROOT_2PI - 2 * np.log(-far) + np.log1p(-3 / far**2)
+    return np.asarray(np.where(z > -1, direct, np.where(z > _FAR_BELOW, scaled, series)))
+
+
+def _log_improvement_slope(z: Array) -> Array:
+    """Return the derivative ``Phi(z) / (phi(z) + z Phi(z))``."""
+    near, far = np.maximum(z, _FAR_BELOW), np.minimum(z, _FAR_BELOW)
+    return np.asarray(np.where(z > _FAR_BELOW, np.exp(log_ndtr(near) - log_improvement(near)), -far - 2 / far))
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """The posterior variance: pure exploration.
+
+    Attributes:
+        process: the surrogate.
+    """
+
+    process: GaussianProcess
+
+    def __call__(self, X: Array) -> Array:
+        """Return the variance at ``(m, d)``, shape ``(m,)``."""
+        return self.process.predict(X)[1]
+
+    def with_gradient(self, X: Array) -> tuple[Array, Array]:
+        """Return the variance ``(m,)`` and its gradient ``(m, d)``."""
+        _, variance, _, d_variance = self.process.predict_with_gradient(X)
+        return variance, d_variance
+
+
+Box = tuple[Array, Array]
+"""The lower and upper bounds ``(d,)`` of a part of the unit cube."""
+
+
+def maximise(
+    acquisition: Acquisition,
+    dimension: int,
+    known: Array,
+    rng: np.random.Generator,
+    *,
+    box: Box | None = None,
+    corners: bool = False,
+    away: Array | None = None,
+) -> Array:
+    """Return the point ``(d,)`` of the unit cube with the largest acquisition, distinct from all known points.
+
+    Uniform candidates and small moves around the known points; then the best few climb.
+
+    Args:
+        acquisition: what to maximise.
+        dimension: d.
+        known: points never to propose again, shape ``(n, d)``; sorted best first, they seed the local candidates.
+        rng: where the candidates come from.
+        box: the part of the cube to stay in.
+        corners: whether to look at corners too, and in the end move single coordinates to bounds while that pays.
+        away: points ``(k, d)`` that are pending or have failed, to keep away from.
+    """
+    low, high = (np.zeros(dimension), np.ones(dimension)) if box is None else box
+    candidates = low + rng.random((min(2000, 256 * dimension), dimension)) * (high - low)
+    nearby = np.repeat(known[:8], 8, axis=0)
+    nearby = np.clip(nearby + rng.normal(scale=0.02, size=nearby.shape), low, high)
+    if corners:
+        _snap(candidates[::2], low, high, rng)
+    candidates = np.concatenate([candidates, nearby])
+    if away is not None and (apart := _is_apart(candidates, away)).any():
+        candidates = candidates[apart]
+    order = np.argsort(-acquisition(candidates), kind="stable")
+    climbed = _climb(acquisition, candidates[_spread(candidates, order, count=4)], low, high)
+    if corners:
+        climbed = np.concatenate([climbed, _polish(acquisition, climbed, low, high)])
+    finalists = np.concatenate([climbed, candidates[order[:16]]])
+    values = np.where(_is_distinct(finalists, known), acquisition(finalists), -np.inf)
+    if away is not None:
+        values[~_is_apart(finalists, away)] = -np.inf
+    if not np.isfinite(values).any():
+        return np.asarray(low + rng.random(dimension) * (high - low))
+    return np.asarray(finalists[np.argmax(values)])
+
+
+def _snap(points: Array, low: Array, high: Array, rng: np.random.Generator) -> None:
+    """Move coordinates to bounds, a share of each point's that is drawn for it."""
+    snapped = rng.random(points.shape) < rng.random((len(points), 1))
+    points[snapped] = np.where(rng.random(points.shape) < 0.5, low, high)[snapped]
+
+
+def _polish(acquisition: Acquisition, points: Array, low: Array, high: Array) -> Array:
+    """Move one coordinate of the best point at a time to the bound that pays most, while one does."""
+    values = acquisition(points)
+    point, value = points[np.argmax(values)], float(values.max())
+    moves = np.tile(np.eye(len(low), dtype=bool), (2, 1))
+    ends = np.repeat([low, high], len(low), axis=0)
+    for _ in range(2 * len(low)):
+        moved = np.where(moves, ends, point)
+        values = acquisition(moved)
+        if values.max() <= value:
+            break
+        point, value = moved[np.argmax(values)], float(values.max())
+    return np.asarray(point[None])
+
+
+def _spread(candidates: Array, order: Rows, count: int) -> list[int]:
+    """Return the best candidates that are not neighbours of a better one."""
+    chosen: list[int] = []
+    reach = 0.05 * np.sqrt(candidates.shape[1])
+    for i in order[:200].tolist():
+        if all(np.linalg.norm(candidates[i] - candidates[j]) > reach for j in chosen):
+            chosen.append(i)
+        if len(chosen) == count:
+            break
+    return chosen
+
+
+def _climb(acquisition: Acquisition, starts: Array, low: Array, high: Array) -> Array:
+    """Climb from all starts at once: their sum is separable, so one quasi-Newton search serves them all."""
+
+    def negative(flat: Array) -> tuple[float, Array]:
+        values, gradients = acquisition.with_gradient(flat.reshape(starts.shape))
+        return -float(values.sum()), -gradients.ravel()
+
+    bounds = list(zip(np.tile(low, len(starts)), np.tile(high, len(starts)), strict=True))
+    result = minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 20})
+    return np.asarray(np.clip(result.x.reshape(starts.shape), low, high))
+
+
+def _is_apart(points: Array, away: Array) -> Mask:
+    if not len(away):
+        return np.ones(len(points), dtype=bool)
+    return np.asarray(cdist(points, away).min(axis=1) > _APART * np.sqrt(points.shape[1]))
+
+
+def _is_distinct(points: Array, known: Array) -> Mask:
+    if not len(known):
+        return np.ones(len(points), dtype=bool)
+    gaps = np.abs(points[:, None, :] - known[None, :, :]).max(axis=-1)
+    return np.asarray(gaps.min(axis=1) > _DISTINCT)

@@ -1,0 +1,143 @@
+"""Maximising a plain function over a box in few, large batches; many of the maxima sought lie at corners."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import minimize
+
+from ctxval._util.arrays import Array
+
+Values = Callable[[Array], Array]
+"""Points ``(m, d)`` -> values ``(m,)``."""
+
+_STARTS = 6
+_POLISHED = 3
+_STEP = 1e-4
+_FEW, _ZOOMS = 3, (0.03, 0.01, 0.003, 0.001)
+"""Dimensions up to which there are no slopes, and how closely the best points are sampled instead."""
+
+
+class Ascent:
+    """One search for the maximum of a function over a box within the unit cube.
+
+    Sampling, then quasi-Newton climbs from the best samples, all at once, then moves of single coordinates to
+    the box's bounds.
+
+    Args:
+        function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
+        low, high: the box, shapes ``(d,)``.
+        budget: at how many points the function may be evaluated.
+    """
+
+    def __init__(self, function: Values, low: Array, high: Array, budget: int) -> None:
+        self._function = function
+        self._low, self._high = low, high
+        self._budget = budget
+        self._points: list[Array] = []
+        self._values: list[Array] = []
+
+    def run(self, starts: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Return points ``(m, d)`` and values ``(m,)`` that were evaluated, the largest first.
+
+        Args:
+            starts: points ``(s, d)`` to look at first.
+            rng: of the samples.
+        """
+        sampled = max(8, self._budget // 3)
+        self._look(np.concatenate([np.clip(starts, self._low, self._high), self._samples(sampled, rng)]))
+        if len(self._low) <= _FEW:
+            self._zoom(rng)
+        elif self._left() > 2 * (len(self._low) + 1):
+            self._climb(self._spread_best())
+        while self._left() > 0 and self._polish(rng):
+            pass
+        return self._found()
+
+    def _left(self) -> int:
+        return self._budget - sum(map(len, self._values))
+
+    def _look(self, points: Array) -> Array:
+        values = np.asarray(self._function(points), dtype=np.float64)
+        values = np.where(np.isfinite(values), values, -np.inf)
+        self._points.append(points)
+        self._values.append(values)
+        return values
+
+    def _found(self) -> tuple[Array, Array]:
+        points, values = np.concatenate(self._points), np.concatenate(self._values)
+        order = np.argsort(-values, kind="stable")
+        return points[order], values[order]
+
+    def _samples(self, count: int, rng: np.random.Generator) -> Array:
+        """Return uniform points, of which half have most of their coordinates at bounds."""
+        points = self._low + rng.random((count, len(self._low))) * (self._high - self._low)
+        ends = np.where(rng.random(points.shape) < 0.5, self._low, self._high)
+        snapped = rng.random(points.shape) < np.where(np.arange(count) % 2, rng.random(count), 0.0)[:, None]
+        return np.where(snapped, ends, points)
+
+    def _spread_best(self) -> Array:
+        """Return some of the best points, none a neighbour of a better one."""
+        points, values = self._found()
+        reach = 0.1 * np.linalg.norm(self._high - self._low)
+        chosen: list[Array] = []
+        for point in points[np.isfinite(values)][:200]:
+            if all(np.linalg.norm(point - other) > reach for other in chosen):
+                chosen.append(point)
+            if len(chosen) == _STARTS:
+                break
+        return np.array(chosen)
+
+    def _zoom(self, rng: np.random.Generator) -> None:
+        """Sample ever closer around the best points: cheaper than slopes in few dimensions, and kinks do no harm."""
+        count = int(0.8 * self._left()) // len(_ZOOMS)
+        for share in _ZOOMS:
+            best = self._spread_best()
+            if not len(best) or not count:
+                return
+            moves = share * (self._high - self._low) * rng.normal(size=(count, len(self._low)))
+            self._look(np.clip(np.resize(best, (count, len(self._low))) + moves, self._low, self._high))
+
+    def _climb(self, starts: Array) -> None:
+        """Climb from all starts at once: their sum is separable, so one quasi-Newton search serves them all."""
+        if not len(starts):
+            return
+        scale = max(float(np.abs(self._found()[1][0])), 1e-300)
+        batch = len(starts) * (len(self._low) + 1)
+        calls = max(2, int(0.8 * self._left()) // batch)
+
+        def negative(flat: Array) -> tuple[float, Array]:
+            values, slopes = self._slopes(np.clip(flat.reshape(starts.shape), self._low, self._high))
+            return -float(values.sum()) / scale, -slopes.ravel() / scale
+
+        bounds = list(zip(np.tile(self._low, len(starts)), np.tile(self._high, len(starts)), strict=True))
+        options = {"maxfun": calls, "maxiter": calls}
+        minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+
+    def _slopes(self, points: Array) -> tuple[Array, Array]:
+        """Return values and one-sided differences, inward where a bound is near."""
+        n, d = points.shape
+        steps = np.where(points + _STEP <= self._high, _STEP, -_STEP)
+        moved = points[:, None, :] + np.eye(d) * steps[:, None, :]
+        values = self._look(np.concatenate([points, moved.reshape(-1, d)]))
+        here, there = values[:n], values[n:].reshape(n, d)
+        with np.errstate(invalid="ignore"):
+            slopes = (there - here[:, None]) / steps
+        here = np.where(np.isfinite(here), here, 0.0)
+        return here, np.where(np.isfinite(slopes), slopes, 0.0)
+
+    def _polish(self, rng: np.random.Generator) -> bool:
+        """Move the best points' coordinates to bounds, one and some at a time; return whether that paid."""
+        points, values = self._found()
+        d = len(self._low)
+        best = points[:_POLISHED]
+        ends = np.concatenate([np.tile(self._low, (d, 1)), np.tile(self._high, (d, 1))])
+        single = np.where(np.tile(np.eye(d, dtype=bool), (2, 1)), ends, best[0])
+        parents = best[rng.integers(len(best), size=2 * d)]
+        several = np.where(
+            rng.random(parents.shape) < 2 / d, ends[rng.integers(2, size=parents.shape) * d, np.arange(d)], parents
+        )
+        moved = np.concatenate([single, several])
+        gain = 1e-9 * abs(values[0]) if np.isfinite(values[0]) else 0.0
+        return bool(self._look(moved[: max(1, self._left())]).max() > values[0] + gain)

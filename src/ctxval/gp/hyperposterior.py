@@ -1,0 +1,302 @@
+"""What the data say of a Gaussian process's hyperparameters: draws from their posterior instead of one best guess.
+
+The process is ``f = mu + sigma g``, g with unit variance and a Matern kernel with one length-scale for each dimension,
+or, for values that cannot be negative, the logarithm of the values is.
+The prior is flat in mu and in log sigma, so that both integrate out in closed form (O'Hagan 1978; Rasmussen and
+Williams 2006, Sec. 2.7) and whatever is said does not depend on the units of f. What is left, the scale of the values,
+the smoothness, the length-scales and the noise, is drawn by slice sampling (Neal 2003), which has no step size to tune.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve, cholesky
+
+from ctxval._util.arrays import Array, ArrayLike, Rows
+from ctxval.errors import InputError
+from ctxval.gp.kernels import Matern
+
+EXACT = 1e-10
+"""Noise variance, relative to sigma^2, of values without noise: it keeps the Cholesky factor safe."""
+
+_FEWEST = 6
+"""Data that are asked apart at least."""
+
+_STEP = 1.0
+_MOST_STEPS = 8
+_MOST_SHRINKS = 60
+
+
+@dataclass(frozen=True)
+class Warp:
+    """A scale on which values are a Gaussian process.
+
+    Attributes:
+        offset: c of ``log(y + c)``; infinity for the values themselves.
+        unit: what the values themselves are measured in when their likelihood is compared with that of the logarithm,
+            whose mean has no unit.
+    """
+
+    offset: float = np.inf
+    unit: float = 1.0
+
+    def forward(self, y: ArrayLike) -> Array:
+        """Return values on the process's scale."""
+        values = np.asarray(y, dtype=np.float64)
+        return values if np.isinf(self.offset) else np.log(values + self.offset)
+
+    def backward(self, z: ArrayLike) -> Array:
+        """Return values on their own scale."""
+        values = np.asarray(z, dtype=np.float64)
+        return values if np.isinf(self.offset) else np.exp(np.minimum(values, _LARGEST)) - self.offset
+
+    def log_slope(self, y: Array) -> float:
+        """Return the sum of the logarithms of the slopes at values ``(n,)``, the flat prior of mu included."""
+        return -float(np.log(self.unit)) if np.isinf(self.offset) else -float(np.log(y + self.offset).sum())
+
+
+_LARGEST = 700.0
+"""The largest exponent."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is believed of the hyperparameters before the data.
+
+    Attributes:
+        smoothness: those of the Matern kernels that are averaged over, equally likely.
+        length_scale: median of the log-normal length-scales in the unit cube, times the square root of the dimension.
+        spread: standard deviation of their logarithms.
+        noise: bounds of the noise variance relative to sigma^2, log-uniform between; equal bounds fix it.
+        offset: of the logarithm, in means of the values; the logarithm is as likely as the values themselves, where
+            none is negative. None leaves it out.
+        spread_share: share of the data, those spread best, that are asked apart from the others. A search crowds its
+            points where the values are smooth and high, and there they speak for smoothness everywhere. Each draw
+            given all data is made as rough as one given these alone, where that one is rougher. With 1 there is
+            none of this: then bounds are exact on draws of the prior, and too low on kinks, jumps and heavy tails
+            (docs/calibration.md).
+    """
+
+    smoothness: tuple[float, ...] = (1.5, 2.5)
+    length_scale: float = 0.3
+    spread: float = 1.0
+    noise: tuple[float, float] = (EXACT, EXACT)
+    offset: float | None = 0.1
+    spread_share: float = 0.5
+
+    def warps(self, y: Array) -> tuple[Warp, ...]:
+        """Return the scales that values ``(n,)`` may have."""
+        if self.offset is None or y.min() < 0:
+            return (Warp(),)
+        mean = float(y.mean())
+        return (Warp(unit=mean), Warp(self.offset * mean))
+
+    def log_density(self, log_scales: Array) -> float:
+        """Return the log density of the length-scales' logarithms ``(d,)``, up to a constant."""
+        centre = np.log(self.length_scale) + 0.5 * np.log(len(log_scales))
+        return float(-0.5 * (((log_scales - centre) / self.spread) ** 2).sum())
+
+    def draw(self, dimension: int, rng: np.random.Generator) -> Hyperparameters:
+        """Return hyperparameters from the prior."""
+        centre = np.log(self.length_scale) + 0.5 * np.log(dimension)
+        log_noise = rng.uniform(*np.log(self.noise))
+        return Hyperparameters(
+            float(rng.choice(self.smoothness)), rng.normal(centre, self.spread, dimension), log_noise
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Hyperparameters:
+    """One draw.
+
+    Attributes:
+        nu: the kernel's smoothness.
+        log_scales: logarithms of the length-scales, shape ``(d,)``.
+        log_noise: logarithm of the noise variance relative to sigma^2.
+    """
+
+    nu: float
+    log_scales: Array
+    log_noise: float
+
+    def kernel(self, X: Array, Z: Array) -> Array:
+        """Return the correlations ``(n, m)`` of g between points ``(n, d)`` and ``(m, d)``."""
+        return Matern(self.nu, ard=True)(self._theta, X, Z)
+
+    def kernel_pull(self, X: Array, Z: Array, weights: Array) -> Array:
+        """Return ``sum_j weights_ij dk(x_i, z_j)/dx_i``, shape ``(n, d)``."""
+        return Matern(self.nu, ard=True).weighted_input_gradient(self._theta, X, Z, weights)
+
+    @property
+    def _theta(self) -> Array:
+        return np.concatenate([[0.0], self.log_scales])
+
+
+@dataclass(frozen=True, eq=False)
+class Conditioned:
+    """The data as one draw of hyperparameters sees them.
+
+    Attributes:
+        hyperparameters: the draw.
+        warp: the scale of the values.
+        y: the values on that scale, shape ``(n,)``.
+        L: lower Cholesky factor of the observations' correlations.
+        mean: the most likely mu.
+        mean_variance: its variance relative to sigma^2.
+        scale2: the most likely sigma^2, with ``n - 1`` degrees of freedom.
+        log_likelihood: of the data, mu and sigma integrated out, up to a constant.
+    """
+
+    hyperparameters: Hyperparameters
+    warp: Warp
+    y: Array
+    L: Array
+    mean: float
+    mean_variance: float
+    scale2: float
+    log_likelihood: float
+
+
+def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: Warp | None = None) -> Conditioned:
+    """Return what the data ``(n, d)``, ``(n,)`` say under these hyperparameters, on the values' own scale by default.
+
+    Raises:
+        InputError: the correlations are not positive definite.
+    """
+    scale = Warp() if warp is None else warp
+    n, y = len(values), scale.forward(values)
+    correlations = hyperparameters.kernel(X, X)
+    correlations[np.diag_indices(n)] += np.exp(hyperparameters.log_noise)
+    try:
+        L = cholesky(correlations, lower=True, check_finite=False)
+    except np.linalg.LinAlgError as error:
+        raise InputError(f"the correlations of {n} observations are not positive definite.") from error
+    pull = cho_solve((L, True), np.stack([np.ones(n), y], axis=1), check_finite=False)
+    precision = pull[:, 0].sum()
+    mean = float(pull[:, 1].sum() / precision)
+    scale2 = float((y - mean) @ (pull[:, 1] - mean * pull[:, 0])) / (n - 1)
+    scale2 = max(scale2, np.finfo(np.float64).tiny)
+    log_likelihood = (
+        scale.log_slope(values) - np.log(np.diag(L)).sum() - 0.5 * np.log(precision) - 0.5 * (n - 1) * np.log(scale2)
+    )
+    return Conditioned(hyperparameters, scale, y, L, mean, float(1 / precision), scale2, float(log_likelihood))
+
+
+def draw_hyperparameters(
+    X: Array, y: Array, count: int, rng: np.random.Generator, prior: Prior | None = None
+) -> list[Conditioned]:
+    """Return draws from the posterior of the hyperparameters, given values ``(n,)`` at unit-cube points ``(n, d)``.
+
+    Raises:
+        InputError: fewer than three values, all of them equal, or not finite.
+    """
+    if len(y) < 3 or not np.isfinite(y).all() or np.ptp(y) == 0:
+        raise InputError(f"hyperparameters need at least three finite values that differ, got {y.tolist()}.")
+    believed = Prior() if prior is None else prior
+    drawn = _Sampler(X, y, believed, rng).draw(count)
+    apart = max(_FEWEST, int(np.ceil(believed.spread_share * len(y))))
+    if apart < len(y):
+        rows = _spread(X, y, apart)
+        rougher = _Sampler(X[rows], y[rows], believed, rng).draw(count)
+        drawn = [(_as_rough_as(own, other), warp) for (own, warp), (other, _) in zip(drawn, rougher, strict=True)]
+    return [condition(own, X, y, warp) for own, warp in drawn]
+
+
+def _as_rough_as(own: Hyperparameters, other: Hyperparameters) -> Hyperparameters:
+    """Return hyperparameters with the length-scales shrunk to those of others in the mean, and no smoother."""
+    shrink = min(0.0, float((other.log_scales - own.log_scales).mean()))
+    return Hyperparameters(min(own.nu, other.nu), own.log_scales + shrink, own.log_noise)
+
+
+class _Sampler:
+    """A Markov chain over (nu, log length-scales, log noise)."""
+
+    def __init__(self, X: Array, y: Array, prior: Prior, rng: np.random.Generator) -> None:
+        self.X, self.y, self.prior, self.rng = X, y, prior, rng
+        self.d = X.shape[1]
+        self.low, self.high = np.log(prior.noise)
+        self.warps = prior.warps(y)
+        self.choice = (prior.smoothness[0], self.warps[0])
+        centre = np.log(prior.length_scale) + 0.5 * np.log(self.d)
+        self.state = np.append(np.full(self.d, centre), 0.5 * (self.low + self.high))
+
+    def draw(self, count: int) -> list[tuple[Hyperparameters, Warp]]:
+        """Return draws two sweeps apart, after a burn-in."""
+        for _ in range(20):
+            self._sweep()
+        draws = []
+        for _ in range(count):
+            self._sweep()
+            self._sweep()
+            nu, warp = self.choice
+            draws.append((self._hyperparameters(nu, self.state), warp))
+        return draws
+
+    def _hyperparameters(self, nu: float, state: Array) -> Hyperparameters:
+        return Hyperparameters(nu, state[: self.d], float(state[self.d]))
+
+    def _log_density(self, choice: tuple[float, Warp], state: Array) -> float:
+        nu, warp = choice
+        if not self.low <= state[-1] <= self.high or np.abs(state[:-1]).max() > 12:
+            return -np.inf
+        try:
+            conditioned = condition(self._hyperparameters(nu, state), self.X, self.y, warp)
+        except InputError:
+            return -np.inf
+        return conditioned.log_likelihood + self.prior.log_density(state[:-1])
+
+    def _sweep(self) -> None:
+        """Move along each length-scale, all of them together and the noise, then to another smoothness or scale."""
+        directions = [np.append(np.ones(self.d), 0.0)]
+        if self.d > 1:
+            directions += list(np.eye(self.d + 1)[: self.d])
+        if self.high > self.low:
+            directions.append(np.eye(self.d + 1)[self.d])
+        for direction in directions:
+            self.state = _slice(lambda state: self._log_density(self.choice, state), self.state, direction, self.rng)
+        self._choose()
+
+    def _choose(self) -> None:
+        choices = [(nu, warp) for nu in self.prior.smoothness for warp in self.warps]
+        if len(choices) == 1:
+            return
+        densities = np.array([self._log_density(choice, self.state) for choice in choices])
+        shares = np.exp(densities - densities.max())
+        self.choice = choices[int(self.rng.choice(len(choices), p=shares / shares.sum()))]
+
+
+def _spread(X: Array, y: Array, count: int) -> Rows:
+    """Return the rows of the largest value and of the points farthest from those before, in the data's order."""
+    rows = [int(y.argmax())]
+    gaps = np.linalg.norm(X - X[rows[0]], axis=1)
+    while len(rows) < min(count, len(y)):
+        gaps[rows[-1]] = -1.0  # never again, though other points are where it is
+        rows.append(int(gaps.argmax()))
+        gaps = np.minimum(gaps, np.linalg.norm(X - X[rows[-1]], axis=1))
+    return np.sort(rows)
+
+
+def _slice(log_density: Callable[[Array], float], state: Array, direction: Array, rng: np.random.Generator) -> Array:
+    """Return the next state of a slice sampler along a line, stepping out and shrinking (Neal 2003, Figs. 3 and 5)."""
+    level = log_density(state) + np.log(rng.random())
+    left = -_STEP * rng.random()
+    right = left + _STEP
+    steps_left = int(rng.integers(_MOST_STEPS))
+    for _ in range(steps_left):
+        if log_density(state + left * direction) <= level:
+            break
+        left -= _STEP
+    for _ in range(_MOST_STEPS - 1 - steps_left):
+        if log_density(state + right * direction) <= level:
+            break
+        right += _STEP
+    for _ in range(_MOST_SHRINKS):
+        move = rng.uniform(left, right)
+        proposal = state + move * direction
+        if log_density(proposal) > level:
+            return np.asarray(proposal)
+        left, right = (move, right) if move < 0 else (left, move)
+    return state

@@ -1,0 +1,209 @@
+"""Covariance functions with analytic gradients (Rasmussen and Williams 2006, chapters 4 and 5).
+
+A kernel is a stateless recipe: its hyperparameters come as one vector theta of natural logarithms, so that every
+real theta is valid. ``X`` and ``Z`` are points, shapes ``(n, d)`` and ``(m, d)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from ctxval._util.arrays import Array
+from ctxval.errors import InputError
+
+Bounds = list[tuple[float, float]]
+
+
+class Kernel(Protocol):
+    """A covariance function k(x, z; theta)."""
+
+    def bounds(self, dimension: int) -> Bounds:
+        """Return the box of theta within which the hyperparameters are searched; its length is that of theta."""
+
+    def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
+        """Return the covariances ``(n, m)``."""
+
+    def diagonal(self, theta: Array, X: Array) -> Array:
+        """Return the variances k(x, x), shape ``(n,)``."""
+
+    def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
+        """Return ``sum_ij W_ij dK_ij/dtheta`` for K = k(X, X) and a symmetric W, the shape of theta."""
+
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
+        """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``."""
+
+    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
+        """Return ``dk(x, x)/dx``, shape ``(n, d)``."""
+
+
+@dataclass(frozen=True)
+class Matern:
+    """Matern kernel of smoothness 3/2 or 5/2; theta = log of (variance, length-scales).
+
+    Attributes:
+        nu: 1.5 (the paper's) or 2.5.
+        ard: one length-scale for each dimension instead of one for all.
+        length_scale: bounds of the length-scales in the unit cube.
+        variance: bounds of the variance, for values of unit variance.
+
+    Raises:
+        InputError: another nu.
+    """
+
+    nu: float = 1.5
+    ard: bool = False
+    length_scale: tuple[float, float] = (0.03, 10.0)
+    variance: tuple[float, float] = (0.05, 50.0)
+
+    def __post_init__(self) -> None:
+        if self.nu not in (1.5, 2.5):
+            raise InputError(f"the smoothness nu of a Matern kernel must be 1.5 or 2.5, got {self.nu!r}.")
+
+    def bounds(self, dimension: int) -> Bounds:
+        """Return the box of theta."""
+        low, high = np.log(self.length_scale).tolist()
+        scales = [(low, high)] * (dimension if self.ard else 1)
+        return [(float(np.log(self.variance[0])), float(np.log(self.variance[1]))), *scales]
+
+    def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
+        """Return the covariances ``(n, m)``."""
+        scales = np.exp(theta[1:])
+        return np.asarray(np.exp(theta[0]) * self._profile(cdist(X / scales, Z / scales)))
+
+    def diagonal(self, theta: Array, X: Array) -> Array:
+        """Return the variance at each point, shape ``(n,)``."""
+        return np.full(len(X), np.exp(theta[0]))
+
+    def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
+        """Return ``sum_ij W_ij dK_ij/dtheta``."""
+        scales = np.exp(theta[1:])
+        Y = X / scales
+        r = cdist(Y, Y)
+        variance = np.exp(theta[0])
+        profile, slope = self._profile_and_slope(r)
+        by_variance = variance * np.vdot(W, profile)
+        # dk/d log l_j = slope(r) * (y_ij - y_kj)^2; the sum over pairs is a quadratic form, without (n, n, d) storage.
+        G = W * slope
+        G *= variance
+        if self.ard:
+            by_scales = 2 * ((G.sum(axis=1)[:, None] * Y**2).sum(axis=0) - (Y * (G @ Y)).sum(axis=0))
+        else:
+            by_scales = np.array([np.vdot(G, r**2)])
+        return np.concatenate([[by_variance], by_scales])
+
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
+        """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``."""
+        scales = np.exp(theta[1:])
+        Y, V = X / scales, Z / scales
+        slope = np.exp(theta[0]) * self._slope(cdist(Y, V))
+        return np.asarray(-slope[:, :, None] * (Y[:, None, :] - V[None, :, :]) / scales)
+
+    def weighted_input_gradient(self, theta: Array, X: Array, Z: Array, weights: Array) -> Array:
+        """Return ``sum_j weights_ij dk(x_i, z_j)/dx_i``, shape ``(n, d)``, without the ``(n, m, d)`` of its terms."""
+        scales = np.exp(theta[1:])
+        pulls = np.exp(theta[0]) * weights * self._slope(cdist(X / scales, Z / scales))
+        return np.asarray((pulls @ Z - pulls.sum(axis=1)[:, None] * X) / scales**2)
+
+    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
+        """Return zero: the kernel is stationary."""
+        return np.zeros_like(X)
+
+    def _profile(self, r: Array) -> Array:
+        """Return k(r) for unit variance and length-scale."""
+        return self._profile_and_slope(r)[0]
+
+    def _slope(self, r: Array) -> Array:
+        """Return ``-k'(r) / r``, which is finite at r = 0."""
+        return self._profile_and_slope(r)[1]
+
+    def _profile_and_slope(self, r: Array) -> tuple[Array, Array]:
+        s = np.sqrt(2 * self.nu) * r
+        decay = np.exp(-s)
+        if self.nu == 1.5:
+            return (1 + s) * decay, 3 * decay
+        return (1 + s + s**2 / 3) * decay, 5 / 3 * (1 + s) * decay
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Linear kernel ``v (1 + sum_j (x_j - 1/2)^2 ...)``: ``v_0 + v_1 (x - c)'(z - c)``; theta = log of (v_0, v_1).
+
+    Attributes:
+        centre: c, the same in each dimension; the middle of the unit cube.
+        variance: bounds of both variances, for values of unit variance.
+    """
+
+    centre: float = 0.5
+    variance: tuple[float, float] = (1e-4, 50.0)
+
+    def bounds(self, dimension: int) -> Bounds:
+        """Return the box of theta."""
+        low, high = np.log(self.variance).tolist()
+        return [(low, high), (low, high)]
+
+    def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
+        """Return the covariances ``(n, m)``."""
+        return np.asarray(np.exp(theta[0]) + np.exp(theta[1]) * (X - self.centre) @ (Z - self.centre).T)
+
+    def diagonal(self, theta: Array, X: Array) -> Array:
+        """Return the variances, shape ``(n,)``."""
+        return np.asarray(np.exp(theta[0]) + np.exp(theta[1]) * ((X - self.centre) ** 2).sum(axis=1))
+
+    def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
+        """Return ``sum_ij W_ij dK_ij/dtheta``."""
+        Y = X - self.centre
+        return np.array([np.exp(theta[0]) * W.sum(), np.exp(theta[1]) * (Y * (W @ Y)).sum()])
+
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
+        """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``."""
+        gradient = np.exp(theta[1]) * (Z - self.centre)
+        return np.broadcast_to(gradient, (len(X), *Z.shape))
+
+    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
+        """Return ``dk(x, x)/dx``, shape ``(n, d)``."""
+        return np.asarray(2 * np.exp(theta[1]) * (X - self.centre))
+
+
+@dataclass(frozen=True)
+class Sum:
+    """The sum of two kernels; theta is that of the first, then that of the second."""
+
+    first: Kernel
+    second: Kernel
+
+    def _split(self, theta: Array, dimension: int) -> tuple[Array, Array]:
+        size = len(self.first.bounds(dimension))
+        return theta[:size], theta[size:]
+
+    def bounds(self, dimension: int) -> Bounds:
+        """Return the box of theta."""
+        return [*self.first.bounds(dimension), *self.second.bounds(dimension)]
+
+    def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
+        """Return the covariances ``(n, m)``."""
+        a, b = self._split(theta, X.shape[1])
+        return self.first(a, X, Z) + self.second(b, X, Z)
+
+    def diagonal(self, theta: Array, X: Array) -> Array:
+        """Return the variances, shape ``(n,)``."""
+        a, b = self._split(theta, X.shape[1])
+        return self.first.diagonal(a, X) + self.second.diagonal(b, X)
+
+    def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
+        """Return ``sum_ij W_ij dK_ij/dtheta``."""
+        a, b = self._split(theta, X.shape[1])
+        return np.concatenate([self.first.weighted_gradient(a, X, W), self.second.weighted_gradient(b, X, W)])
+
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
+        """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``."""
+        a, b = self._split(theta, X.shape[1])
+        return self.first.input_gradient(a, X, Z) + self.second.input_gradient(b, X, Z)
+
+    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
+        """Return ``dk(x, x)/dx``, shape ``(n, d)``."""
+        a, b = self._split(theta, X.shape[1])
+        return self.first.diagonal_input_gradient(a, X) + self.second.diagonal_input_gradient(b, X)

@@ -1,0 +1,200 @@
+"""The Gaussian process over task parameters, fitted to distances in their own units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Rows
+from ctxval.errors import InputError
+from ctxval.gp import regression as gp
+from ctxval.gp.hyperposterior import Warp
+from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
+
+_KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())
+_LENGTH_SCALE, _SPREAD, _ARD_SPREAD = 0.4, 0.5, 0.3
+"""Median of the length-scales, times the square root of the dimension; deviation of the mean of their logarithms, and
+of each from that mean: few values say how smooth a function is, and many which dimensions matter."""
+_VARIANCE, _LINEAR = 1.0, 0.3
+"""Medians of the variances of the Matern part and, averaged over the cube, of each linear one."""
+_VARIANCE_SPREAD = 1.5
+_OFFSET = 0.1
+"""Of the logarithm, in means of the values, as in the prior of the certificates."""
+_CLEARLY = 0.25
+"""By how much, for each value, its logarithmic density must be larger for the logarithm of the values to be taken."""
+_LEARNED_FROM = 300
+"""Values that the hyperparameters are learned from at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surrogate:
+    """A GP of the distance over the unit cube.
+
+    Attributes:
+        process: the process of the standardised distance ``(d - shift) / scale``.
+        shift, scale: the standardisation.
+    """
+
+    process: gp.GaussianProcess
+    shift: float
+    scale: float
+
+    def predict(self, points: Array) -> tuple[Array, Array]:
+        """Return posterior mean and standard deviation at unit-cube points ``(m, d)``, shapes ``(m,)``."""
+        mean, variance = self.process.predict(points)
+        return self.shift + self.scale * mean, self.scale * np.sqrt(variance)
+
+
+def fit_surrogate(
+    points: Array,
+    values: Array,
+    kernel: Kernel | None = None,
+    *,
+    noise: tuple[float, float] = (gp.NOISE, gp.NOISE),
+    prior_mean: gp.Mean | None = None,
+) -> Surrogate:
+    """Return the GP of most likely hyperparameters, given values ``(n,)`` at unit-cube points ``(n, d)``.
+
+    Points whose value is NaN, pending or failed, are taken to have the value that the others predict: that lowers
+    the uncertainty around them and moves nothing.
+
+    Raises:
+        InputError: fewer than two values are known, or the prior mean is not finite at a known point.
+    """
+    known = np.isfinite(values)
+    if known.sum() < 2:
+        raise InputError(f"a surrogate needs at least two known distances, got {int(known.sum())}.")
+    X, y = points[known], values[known]
+    prior = np.zeros(len(y)) if prior_mean is None else np.asarray(prior_mean(X), dtype=np.float64)
+    if prior.shape != y.shape or not np.isfinite(prior).all():
+        raise InputError("the prior mean must return one finite value for each point.")
+    shift = float(y.mean()) if prior_mean is None else 0.0
+    scale = _scale(y - shift - prior)
+    mean = gp.zero_mean if prior_mean is None else _Scaled(prior_mean, scale)
+    process = gp.fit(Matern(1.5) if kernel is None else kernel, X, (y - shift) / scale, noise=noise, mean=mean)
+    return Surrogate(_with_believed(process, points[~known]), shift, scale)
+
+
+def _scale(residual: Array) -> float:
+    """Return the residual's root mean square, or 1 where it vanishes."""
+    spread = float(np.sqrt((residual**2).mean()))
+    return spread if spread > 1e-12 else 1.0
+
+
+@dataclass(frozen=True)
+class _Scaled:
+    mean: gp.Mean
+    scale: float
+
+    def __call__(self, X: Array) -> Array:
+        return np.asarray(self.mean(X), dtype=np.float64) / self.scale
+
+
+def _with_believed(process: gp.GaussianProcess, points: Array) -> gp.GaussianProcess:
+    if not len(points):
+        return process
+    believed, _ = process.predict(points)
+    X, y = np.concatenate([process.X, points]), np.concatenate([process.y, believed])
+    return gp.condition(process.kernel, process.theta, X, y, noise=process.noise, mean=process.mean)
+
+
+# For a search in many dimensions
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """What values say of a Gaussian process of theirs: it is conditioned on more of them without learning anew.
+
+    Attributes:
+        theta: logarithms of the hyperparameters of a Matern 3/2 kernel, a length-scale for each dimension, and a
+            linear kernel.
+        warp: the scale on which the values are a Gaussian process.
+        shift, scale: the standardisation on that scale.
+    """
+
+    theta: Array
+    warp: Warp
+    shift: float
+    scale: float
+
+    def standardised(self, values: Array) -> Array:
+        """Return values ``(n,)`` in the process's units."""
+        return np.asarray((self.warp.forward(values) - self.shift) / self.scale)
+
+    def condition(self, points: Array, values: Array) -> gp.GaussianProcess:
+        """Return the process given values ``(n,)``, NaN where pending or failed: there it believes what it predicts."""
+        known = np.isfinite(values)
+        process = gp.condition(_KERNEL, self.theta, points[known], self.standardised(values[known]))
+        return _with_believed(process, points[~known])
+
+
+def learn(points: Array, values: Array) -> Learned:
+    """Return the most likely hyperparameters given known values ``(n,)`` at unit-cube points ``(n, d)``.
+
+    Length-scales have a log-normal prior that grows with the root of the dimension (Hvarfner, Hellsten and Nardi
+    2024). The process is one of the values or, where none is negative and that predicts each value clearly better
+    from all others, of their logarithms.
+    """
+    if len(values) > _LEARNED_FROM:
+        rows = _telling(values)
+        points, values = points[rows], values[rows]
+    score, learned = _learn_on(points, values, Warp())
+    if values.min() >= 0 and values.max() > 0:
+        log_score, of_logarithm = _learn_on(points, values, Warp(_OFFSET * float(values.mean())))
+        if log_score > score + _CLEARLY * len(values):
+            return of_logarithm
+    return learned
+
+
+def _telling(values: Array) -> Rows:
+    """Return the rows of the largest values and of others evenly spread over the history."""
+    order = np.argsort(-values, kind="stable")
+    largest, others = order[: _LEARNED_FROM // 2], np.sort(order[_LEARNED_FROM // 2 :])
+    spread = others[np.linspace(0, len(others) - 1, _LEARNED_FROM - len(largest)).astype(int)]
+    return np.sort(np.concatenate([largest, spread]))
+
+
+def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, Learned]:
+    """Return how well each value is predicted from all others on a scale, and what was learned there."""
+    warped = warp.forward(values)
+    shift = float(warped.mean())
+    scale = _scale(warped - shift)
+    y = (warped - shift) / scale
+    process = gp.fit(_KERNEL, points, y, log_prior=_LogPrior(points.shape[1]), starts=_starts(points.shape[1]))
+    mean, variance = process.left_out()
+    score = -0.5 * (np.log(variance) + (y - mean) ** 2 / variance).sum() - len(y) * np.log(scale)
+    return float(score) + warp.log_slope(values), Learned(process.theta, warp, shift, scale)
+
+
+def _centre(dimension: int) -> Array:
+    """Return the medians' logarithms, of theta and of the noise, which is fixed."""
+    scales = [_LENGTH_SCALE * np.sqrt(dimension)] * dimension
+    return np.asarray(np.log([_VARIANCE, *scales, _LINEAR, 12 * _LINEAR / dimension, gp.NOISE]))
+
+
+def _starts(dimension: int) -> Array:
+    """Return starts of the climbs: the prior's mode, and something rougher."""
+    rougher = np.zeros(dimension + 4)
+    rougher[1 : dimension + 1] = -1.0
+    return np.asarray(_centre(dimension) + np.array([np.zeros(dimension + 4), rougher]))
+
+
+@dataclass(frozen=True)
+class _LogPrior:
+    """Independent normal densities of the hyperparameters' logarithms; length-scales have a mean in common.
+
+    Attributes:
+        dimension: of the points.
+    """
+
+    dimension: int
+
+    def __call__(self, parameters: Array) -> tuple[float, Array]:
+        """Return the log density at (theta, log noise), up to a constant, and its gradient."""
+        scales = slice(1, self.dimension + 1)
+        away = parameters - _centre(self.dimension)
+        gradient = -away / _VARIANCE_SPREAD**2
+        common = away[scales].mean()
+        gradient[scales] = -common / (self.dimension * _SPREAD**2) - (away[scales] - common) / _ARD_SPREAD**2
+        return 0.5 * float(away @ gradient), gradient  # the density is quadratic

@@ -1,0 +1,1 @@
+"""What executions teach about the system."""

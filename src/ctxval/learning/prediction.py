@@ -1,0 +1,193 @@
+"""The distance that executions predict, with M corrected by what they showed.
+
+The corrected model wrapped as a simulated system is a system again. So the predicted distance at p is the ordinary
+validation of M against M_hat, which designs the controller at every p and sees where that jumps.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.cores import on_all_cores
+from ctxval.core.distance import ComposedDistance
+from ctxval.core.rollout import rollout
+from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.core.validation import Validation
+from ctxval.learning.dynamics import CorrectedModel, learn_corrected
+from ctxval.learning.vector import predict_composed
+from ctxval.models.scaling import spread
+from ctxval.searches import Prediction
+
+_CENTRES, _WORK = (100, 450), 30_000
+"""Transitions that the residual is conditioned on, and their number times the horizon at most: the time of a loop."""
+_POOL, _DATA = 3000, 600
+"""Transitions of executions that these are chosen from, and of the model's own data: those nearest to the tasks."""
+_LOOPS, _SLOW_LOOPS = 64, 3
+"""Closed loops on M that show which transitions the tasks need, and how often one is tried where batches fail."""
+_DESIGNS, _SLOW_DESIGNS = 2000, 150
+"""Designs for one suggestion, where the synthesizer takes batches and where not."""
+_SLOW = 0.02
+"""Seconds of a closed loop on M from which on they are spread over the cores, where there can be no batch of them."""
+
+
+def predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
+    """Return what the executions so far, and the data that the model came with, let one expect of d at other points.
+
+    None where nothing was recorded, where M is not wrong in it, or where no task can be planned. Where the distance is
+    composed of a short vector, such as the error of the final state, the prediction names another to turn to, that of
+    the vectors as functions of p: what no function of state and input explains may still be one of p.
+
+    Args:
+        validation: the map p -> d(p).
+        executed: points of the unit cube ``(d,)`` with the system's trajectories there.
+    """
+    otherwise = functools.partial(_predict_vectors, validation, executed)
+    with single_threaded():
+        found = _predict_distance(validation, executed)
+        return otherwise() if found is None else replace(found, otherwise=otherwise)
+
+
+def _predict_vectors(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
+    """Return what the vectors that distances are composed of let one expect; None where they are not."""
+    distance = validation.distance
+    if not isinstance(distance, ComposedDistance) or len(executed) < 2:
+        return None
+    try:
+        errors = np.array([_vector(validation, distance, *pair) for pair in executed])
+    except Exception:  # the user's own parts; they work where S was executed, but a distance may still object
+        return None
+    if errors.ndim != 2 or not np.isfinite(errors).all():
+        return None
+    return predict_composed(np.array([point for point, _ in executed]), errors, distance.compose)
+
+
+def _vector(validation: Validation, distance: ComposedDistance, point: Array, trajectory: Trajectory) -> Array:
+    plan = validation.plan(validation.space.from_unit(point))
+    return distance.error(plan.model_trajectory, trajectory, plan.task)
+
+
+def _predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
+    started = time.perf_counter()
+    loops = _closed_loops_on_model(validation)
+    seconds = time.perf_counter() - started
+    if loops is None:
+        return None
+    parts = [trajectory.transitions() for _, trajectory in executed]
+    sources = [np.full(len(part), k) for k, part in enumerate(parts)]
+    data = getattr(validation.model, "data", None)
+    if isinstance(data, Transitions) and len(data):
+        parts.append(_nearest(data, loops))
+        sources.append(np.full(len(parts[-1]), -1))
+    if not parts:
+        return None
+    together, of = Transitions.joined(parts), np.concatenate(sources)
+    if len(of) > _POOL:
+        kept = np.sort(np.random.default_rng(len(of)).permutation(len(of))[:_POOL])
+        together, of = Transitions(together.x[kept], together.u[kept], together.x_next[kept]), of[kept]
+    centres = int(np.clip(_WORK // loops.horizon, *_CENTRES))
+    corrected = learn_corrected(validation.model, together, of, centres)
+    if corrected is None:
+        return None
+    batched = bool(loops.batch_shape)
+    forecast = _Forecast(validation, corrected, batched, executed, spread_out=not batched and seconds > _SLOW)
+    return Prediction(forecast, forecast.left_out, _DESIGNS if batched else _SLOW_DESIGNS)
+
+
+def _closed_loops_on_model(validation: Validation) -> Trajectory | None:
+    """Return what M promises for some tasks: a batch, or one task where there can be no batch; None for none at all."""
+    space = validation.space
+    points = space.from_unit(np.random.default_rng(0).random((_LOOPS, space.dimension)))
+    batches = [points] if getattr(validation.synthesizer, "batched", False) else []
+    for rows in [*batches, *points[:_SLOW_LOOPS]]:
+        try:
+            task = validation.task(space.parameters(rows))
+            loops = rollout(validation.model.step, validation.synthesizer.design(task, validation.model), task)
+        except Exception:  # the user's own parts, on tasks that nobody may ever ask for
+            continue
+        if loops.batch_shape == rows.shape[:-1]:
+            return loops
+    return None
+
+
+def _nearest(data: Transitions, loops: Trajectory) -> Transitions:
+    """Return the transitions that are nearest to where the tasks lead."""
+    if len(data) <= _DATA:
+        return data
+    needed = loops.transitions()
+    there = np.concatenate([needed.x, needed.u], axis=1)
+    there = there[np.isfinite(there).all(axis=1)][:: max(1, len(there) // _POOL)]
+    here = np.concatenate([data.x, data.u], axis=1)
+    if not len(there):
+        return data
+    scale = spread(here)
+    kept = np.sort(np.argsort(cdist(here / scale, there / scale).min(axis=1), kind="stable")[:_DATA])
+    return Transitions(data.x[kept], data.u[kept], data.x_next[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class _Forecast:
+    """The validation of M against M_hat, in the unit cube.
+
+    Attributes:
+        validation: of M against S.
+        corrected: M_hat.
+        batched: whether controllers are designed in batches.
+        executed: points with the trajectories that M_hat was learned from.
+        spread_out: whether closed loops are spread over the cores; they come out the same.
+    """
+
+    validation: Validation
+    corrected: CorrectedModel
+    batched: bool
+    executed: Sequence[tuple[Array, Trajectory]]
+    spread_out: bool
+
+    def __call__(self, points: Array) -> tuple[Array, Array]:
+        """Return the predicted distances ``(m,)`` and how little of the predicted trajectories was seen, ``(m,)``."""
+        with single_threaded():
+            if not self.spread_out:
+                return self._looped(points, self.corrected)
+            parts = on_all_cores(functools.partial(self._looped, corrected=self.corrected), list(points[:, None, :]))
+            return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+    def left_out(self, rows: Rows) -> Array:
+        """Return the distances predicted at executed points, each from the executions of other points, ``(k,)``."""
+        points = [self.executed[k][0] for k in rows.tolist()]
+        with single_threaded():
+            return np.array([self._looped(point[None], self._without(point))[0][0] for point in points])
+
+    def _without(self, point: Array) -> CorrectedModel:
+        there = [source for source, (other, _) in enumerate(self.executed) if np.array_equal(other, point)]
+        return CorrectedModel(self.corrected.model, self.corrected.residual.without(there))
+
+    def _looped(self, points: Array, corrected: CorrectedModel) -> tuple[Array, Array]:
+        """Halve what fails, so that a task without a prediction, NaN, costs the others nothing."""
+        if self.batched or len(points) == 1:
+            try:
+                return self._closed_loops(points, corrected)
+            except Exception:  # a task, a synthesizer or a distance of the user's, on points that nobody may ever run
+                if len(points) == 1:
+                    return np.array([np.nan]), np.array([np.nan])
+        half = len(points) // 2
+        parts = [self._looped(part, corrected) for part in (points[:half], points[half:])]
+        return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+    def _closed_loops(self, points: Array, corrected: CorrectedModel) -> tuple[Array, Array]:
+        parts, space = self.validation, self.validation.space
+        rows = points if self.batched else points[0]
+        task = parts.task(space.parameters(space.from_unit(rows)))
+        controller = parts.synthesizer.design(task, parts.model)
+        promised = rollout(parts.model.step, controller, task)
+        predicted = rollout(corrected.step, controller, task)
+        with np.errstate(all="ignore"):
+            distance = np.reshape(parts.distance(promised, predicted, task), len(points))
+            doubt = np.reshape(corrected.residual.unfamiliarity(predicted), len(points))
+        finite = np.isfinite(distance) & np.isfinite(doubt)
+        return np.where(finite, distance, np.nan), np.where(finite, doubt, np.nan)

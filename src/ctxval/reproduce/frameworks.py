@@ -1,0 +1,112 @@
+"""The paper's Example 1: the running example's M and S compared in four frameworks.
+
+In open loop by whole trajectories (OLDT) or final states (OLCD), in closed loop by whole trajectories (CCDT) or final
+states (CuSTOM).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval import Task, Trajectory, Validation, distances, systems
+from ctxval._util.arrays import Array
+from ctxval.cases import pendulum
+from ctxval.reproduce.open_loop import OpenLoopWorst, worst_open_loop
+
+WHOLE = distances.WholeTrajectory(norm=np.inf)
+"""The distance of OLDT and CCDT."""
+
+FINAL = distances.FinalState(norm=1)
+"""The distance of OLCD and CuSTOM."""
+
+BOUND = pendulum.Settings().torque
+"""Of the open-loop torques, N m: that of the training data, so that the model does not extrapolate in the input.
+
+The paper leaves the torque unbounded, where no largest open-loop distance exists. The distance grows with the bound:
+if it exceeds the closed-loop one here, so it does with the far larger torques that the closed loops use.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Frameworks:
+    """The distance between M and S as each framework has it.
+
+    Attributes:
+        goals: theta_final, shape ``(N,)``, rad.
+        ccdt: distance of the closed loops' trajectories for each goal, shape ``(N,)``.
+        custom: distance of the closed loops' final states for each goal, shape ``(N,)``.
+        oldt: the largest distance of open-loop trajectories, the same for every goal.
+        olcd: the largest distance of open-loop final states, the same for every goal.
+        bound: of the open-loop torques, N m.
+        closed_loop_torque: the largest torque of any closed loop, on M or on S, N m.
+    """
+
+    goals: Array
+    ccdt: Array
+    custom: Array
+    oldt: OpenLoopWorst
+    olcd: OpenLoopWorst
+    bound: float
+    closed_loop_torque: float
+
+    @property
+    def worst_ccdt_goal(self) -> float:
+        """The goal where CCDT is largest, rad."""
+        return float(self.goals[np.argmax(self.ccdt)])
+
+    @property
+    def worst_custom_goal(self) -> float:
+        """The goal where CuSTOM is largest, rad."""
+        return float(self.goals[np.argmax(self.custom)])
+
+
+def frameworks(seed: int = 0, *, per_axis: int = 2001, restarts: int = 64, bound: float = BOUND) -> Frameworks:
+    """Return the four distances of the running example.
+
+    Args:
+        seed: draws the data that the model is learned from, and where the open-loop searches start.
+        per_axis: goals on the grid.
+        restarts: of each open-loop search.
+        bound: of the open-loop torques, N m.
+
+    Raises:
+        InputError: an argument cannot be used.
+    """
+    validation = pendulum.experiment(seed).validation
+    goals = validation.space.grid(per_axis)
+    task = validation.task(validation.space.parameters(goals))
+    on_model, on_system = closed_loops(validation, task)
+    torques = [float(np.abs(loop.inputs).max()) for loop in (on_model, on_system)]
+    oldt, olcd = (open_loop(validation, distance, bound, restarts, seed) for distance in (WHOLE, FINAL))
+    return Frameworks(
+        goals=goals[:, 0],
+        ccdt=WHOLE(on_model, on_system, task),
+        custom=FINAL(on_model, on_system, task),
+        oldt=oldt,
+        olcd=olcd,
+        bound=bound,
+        closed_loop_torque=max(torques),
+    )
+
+
+def closed_loops(validation: Validation, task: Task) -> tuple[Trajectory, Trajectory]:
+    """Return the closed loops on M and on S for a batch of tasks."""
+    controller = validation.synthesizer.design(task, validation.model)
+    on_model = systems.Simulated(validation.model).execute(controller, task)
+    return on_model, validation.system.execute(controller, task)
+
+
+def open_loop(
+    validation: Validation,
+    distance: distances.FinalState | distances.WholeTrajectory,
+    bound: float,
+    restarts: int,
+    seed: int,
+) -> OpenLoopWorst:
+    """Return the worst open loop from the running example's initial state."""
+    assert isinstance(validation.system, systems.Simulated)  # the running example's is
+    task = validation.task(validation.space.parameters([0.0]))
+    step = validation.system.model
+    return worst_open_loop(step, validation.model, task, bound, distance, restarts=restarts, seed=seed)

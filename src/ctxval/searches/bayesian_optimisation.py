@@ -1,0 +1,214 @@
+"""Bayesian optimisation where nothing is known but the values: two acquisition functions, and branches out of basins.
+
+The surrogate is that of :func:`ctxval.gp.surrogate.learn`. Its expected improvement or, every third time, its upper
+confidence bound is maximised over the cube. After some executions without improvement the search branches: of all
+coordinates it takes the one across which, seen from the best point, it has been least often, and stays in that half of
+the cube. There it starts where the bound is largest, and then improves on what this branch has found itself, not on
+the best of all, as a wide basin that is not the highest is left only through what is lower.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, single_threaded
+from ctxval.errors import InputError
+from ctxval.gp import regression as gp
+from ctxval.gp.acquisition import Acquisition, Box, LogExpectedImprovement, UpperConfidenceBound, maximise
+from ctxval.gp.subset import kept_rows
+from ctxval.gp.surrogate import Learned, learn
+from ctxval.searches.base import Note, SequentialSearch, best_first
+
+_WORTH = 0.005
+"""The least improvement worth an execution, as a share of what the best value is above the median."""
+_PATIENCE, _BRANCH_PATIENCE = 8, 6
+"""Executions without improvement after which the search branches, and after which it leaves a branch for another."""
+_EVERYWHERE = 4
+"""Every so many executions are chosen for the whole cube whatever the branch; in few dimensions they fill the space."""
+_BOUND = 3
+"""Every so many executions maximise the upper confidence bound."""
+_BOLD = 100.0
+"""The confidence parameter of the bound where a branch starts."""
+_FEW, _FILLERS = 2, 512
+"""Dimensions up to which a share of the executions fills the space, and candidates for each of these."""
+_EACH = 20
+"""Up to so many values the hyperparameters are learned with each new one, up to twice as many with each second ..."""
+_KEPT = 1000
+"""Points of a long history that the surrogate is conditioned on."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Branch:
+    """Half of the cube.
+
+    Attributes:
+        coordinate: the axis that is halved.
+        upper: which half.
+        best: the largest value that it has found; minus infinity at first.
+        misses: executions without improvement in it, one after the other.
+    """
+
+    coordinate: int
+    upper: bool
+    best: float = -np.inf
+    misses: int = 0
+
+    def has(self, point: Array) -> bool:
+        """Return whether a point ``(d,)`` is in it."""
+        return bool(point[self.coordinate] >= 0.5) is self.upper
+
+    def box(self, dimension: int) -> Box:
+        """Return its bounds."""
+        low, high = np.zeros(dimension), np.ones(dimension)
+        (low if self.upper else high)[self.coordinate] = 0.5
+        return low, high
+
+
+class Scalar(SequentialSearch):
+    """The search where only values are known: expected improvement and upper bounds, with branches out of basins.
+
+    From 1,000 points on the surrogate is conditioned on 1,000 of them: the largest values, the latest, and well-spread
+    ones.
+
+    Args:
+        initial: how many random points come first; in one and two dimensions all but one are far from each other.
+        beta: the confidence parameter of the upper bounds.
+
+    Raises:
+        InputError: beta is negative or there is no initial point.
+    """
+
+    def __init__(self, initial: int = 3, beta: float = 4.0) -> None:
+        if initial < 1:
+            raise InputError(f"the scalar search needs at least one initial point, got {initial}.")
+        if not 0 <= beta < float("inf"):
+            raise InputError(f"beta must not be negative or infinite, got {beta!r}.")
+        self.initial = initial
+        self.beta = beta
+
+    def reset(self, dimension: int, seed: int) -> None:
+        """Forget everything and start on the unit cube of this dimension."""
+        super().reset(dimension, seed)
+        self._memo: tuple[bytes, Learned] | None = None
+
+    def propose(self, rng: np.random.Generator) -> Array:
+        """Return the point worth most."""
+        point, self._thought = self.choose(self.points, self.values, rng)
+        return point
+
+    def choose(self, points: Array, values: Array, rng: np.random.Generator) -> tuple[Array, Note]:
+        """Return the point ``(d,)`` worth most after this history, whoever asked for it, and what was thought.
+
+        Args:
+            points, values: ``(n, d)`` and ``(n,)``, NaN where pending or failed.
+            rng: of the candidates.
+        """
+        few = self.dimension <= _FEW
+        if len(values) < self.initial or np.isfinite(values).sum() < 2:
+            point = _filling(points, rng) if few and len(points) else rng.random(self.dimension)
+            return point, {"engine": "scalar", "how": "initial"}
+        if few and len(values) % _EVERYWHERE == 0:
+            return _filling(points, rng), {"engine": "scalar", "how": "filling"}
+        with single_threaded():
+            return self._most_worth(points, values, rng)
+
+    def _most_worth(self, points: Array, values: Array, rng: np.random.Generator) -> tuple[Array, Note]:
+        known = np.isfinite(values)
+        learned = self._learned(points[known], values[known])
+        rows = kept_rows(points, values, _KEPT)
+        process = learned.condition(points[rows], values[rows])
+        branch = None if len(values) % _EVERYWHERE == 0 else _branch(points[known], values[known])
+        believed = process.y[int(known[rows].sum()) :].max(initial=-np.inf)
+        acquisition = self._acquisition(learned, process, values, branch, float(believed))
+        box = None if branch is None else branch.box(self.dimension)
+        known_first, away = best_first(points, values), points[~known]
+        point = maximise(acquisition, self.dimension, known_first, rng, box=box, corners=True, away=away)
+        return point, {
+            "engine": "scalar",
+            "how": "bound" if isinstance(acquisition, UpperConfidenceBound) else "improvement",
+            "branch": None if branch is None else [branch.coordinate, branch.upper],
+            "logarithm": bool(np.isfinite(learned.warp.offset)),
+        }
+
+    def _acquisition(
+        self, learned: Learned, process: gp.GaussianProcess, values: Array, branch: _Branch | None, believed: float
+    ) -> Acquisition:
+        if branch is not None and not np.isfinite(branch.best):
+            # Far from the flank of the basin that was left: there the branch would only lead back to it.
+            return UpperConfidenceBound(process, _BOLD)
+        if len(values) % _BOUND == _BOUND - 1:
+            return UpperConfidenceBound(process, self.beta)
+        if branch is not None:
+            return LogExpectedImprovement(process, _worthwhile(learned, values, branch.best))
+        # What is believed of pending points counts: questions of one batch do not all improve on the same value.
+        best = _worthwhile(learned, values, float(np.nanmax(values)))
+        return LogExpectedImprovement(process, max(best, believed))
+
+    def _learned(self, points: Array, values: Array) -> Learned:
+        """Return the hyperparameters, which are a function of the first so many values by a fixed schedule."""
+        count = _scheduled(len(values))
+        key = points[:count].tobytes() + values[:count].tobytes()
+        if self._memo is None or self._memo[0] != key:
+            self._memo = (key, learn(points[:count], values[:count]))
+        return self._memo[1]
+
+
+def _scheduled(count: int) -> int:
+    """Return the largest number up to ``count`` at which hyperparameters are learned."""
+    step = 1
+    while count >= 2 * _EACH * step:
+        step *= 2
+    return count - count % step
+
+
+def _worthwhile(learned: Learned, values: Array, best: float) -> float:
+    """Return the value to improve on, in the process's units."""
+    margin = _WORTH * float(np.nanmax(values) - np.nanmedian(values))
+    return float(learned.standardised(np.array([best + margin]))[0])
+
+
+def _filling(points: Array, rng: np.random.Generator) -> Array:
+    """Return a point ``(d,)`` far from all others."""
+    candidates = rng.random((_FILLERS, points.shape[1]))
+    gaps = np.linalg.norm(candidates[:, None, :] - points[None, :, :], axis=2).min(axis=1)
+    return np.asarray(candidates[np.argmax(gaps)])
+
+
+def _branch(points: Array, values: Array) -> _Branch | None:
+    """Return the branch in which these known values leave the search, in their order; None for the whole cube."""
+    branch, misses, best, place = None, 0, -np.inf, points[0]
+    ordered: list[float] = []
+    for count, (point, value) in enumerate(zip(points, values.tolist(), strict=True), start=1):
+        insort(ordered, value)
+        median = (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
+        margin = _WORTH * max(best, value) - _WORTH * median
+        improves = value > best + margin
+        if value > best:
+            best, place = value, point
+        if improves:
+            branch, misses = None, 0
+        elif branch is None:
+            misses += 1
+        elif branch.has(point):
+            branch = _after(branch, value, margin)
+        exhausted = misses >= _PATIENCE if branch is None else branch.misses >= _BRANCH_PATIENCE
+        if exhausted:
+            branch, misses = _across(place, points[:count]), 0
+    return branch
+
+
+def _after(branch: _Branch, value: float, margin: float) -> _Branch:
+    """Return a branch after one of its values."""
+    misses = 0 if value > branch.best + margin else branch.misses + 1
+    return _Branch(branch.coordinate, branch.upper, max(branch.best, value), misses)
+
+
+def _across(place: Array, points: Array) -> _Branch:
+    """Return the half of the cube, away from a place ``(d,)``, that fewest points are in."""
+    upper = place < 0.5
+    visited = ((points >= 0.5) == upper).sum(axis=0)
+    coordinate = int(visited.argmin())
+    return _Branch(coordinate, bool(upper[coordinate]))

@@ -1,0 +1,280 @@
+"""What can be read of a store, whole or damaged, as CSV and JSON."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import sqlite3
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+from urllib.parse import quote
+
+from ctxval._util.describe import describe
+from ctxval._util.temporary import scratch
+from ctxval._util.texts import guarded, shortened, visible
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Trial
+from ctxval.errors import CtxvalError, InputError, StoreAccessError
+from ctxval.storage import schema
+from ctxval.storage.rows import CHECKED, COLUMNS, read_json, read_trajectory, read_trial, trial_checksum
+from ctxval.storage.store import Side, Store
+
+_PROBED = 10_000
+"""Numbers of rows that are tried where the file does not say how many there are."""
+
+_SMALLEST = 16
+"""Bytes that a row takes at least."""
+
+_LOOKS, _BETWEEN = 20, 0.05
+"""How often, and after how many seconds, it is looked whether a journal has gone."""
+
+_DEPTH = 100
+"""Levels of what is written as JSON: more than is ever read."""
+
+_TABLES = ("experiment", "settings", "history", "trials", "trajectories")
+
+_UNREADABLE = (sqlite3.Error, CtxvalError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
+
+
+@dataclass(eq=False)
+class Salvage:
+    """What was readable.
+
+    Attributes:
+        trials: by number.
+        trajectories: by number and side.
+        about: the tables experiment, settings and history.
+        damaged: a sentence for each thing that was not readable.
+    """
+
+    trials: dict[int, Trial] = field(default_factory=dict)
+    trajectories: dict[tuple[int, Side], Trajectory] = field(default_factory=dict)
+    about: dict[str, Any] = field(default_factory=dict)
+    damaged: list[str] = field(default_factory=list)
+
+
+def salvage(path: Path) -> Salvage:
+    """Read what is readable of a store; the file is not changed where it is damaged, or has a journal.
+
+    Raises:
+        StoreAccessError: there is no such file, or it cannot be read at all.
+    """
+    schema.require_file(path)
+    if not path.is_file():
+        raise StoreAccessError(f"there is no store at {path}.")
+    found = Salvage()
+    with _played_back(path, found) as readable:
+        try:
+            uri = f"file:{quote(str(readable.absolute()))}?mode=ro&immutable=1"
+            connection = sqlite3.connect(uri, uri=True, factory=schema.Guarded)
+        except sqlite3.Error as error:
+            raise StoreAccessError(f"{path} cannot be read: {error}.") from error
+        try:
+            _read(connection, path.stat().st_size, found)
+        finally:
+            connection.close()
+    return found
+
+
+@contextmanager
+def _played_back(path: Path, found: Salvage) -> Iterator[Path]:
+    """Give the file to read: the store, or a copy into which the journal of a process that died was played back."""
+    journals = _left_journals(path)
+    if not journals:
+        try:
+            Store.existing(path).close()
+        except CtxvalError as error:
+            found.damaged.append(str(error))
+        yield path
+        return
+    with scratch() as folder:
+        copy = folder / "store.sqlite"
+        try:
+            # In place it might destroy what is readable, should the journal be another database's.
+            for file, ending in journals.items():
+                shutil.copyfile(file, f"{copy}{ending}")
+            Store.existing(copy).close()
+        except (CtxvalError, OSError) as error:
+            found.damaged.append(str(error).replace(str(copy), str(path)))
+            copy = path
+        yield copy
+
+
+def _left_journals(path: Path) -> dict[Path, str]:
+    """Return the store and the journals beside it, with their endings; empty where there is none for long."""
+    for _ in range(_LOOKS):
+        journals = schema.beside(path)
+        if not journals:
+            return {}
+        time.sleep(_BETWEEN)  # it may be of a process that is writing
+    real = str(path.resolve())
+    return {path: ""} | {journal: str(journal).removeprefix(real) for journal in journals}
+
+
+def _read(connection: sqlite3.Connection, size: int, found: Salvage) -> None:
+    try:
+        # Or SQLite refuses a file that is shorter than it says.
+        connection.execute("PRAGMA writable_schema = ON")
+        unchecked = connection.execute("PRAGMA user_version").fetchone()[0] < CHECKED
+        tables = schema.plain_tables(connection, _TABLES)
+    except _UNREADABLE as error:
+        found.damaged.append(f"nothing is readable: {error}")
+        return
+    missing = [name for name in _TABLES if name not in tables and (name != "history" or not unchecked)]
+    found.damaged += [f"the table {name} is missing, or is no plain table" for name in missing]
+    reader = _Reader(connection, tables, size, unchecked, found)
+    for table in ("experiment", "settings"):
+        found.about[table] = dict(reader.pairs(table))
+    found.about["history"] = list(reader.history())
+    for row in reader.rows("trials", [*(name.strip() for name in COLUMNS.split(",")), "checksum"]):
+        reader.take_trial(row)
+    for row in reader.rows("trajectories", ["trial", "side", "npz", "checksum"]):
+        reader.take_trajectory(*row)
+
+
+@dataclass(eq=False)
+class _Reader:
+    """Reads tables row by row, each by its place, so that one row that is damaged does not hide the next."""
+
+    connection: sqlite3.Connection
+    tables: dict[str, set[str]]
+    size: int
+    unchecked: bool
+    found: Salvage
+
+    def pairs(self, table: str) -> Iterator[tuple[str, Any]]:
+        for key, value in self.rows(table, ["key", "value"]):
+            try:
+                yield str(key), read_json(value, finite=False)
+            except InputError as error:
+                self._note(f"the table {table}, {key}: {error}")
+
+    def history(self) -> Iterator[dict[str, Any]]:
+        """Return what was changed in the store; versions before it was kept have none."""
+        for at, what, why, content in self.rows("history", ["at", "what", "why", "content"]):
+            try:
+                yield {"at": str(at), "what": str(what), "why": str(why), "content": read_json(content, finite=False)}
+            except InputError as error:
+                self._note(f"the table history, {at}: {error}")
+
+    def rows(self, table: str, columns: list[str]) -> Iterator[tuple[Any, ...]]:
+        """Return the readable rows of a table; columns that older versions have not are None."""
+        if table not in self.tables:
+            return
+        wanted = ", ".join(name if name in self.tables[table] else f"NULL AS {name}" for name in columns)
+        unreadable: dict[str, list[int]] = {}
+        for place in self._places(table):
+            try:
+                row = self.connection.execute(f"SELECT {wanted} FROM {table} WHERE rowid = ?", (place,)).fetchone()
+            except _UNREADABLE as error:
+                unreadable.setdefault(str(error), []).append(place)
+                continue
+            if row is not None:
+                yield row
+        for reason, places in unreadable.items():
+            self._note(f"the table {table}, {_rows(places)}: {reason}")
+
+    def _places(self, table: str) -> list[int]:
+        places: set[int] = set()
+        try:
+            places.update(place for (place,) in self.connection.execute(f"SELECT rowid FROM {table} NOT INDEXED"))
+        except _UNREADABLE as error:
+            self._note(f"the table {table}: {error}")
+            # What is behind the damage is found by its number, of which a file has not more than it has room for.
+            places |= set(range(min(self._last(table) + 1, self.size // _SMALLEST)))
+        return sorted(places)
+
+    def _last(self, table: str) -> int:
+        try:
+            last = self.connection.execute(f"SELECT max(rowid) FROM {table}").fetchone()[0]
+        except _UNREADABLE:
+            return _PROBED
+        return int(last or 0)
+
+    def take_trial(self, row: tuple[Any, ...]) -> None:
+        number, *values, checksum = row
+        trial = read_trial((number, *values), checksum, unchecked=self.unchecked)
+        if trial is not None and trial.number not in self.found.trials:
+            self.found.trials[trial.number] = trial
+        elif trial is not None:
+            self._note(f"trial {number} is there more than once, and the first one is taken")
+        elif checksum is not None and trial_checksum((number, *values)) == checksum:
+            self._note(f"trial {number}: it holds what no trial can")
+        else:
+            self._note(f"trial {number}: its checksum does not fit")
+
+    def take_trajectory(self, number: Any, side: Any, npz: Any, checksum: Any) -> None:
+        name = f"the {side}'s trajectory of trial {number}"
+        if side not in get_args(Side) or not isinstance(number, int):
+            self._note(f"{name}: there is no such thing")
+        elif (number, side) in self.found.trajectories:
+            self._note(f"{name} is there more than once, and the first one is taken")
+        elif trajectory := read_trajectory(number, side, npz, checksum, unchecked=self.unchecked):
+            self.found.trajectories[number, side] = trajectory
+        else:
+            self._note(f"{name}: its checksum does not fit")
+
+    def _note(self, sentence: str) -> None:
+        self.found.damaged.append(shortened(sentence))
+
+
+def _rows(places: list[int]) -> str:
+    """Name rows, in the order of their places; one that is probed on damaged pages is one of thousands."""
+    if len(places) == 1:
+        return f"row {places[0]}"
+    return f"{len(places)} rows from {places[0]} to {places[-1]}"
+
+
+def export(found: Salvage, folder: Path) -> list[Path]:
+    """Write trials.csv, trials.json and a CSV file of each trajectory.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    try:
+        (folder / "trajectories").mkdir(parents=True, exist_ok=True)
+        paths = [folder / "trials.csv", folder / "trials.json"]
+        _write_table(paths[0], found)
+        trials = [asdict(trial) | {"unit_point": trial.unit_point.tolist()} for trial in found.trials.values()]
+        content = describe({**found.about, "damaged": found.damaged, "trials": trials}, _DEPTH)
+        paths[1].write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
+        for (number, side), trajectory in found.trajectories.items():
+            paths.append(folder / "trajectories" / f"{number}.{side}.csv")
+            trajectory.to_csv(paths[-1])
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written: {error.strerror}.") from error
+    return paths
+
+
+def _write_table(path: Path, found: Salvage) -> None:
+    rows = [_flat(trial) for trial in found.trials.values()]
+    header = list(dict.fromkeys(name for row in rows for name in row))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([_cell(name) for name in header])
+        writer.writerows([_cell(row.get(name)) for name in header] for row in rows)
+
+
+def _cell(value: Any) -> Any:
+    """Return a value as a cell; a text does nothing in a spreadsheet or in a terminal."""
+    return guarded(visible(value)) if isinstance(value, str) else value
+
+
+def _flat(trial: Trial) -> dict[str, Any]:
+    parameters: dict[str, Any] = {}
+    for name, value in trial.parameters.items():
+        entries = {name: value} if not isinstance(value, list) else {f"{name}[{i}]": v for i, v in enumerate(value)}
+        parameters |= entries
+    ended = ("distance", "failure", "executed", "attempts", "seconds")
+    return {
+        "number": trial.number,
+        "origin": trial.origin,
+        "state": trial.state,
+        **parameters,
+        **{name: getattr(trial, name) for name in ended},
+    }

@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from ctxval._util.arrays import (
+    as_finite,
+    as_floats,
+    as_norm_order,
+    as_weight,
+    require_shape,
+    single_threaded,
+    vector_norm,
+)
+from ctxval.errors import InputError, ShapeError
+
+VECTORS = arrays(np.float64, array_shapes(min_dims=1, max_dims=3, max_side=4), elements=st.floats(-1e6, 1e6))
+
+
+def test_numbers_become_float64() -> None:
+    array = as_floats("x", [[1, 2], [3, 4]])
+    assert array.dtype == np.float64
+    assert array.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+
+
+@pytest.mark.parametrize("value", ["goal", [1, [2, 3]], {"a": 1}, [object()]])
+def test_what_is_no_number_is_refused_by_name(value: object) -> None:
+    with pytest.raises(InputError, match=r"^x must be numbers, got "):
+        as_floats("x", value)
+
+
+@pytest.mark.parametrize("value", [np.nan, [1.0, np.inf], None])
+def test_what_is_not_finite_is_refused_by_name_and_value(value: object) -> None:
+    with pytest.raises(InputError, match=r"^x must be finite, got .*(nan|inf)"):
+        as_finite("x", value)
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 3), (4, 2, 3)])
+def test_only_the_last_axes_are_required(shape: tuple[int, ...]) -> None:
+    array = np.zeros(shape)
+    assert require_shape("x", array, (3,)) is array
+
+
+@pytest.mark.parametrize(("shape", "expected"), [((), (3,)), ((4,), (3,)), ((3,), (2, 3)), ((3, 2), (2, 3))])
+def test_a_wrong_shape_is_named_beside_the_right_one(shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    with pytest.raises(ShapeError) as caught:
+        require_shape("x", np.zeros(shape), expected)
+    assert str(shape) in str(caught.value)
+    assert ", ".join(map(str, expected)) in str(caught.value)
+
+
+def test_a_weight_is_a_diagonal_or_a_matrix() -> None:
+    np.testing.assert_array_equal(as_weight("Q", [1, 2]), [[1, 0], [0, 2]])
+    np.testing.assert_array_equal(as_weight("Q", [[2, 1], [1, 2]]), [[2, 1], [1, 2]])
+
+
+@pytest.mark.parametrize("value", [1.0, [], [[1, 2]], np.zeros((2, 2, 2))])
+def test_a_weight_of_another_shape_is_refused(value: object) -> None:
+    with pytest.raises(ShapeError, match=r"Q must be a diagonal or a square matrix, got shape"):
+        as_weight("Q", value)
+
+
+@pytest.mark.parametrize(
+    ("value", "sentence"),
+    [
+        ([1, np.nan], r"Q must be finite, got \[1.0, nan\]"),
+        ([[1, 2], [0, 1]], r"Q must be symmetric, got \[\[1.0, 2.0\], \[0.0, 1.0\]\]"),
+        ([1, -2], r"Q must have no negative eigenvalue, got \[\[1.0, 0.0\], \[0.0, -2.0\]\]"),
+        ([[1, 2], [2, 1]], r"Q must have no negative eigenvalue"),
+    ],
+)
+def test_a_weight_that_is_not_positive_semidefinite_is_refused(value: object, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        as_weight("Q", value)
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+def test_rounding_does_not_make_a_gram_matrix_an_invalid_weight(scale: float) -> None:
+    factor = np.random.default_rng(0).normal(size=(5, 2))
+    gram = scale * factor @ factor.T
+    np.testing.assert_array_equal(as_weight("Q", gram), gram)
+
+
+@pytest.mark.parametrize("order", [1, 2, np.inf])
+@settings(max_examples=40, deadline=None)
+@given(vectors=VECTORS)
+def test_the_norm_is_that_of_numpy_over_the_last_axis(order: float, vectors: np.ndarray) -> None:
+    np.testing.assert_allclose(vector_norm(vectors, order), np.linalg.norm(vectors, order, axis=-1), rtol=1e-12)
+
+
+@pytest.mark.parametrize("value", [0, 3, -1, np.nan, "two", None])
+def test_another_norm_is_refused_by_value(value: object) -> None:
+    with pytest.raises(InputError, match=r"norm must be 1, 2 or inf, got "):
+        as_norm_order(value)
+
+
+@pytest.mark.parametrize("value", [1, 2, np.inf])
+def test_the_three_norms_are_taken(value: float) -> None:
+    assert as_norm_order(value) == value
+
+
+def test_algebra_is_bound_to_one_thread_and_released_again() -> None:
+    def threads() -> set[int]:
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    with threadpool_limits(2, user_api="blas"):
+        before = threads()
+        with single_threaded():
+            assert threads() == {1}
+        assert threads() == before == {2}
+
+
+HALF = np.ma.masked_array([1.0, 2.0], mask=[False, True])
+
+
+@pytest.mark.parametrize("value", [HALF, [HALF, HALF], ([1.0], [HALF]), np.ma.masked, [1.0, np.ma.masked]])
+def test_what_is_masked_is_refused_and_not_taken_from_below_the_mask(value: object) -> None:
+    with pytest.raises(InputError, match=r"^x must have a number everywhere, and some are masked"):
+        as_floats("x", value)  # type: ignore[arg-type]
+
+
+def test_a_masked_array_without_a_masked_number_is_an_array() -> None:
+    assert as_floats("x", np.ma.masked_array([1.0, 2.0])).tolist() == [1, 2]
+    assert type(as_floats("x", np.ma.masked_array([1.0], mask=[False]))) is np.ndarray
+
+
+def test_messages_about_large_arrays_stay_short() -> None:
+    large = np.zeros((300, 300))
+    large[7, 3] = np.nan
+    with pytest.raises(InputError, match=r"^x must be finite, got nan at \[7, 3\]\.$"):
+        as_finite("x", large)
+    with pytest.raises(InputError) as caught:
+        as_floats("x", [["one"] * 10_000] * 100)
+    assert len(str(caught.value)) < 5000

@@ -1,0 +1,231 @@
+from __future__ import annotations
+
+import functools
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ctxval import TaskSpace, controllers, distances, models
+from ctxval._util.describe import describe, first_difference
+
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(["", "goal", "ß"]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from("abc"), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@dataclass
+class Part:
+    gain: float
+    _cache: int = 0
+
+
+class Slotted:
+    __slots__ = ("gain",)
+
+
+class Own:
+    def describe(self) -> dict[str, object]:
+        return {"identity": 7}
+
+
+def policy(t: int, x: float) -> float:
+    return x
+
+
+def stored(value: object) -> object:
+    return json.loads(json.dumps(describe(value)))
+
+
+def without_code(description: object) -> object:
+    assert isinstance(description, dict)
+    return {key: value for key, value in description.items() if key != "code"}
+
+
+@settings(max_examples=40, deadline=None)
+@given(PLAIN)
+def test_a_description_is_json_and_does_not_differ_from_itself(value: object) -> None:
+    assert first_difference(stored(value), stored(value)) is None
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (np.float32(0.5), 0.5),
+        (np.int64(3), 3.0),
+        (np.bool_(True), True),
+        (np.bool_(False), False),
+        (np.inf, "inf"),
+        (np.nan, "nan"),
+        ((1, "two"), [1, "two"]),
+        (np.array([[1, 2]]), [[1, 2]]),
+        ({1: None}, {"1": None}),
+        (int, "builtins.int"),
+        (np.linalg.norm, "numpy.linalg.norm"),
+    ],
+)
+def test_values_are_described_by_what_identifies_them(value: object, expected: object) -> None:
+    assert stored(value) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (Part(2.0, _cache=9), {"type": "Part", "gain": 2.0}),
+        (Slotted(), {"type": "Slotted"}),
+        (Own(), {"type": "Own", "identity": 7}),
+    ],
+)
+def test_objects_are_described_by_their_type_their_values_and_their_code(value: object, expected: object) -> None:
+    described = stored(value)
+    assert without_code(described) == expected
+    assert isinstance(described, dict)
+    assert [set(code) - {"uses"} for code in described["code"]] == [{"digest"}]
+
+
+def test_private_attributes_are_described_on_request() -> None:
+    assert describe(Part(2.0, _cache=9), private=True)["_cache"] == 9
+
+
+def test_a_partial_is_described_by_its_function_and_what_it_binds() -> None:
+    expected = {"partial": stored(policy), "args": [1], "keywords": {"x": 2.0}}
+    assert stored(functools.partial(policy, 1, x=2.0)) == expected
+
+
+def test_functions_that_close_over_other_values_are_told_apart() -> None:
+    def scaled(gain: float) -> object:
+        return lambda x: gain * x
+
+    assert first_difference(stored(scaled(2.0)), stored(scaled(2.0))) is None
+    assert first_difference(stored(scaled(2.0)), stored(scaled(3.0))) == "gain was 2.0 and is now 3.0"
+
+
+def test_methods_of_objects_with_other_values_are_told_apart() -> None:
+    one, other = models.Linear([[1]], [[1]]), models.Linear([[2]], [[1]])
+    assert first_difference(stored(one.step), stored(other.step)) == "of.A[0][0] was 1.0 and is now 2.0"
+
+
+def test_large_arrays_are_told_apart_without_being_listed() -> None:
+    data = np.random.default_rng(0).normal(size=(200, 3))
+    assert len(json.dumps(stored(data))) < 200
+    assert first_difference(stored(data), stored(data + 1e-3)) is not None
+    assert first_difference(stored(data), stored(data[:-1])) is not None
+
+
+def test_what_contains_itself_has_a_description() -> None:
+    endless: list[object] = []
+    endless.append(endless)
+    assert stored(endless) == [[[[[["list"]]]]]]
+
+
+@pytest.mark.parametrize("part", [TaskSpace(a=(0, 1)), controllers.ILQR([1.0], [1.0]), distances.FinalState(norm=2)])
+def test_the_parts_of_a_validation_have_descriptions_that_tell_them_apart(part: object) -> None:
+    changed = {
+        TaskSpace: TaskSpace(a=(0, 2)),
+        controllers.ILQR: controllers.ILQR([2.0], [1.0]),
+        distances.FinalState: distances.FinalState(norm=1),
+    }[type(part)]
+    assert first_difference(stored(part), stored(part)) is None
+    assert first_difference(stored(part), stored(changed)) is not None
+
+
+def test_the_description_of_a_set_does_not_depend_on_its_order() -> None:
+    # 0 and 8 share a slot of the hash table, as two strings do in one process and not in the next.
+    one, other = {0, 8}, {8, 0}
+    assert list(one) != list(other)
+    assert stored(one) == stored(other)
+    assert stored(frozenset({"b", "a"})) == ["a", "b"]
+
+
+@pytest.mark.parametrize("one", [np.array([1.0, np.nan]), np.full(500, np.nan), np.array([np.inf])])
+def test_descriptions_with_what_is_not_finite_agree_with_themselves(one: np.ndarray) -> None:
+    assert first_difference(stored(one), stored(one)) is None
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "difference"),
+    [
+        ({"a": 1}, {"a": 2}, "a was 1 and is now 2"),
+        ({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}, "a.b[1] was 2 and is now 3"),
+        ({"a": 1, "b": 2}, {"a": 1}, "b is missing now"),
+        ({"a": 1}, {"a": 1, "b": 2}, "b is new"),
+        ({"a": [1]}, {"a": [1, 2]}, "a was [1] and is now [1, 2]"),
+        ({"a": "x"}, {"a": 1}, "a was 'x' and is now 1"),
+        ({"a": 1.0}, {"a": 1.0 + 1e-5}, "a was 1.0 and is now 1.00001"),
+        ({"a": 1.0}, {"a": float("nan")}, "a was 1.0 and is now nan"),
+    ],
+)
+def test_the_first_difference_is_named_with_its_place(one: object, other: object, difference: str) -> None:
+    assert first_difference(one, other) == difference
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-1e6, 1e6), st.floats(-5e-7, 5e-7))
+def test_rounding_between_machines_is_no_difference(value: float, error: float) -> None:
+    assert first_difference({"a": value}, {"a": value * (1 + error)}) is None
+
+
+def test_long_values_are_shortened_in_a_difference() -> None:
+    found = first_difference({"a": "x" * 500}, {"a": "y" * 500})
+    assert found is not None
+    assert len(found) < 160
+
+
+def test_functions_that_differ_in_a_constant_a_default_or_a_name_are_told_apart() -> None:
+    pairs = (
+        (lambda x: 0.5 * x, lambda x: 0.3 * x),
+        (lambda x, k=1.0: k * x, lambda x, k=2.0: k * x),
+        (lambda x, *, k=1.0: k * x, lambda x, *, k=2.0: k * x),
+        (lambda x: np.sin(x), lambda x: np.tanh(x)),
+    )
+    for one, other in pairs:
+        assert first_difference(stored(one), stored(other)) is not None
+        assert first_difference(stored(one), stored(one)) is None
+
+
+def test_large_arrays_in_another_order_are_told_apart() -> None:
+    matrix = np.random.default_rng(0).normal(size=(11, 11))
+    assert first_difference(stored(matrix), stored(matrix.T)) is not None
+    assert first_difference(stored(matrix), stored(matrix * (1 + 1e-9))) is None
+
+
+def test_small_weights_are_told_apart() -> None:
+    assert first_difference(1e-10, 9e-10, "R") is not None
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        range(10**9),
+        b"x" * 10**7,
+        1 + 2j,
+        np.array([np.nan, *range(500)]),
+        np.array([Slotted()], dtype=object),
+        type("Answering", (), {"__getattr__": lambda self, name: lambda *a, **k: 1})(),
+        type("Raising", (), {"describe": property(lambda self: 1 / 0)})(),
+        type("Text", (), {"describe": lambda self: "text"})(),
+        type("Wanting", (), {"describe": lambda self, more: {}})(),
+    ],
+)
+def test_odd_objects_have_a_short_description_that_agrees_with_itself(value: object) -> None:
+    described = stored(value)
+    assert len(json.dumps(described)) < 3000
+    assert first_difference(described, stored(value)) is None
+    assert " at 0x" not in json.dumps(described)
+
+
+def test_a_variable_without_a_value_is_left_out() -> None:
+    def outer() -> object:
+        def inner() -> object:
+            return later
+
+        found = stored(inner)
+        later = 1
+        return found, later
+
+    assert outer()

@@ -1,0 +1,70 @@
+"""The page on the search `auto` is what the stored campaigns give."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+sys.path.insert(0, str(BENCHMARKS))
+
+import search_page  # noqa: E402
+from study_auto import CASES, first_within  # noqa: E402
+
+TARGETS = search_page.targets()
+
+
+def test_the_page_is_what_the_stored_results_give() -> None:
+    assert search_page.PAGE.read_text() == search_page.text()
+
+
+def test_its_links_and_pictures_lead_somewhere() -> None:
+    for link in re.findall(r"\]\(([^)#:]+)\)", search_page.PAGE.read_text()):
+        assert (search_page.PAGE.parent / link).exists(), link
+
+
+def test_every_case_of_the_study_has_a_target() -> None:
+    assert {target.case for target in TARGETS if target.study == "auto"} == set(CASES)
+
+
+@pytest.mark.parametrize("study", ["auto", "scalar", "misleading", "ablations"])
+def test_stored_campaigns_end_within_one_per_cent_or_with_their_budget(study: str) -> None:
+    paths = sorted((search_page.RESULTS / study).glob("*.json"))
+    assert paths
+    for path in paths:
+        result = json.loads(path.read_text())
+        ended = len(result["distances"])
+        assert ended <= result["budget"], path
+        assert ended == result["budget"] or first_within(result, 1.0) == ended, path
+
+
+def test_a_target_is_met_by_the_median_or_by_all() -> None:
+    counts = [3.0, 5.0, np.inf]
+    assert search_page.within(5)(counts)
+    assert not search_page.within(4)(counts)
+    assert not search_page.all_within(30)(counts)
+
+
+def test_numbers_of_executions_are_shown_with_the_budget_where_it_did_not_suffice() -> None:
+    counts = [3.0, 5.0, 9.0, np.inf]
+    assert search_page.spread(counts, 30) == "3 to 9"
+    assert search_page.spread([3.0, np.inf, np.inf, np.inf], 30) == "3 to > 30"
+    assert search_page.reached(counts) == "3 of 4"
+
+
+def test_more_seeds_than_the_table_has_are_reported_beside_it() -> None:
+    text = search_page.more_seeds()
+    for case, *_ in search_page.MORE_SEEDS:
+        stored = list((search_page.RESULTS / "scalar").glob(f"{case}-*-scalar.json"))
+        assert f", {len(stored)} seeds: within" in text
+
+
+def test_what_is_missing_goes_on_flat_where_a_campaign_ended() -> None:
+    result = {"truth": 2.0, "budget": 4, "distances": [1.0, None, 2.0]}
+    np.testing.assert_allclose(search_page.missing([result]), [[50.0, 50.0, 1.0, 1.0]])
+    assert first_within(result, 1.0) == 3

@@ -1,0 +1,579 @@
+"""Hardware by hand: asking and telling, from Python and from many real processes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from ctxval import Campaign, Store, TaskSpace, Trajectory, searches
+from ctxval.campaign.by_hand import parameters_from
+from ctxval.certificates import Sample
+from ctxval.cli import app
+from ctxval.controllers import read_controller
+from ctxval.core.exchange import read_task
+from ctxval.core.rollout import rollout
+from ctxval.errors import ExecutionError, InputError, StoreAccessError
+
+MODULE = """
+from ctxval import Experiment, Task, TaskSpace, Validation, controllers, distances, models, systems
+
+
+def experiment(seed):
+    rig = systems.Manual(states={"position": "m", "speed": "m/s"}, inputs={"force": "N"}, dt=0.1)
+    validation = Validation(
+        space=TaskSpace(goal=(0.5, 2.0, "m")),
+        task=lambda p: Task([0, 0], goal=[p.goal, 0], horizon=20, dt=rig.dt),
+        system=rig,
+        model=models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]]),
+        synthesizer=controllers.LQR([10, 1], [0.1], limits=3.0),
+        distance=distances.FinalState(),
+    )
+    return Experiment("rig", validation, threshold=2.0, units="m")
+
+
+def policy(seed):
+    made = experiment(seed)
+    made.validation.synthesizer = controllers.Policy(lambda t, x, task: task.goal[..., :1] - x[..., :1] - x[..., 1:])
+    return made
+"""
+
+PYTHON = [sys.executable, "-c", "from ctxval.cli import main; main()"]
+
+
+@pytest.fixture
+def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+    """Run the command line in a folder with a manual rig in it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_rig.py").write_text(MODULE)
+    sys.modules.pop("my_rig", None)
+
+    def run(*arguments: str) -> Result:
+        return CliRunner().invoke(app, list(arguments))
+
+    yield run
+    sys.modules.pop("my_rig", None)
+
+
+def asked(invoke: Any, *arguments: str) -> dict[str, Any]:
+    result = invoke("ask", *arguments, "--json")
+    assert result.exit_code == 0, result.stderr
+    report: dict[str, Any] = json.loads(result.stdout)
+    return report
+
+
+def new(invoke: Any) -> dict[str, Any]:
+    return asked(invoke, "my_rig:experiment", "--store", "a.sqlite")
+
+
+def record(folder: str, path: str = "run.csv", *, substeps: int = 1, rate: float = 0.98) -> Trajectory:
+    """Do what a rig does with the files alone: read them, run, and write down what happened."""
+    found, task = read_controller(Path(folder) / "controller.npz"), read_task(Path(folder) / "task.json")
+
+    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return np.array([x[0] + 0.1 * x[1], rate * x[1] + 0.1 * u[0]])
+
+    trajectory = rollout(step, found.controller, task)
+    if substeps > 1:
+        times = np.arange(substeps * task.horizon + 1) * task.dt / substeps
+        states = np.stack([np.interp(times, trajectory.times, column) for column in trajectory.states.T], axis=-1)
+        trajectory = Trajectory(times, states, np.repeat(trajectory.inputs, substeps, axis=0))
+    trajectory.to_csv(path, states=["position [m]", "speed"], inputs=["force"])
+    return trajectory
+
+
+def refused(result: Result) -> str:
+    """Return the sentence of a command that refused its input."""
+    assert result.exit_code == 2, result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
+    return result.stderr.replace("\n", " ")
+
+
+# Asking
+
+
+def test_asking_writes_all_that_a_rig_needs(invoke: Any) -> None:
+    report = new(invoke)
+    folder = Path(report["folder"])
+    assert (report["trial"], report["folder"]) == (0, "a.trials/0")
+    assert sorted(path.name for path in folder.iterdir()) == sorted(report["files"])
+    assert {"task.json", "controller.json", "controller.npz", "model.csv"} == set(report["files"])
+    found = read_controller(folder / "controller.json")
+    assert (found.states, found.inputs, found.dt) == ({"position": "m", "speed": "m/s"}, {"force": "N"}, 0.1)
+    assert read_task(folder / "task.json").goal[0] == report["task"]["goal"]
+    assert (folder / "model.csv").read_text().startswith("t,position,speed,force\n")
+    assert Store("a.sqlite").trials()[0].state == "open"
+
+
+def test_a_store_knows_what_it_is_of(invoke: Any) -> None:
+    new(invoke)
+    second = asked(invoke, "a.sqlite")
+    chosen = asked(invoke, "a.sqlite", "--set", "goal=1.25", "--out", "elsewhere")
+    drawn = asked(invoke, "a.sqlite", "--draw")
+    assert [r["trial"] for r in (second, chosen, drawn)] == [1, 2, 3]
+    assert (chosen["task"], chosen["origin"], drawn["origin"]) == ({"goal": 1.25}, "manual", "iid")
+    assert Path("elsewhere/task.json").exists()
+    status = json.loads(invoke("status", "a.sqlite", "--json").stdout)
+    assert (status["open"], status["executions"]) == ([0, 1, 2, 3], 0)
+
+
+def test_the_files_of_an_open_trial_can_be_written_again(invoke: Any) -> None:
+    first = new(invoke)
+    before = (Path(first["folder"]) / "controller.json").read_bytes()
+    again = asked(invoke, "a.sqlite", "--trial", "0", "--out", "again")
+    assert (Path("again") / "controller.json").read_bytes() == before
+    assert again["task"] == first["task"]
+    assert len(Store("a.sqlite").trials()) == 1
+
+
+def test_a_controller_that_has_no_file_is_said_so(invoke: Any) -> None:
+    result = invoke("ask", "my_rig:policy", "--store", "b.sqlite")
+    assert result.exit_code == 0
+    assert "cannot be written to a file" in result.stdout
+    assert "ctxval tell b.sqlite 0 --trajectory run.csv" in result.stdout
+
+
+def test_a_folder_that_cannot_be_written_leaves_the_trial_open_and_says_how_to_go_on(invoke: Any) -> None:
+    new(invoke)
+    Path("file").write_text("")
+    sentence = refused(invoke("ask", "a.sqlite", "--out", "file/inside"))
+    assert "the trial is open, and `ctxval ask STORE --trial 1 --out FOLDER` writes them elsewhere" in sentence
+    assert asked(invoke, "a.sqlite", "--trial", "1")["trial"] == 1
+
+
+def test_asking_by_command_chooses_what_a_campaign_chooses(invoke: Any) -> None:
+    sys.path.insert(0, os.getcwd())
+    import my_rig  # type: ignore[import-not-found]
+
+    for number in range(7):
+        report = asked(invoke, "a.sqlite") if number else new(invoke)
+        record(report["folder"])
+        assert invoke("tell", "a.sqlite", str(number), "--trajectory", "run.csv").exit_code == 0
+    sys.path.remove(os.getcwd())
+    one = Campaign(my_rig.experiment(0).validation, search=searches.Auto(), seed=0)
+    kept = Store("a.sqlite")
+    for trial in kept.trials():
+        opened = one.ask()
+        np.testing.assert_array_equal(opened.trial.unit_point, trial.unit_point)
+        one.tell(opened, kept.trajectory(trial.number, "system"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["a.sqlite", "--set", "gaol=1"], "did you mean 'goal'"),
+        (["a.sqlite", "--set", "goal=9"], "goal = 9 is outside the task space"),
+        (["a.sqlite", "--set", "goal"], "as name=value, got 'goal'"),
+        (["a.sqlite", "--set", "goal=1", "--set", "goal=2"], "given once"),
+        (["a.sqlite", "--set", "goal=one"], "goal must be a number, got 'one'"),
+        (["a.sqlite", "--set", "goal=1", "--draw"], "only one can be given"),
+        (["a.sqlite", "--trial", "9"], "there is no trial 9"),
+        (["a.sqlite", "--seed", "3"], "is a store, which knows its search and its seed"),
+        (["none.sqlite"], "there is no store at none.sqlite; `ctxval ask FILE.toml --store none.sqlite` makes one"),
+        (["none"], "no case is called 'none'"),
+    ],
+)
+def test_what_cannot_be_asked_opens_no_trial(invoke: Any, arguments: list[str], sentence: str) -> None:
+    new(invoke)
+    assert sentence in refused(invoke("ask", *arguments))
+    assert len(Store("a.sqlite").trials()) == 1
+
+
+def test_a_manual_system_is_not_run(invoke: Any) -> None:
+    sentence = refused(invoke("run", "my_rig:experiment", "--store", "a.sqlite"))
+    assert "this system is executed by people, not by run or audit: take tasks with ask" in sentence
+    new(invoke)
+    assert "executed by people" in refused(invoke("certify", "a.sqlite", "--audit", "3"))
+    assert len(Store("a.sqlite").trials()) == 1
+
+
+SPACE = TaskSpace(goal=([0.0, 0.0], [2.0, 2.0], "rad"), load=(0.0, 1.0, "m/s^2"), bare=(-1.0, 1.0))
+WHOLE = {"goal": [1.5, 0.5], "load": 0.2, "bare": -0.001}
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [
+        ["goal=1.5,0.5", "load=0.2", "bare=-1e-3"],
+        ["goal=[1.5, 0.5]", "load = 0.2", "bare=-.001"],
+        ["goal = [1.5, 0.5] rad", "load=0.2 m/s^2", "bare=-0.001"],
+        ["goal=1.5 rad, 0.5 rad", "load=0.2 [m/s^2]", "bare=-0.001"],
+        ["goal[0]=1.5", "goal[1]=0.5 rad", "load=.2", "bare=-0.001"],
+        ["goal[1] = 0.5, goal[0] = 1.5, load = 0.2, bare = -0.001"],
+        ["goal = 1.5, 0.5, load = 0.2, bare = -0.001"],
+        ["goal = [1.5, 0.5], load = 0.2", "bare = -0.001"],
+    ],
+)
+def test_parameters_are_taken_in_every_form_in_which_they_are_printed(texts: list[str]) -> None:
+    assert parameters_from(texts, SPACE) == WHOLE
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("goal[0]=1.5", "goal must be given whole, goal[1] is missing"),
+        ("goal[0]=1, goal[1]=1, goal=1,1", "goal is given once, whole or by its components"),
+        ("goal[2]=1", "did you mean"),
+        ("load[0]=1", "did you mean 'load'"),
+        ("load=0.2 rad", "load must be in m/s^2, got '0.2 rad'"),
+        ("load=0.2 deg/s", "load must be in m/s^2"),
+        ("goal=[1.5 deg, 0.5]", "goal must be in rad"),
+        ("bare=1 m", "bare must be a number without a unit, got '1 m'"),
+        ("goal=[1.5, 0.5", "goal must be a list such as [1.5, 0.5], got '[1.5, 0.5'"),
+        ("load=one", "load must be a number, got 'one'"),
+        ("load=", "load must be a number, got ''"),
+        ("load=1,,2", "load must be a number, got ''"),
+        ("load", "as name=value, got 'load'"),
+        ("=1", "as name=value, got '=1'"),
+        ("", "as name=value, got ''"),
+        ("load=1, load=2", "given once"),
+    ],
+)
+def test_parameters_that_cannot_be_used_are_named(text: str, sentence: str) -> None:
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        SPACE.point(parameters_from([text], SPACE))
+
+
+def test_what_a_person_types_comes_back_as_it_was_typed(invoke: Any) -> None:
+    new(invoke)
+    for number, typed in enumerate(("0.7", "1.1", "1.9 m", "0.9000001"), 1):
+        report = asked(invoke, "a.sqlite", "--set", f"goal={typed}")
+        value = float(typed.removesuffix(" m"))
+        assert report["task"] == {"goal": value}
+        assert read_task(Path(report["folder"]) / "task.json").goal[0] == value
+        assert report["trial"] == number
+
+
+# Telling
+
+
+def test_open_trials_are_told_in_any_order_and_in_every_way(invoke: Any) -> None:
+    reports = [new(invoke), *(asked(invoke, "a.sqlite") for _ in range(3))]
+    whole = record(reports[2]["folder"])
+    Path("run.npz").write_bytes(record(reports[0]["folder"], "other.csv").to_npz())
+    told = [
+        ("2", "--trajectory", "run.csv"),
+        ("0", "--npz", "run.npz"),
+        ("3", "--distance", "0.125"),
+        ("1", "--failed", "motor cut out"),
+    ]
+    answers = [json.loads(invoke("tell", "a.sqlite", *arguments, "--json").stdout) for arguments in told]
+    assert [(a["trial"], a["state"]) for a in answers] == [
+        (2, "completed"),
+        (0, "completed"),
+        (3, "completed"),
+        (1, "failed"),
+    ]
+    assert answers[-1]["executions"] == 4
+    store = Store("a.sqlite")
+    assert [t.failure for t in store.trials()] == [None, "motor cut out", None, None]
+    assert store.trials()[3].distance == 0.125
+    kept = store.trajectory(2, "system")
+    assert kept is not None
+    np.testing.assert_array_equal(kept.states, whole.states)
+
+
+def test_what_was_told_is_said(invoke: Any) -> None:
+    record(new(invoke)["folder"])
+    assert "trial 0 has the distance" in invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv").stdout
+    asked(invoke, "a.sqlite")
+    assert "trial 1 failed: fuse [blown]" in invoke("tell", "a.sqlite", "1", "--failed", "fuse [blown]").stdout
+
+
+def test_the_task_of_a_failed_trial_can_be_executed_again(invoke: Any) -> None:
+    first = new(invoke)
+    assert invoke("tell", "a.sqlite", "0", "--failed", "the cable came off").exit_code == 0
+    again = asked(invoke, "a.sqlite", "--again", "0")
+    assert (again["trial"], again["task"]) == (1, first["task"])
+    record(again["folder"])
+    assert invoke("tell", "a.sqlite", "1", "--trajectory", "run.csv").exit_code == 0
+    assert "execute those tasks again" not in invoke("certify", "a.sqlite").stderr
+    failed, made_good = Store("a.sqlite").trials()
+    assert Sample.of([failed]).failed == 1
+    assert Sample.of([failed, made_good]).failed == 0
+    assert made_good.because is None
+    refused = invoke("ask", "a.sqlite", "--again", "7")
+    assert refused.exit_code == 2
+    assert "there is no trial 7; there are 2, numbered from 0" in refused.stderr
+
+
+def test_why_a_failed_task_is_executed_again_is_kept_and_certified(invoke: Any) -> None:
+    new(invoke)
+    invoke("tell", "a.sqlite", "0", "--failed", "the fuse blew")
+    assert asked(invoke, "a.sqlite", "--again", "0", "--because", "fuse replaced")["trial"] == 1
+    invoke("tell", "a.sqlite", "1", "--distance", "0.1")
+    assert Store("a.sqlite").trials()[1].because == "fuse replaced"
+    for number, goal in enumerate((0.6, 0.9, 1.4, 1.9), start=2):
+        asked(invoke, "a.sqlite", "--set", f"goal={goal}")
+        invoke("tell", "a.sqlite", str(number), "--distance", f"{0.1 + 0.01 * goal}")
+    report = json.loads(invoke("certify", "a.sqlite", "--resolution", "1", "--json").stdout)
+    assert report["details"]["failures"]["made_good"] == [{"trial": 0, "by": 1, "because": "fuse replaced"}]
+    assert any("you state why: 'fuse replaced'" in sentence for sentence in report["assumptions"])
+    refused = invoke("ask", "a.sqlite", "--because", "oil")
+    assert refused.exit_code == 2
+    assert "say --again TRIAL too" in refused.stderr.replace("\n", " ")
+
+
+def edit(change: Any) -> None:
+    """Change the rows of the recording."""
+    with open("run.csv", newline="") as file:
+        rows = list(csv.reader(file))
+    with open("run.csv", "w", newline="") as file:
+        csv.writer(file).writerows(change(rows))
+
+
+def without(column: int) -> Any:
+    return lambda rows: [[cell for i, cell in enumerate(row) if i != column] for row in rows]
+
+
+def with_cell(line: int, column: int, text: str) -> Any:
+    def change(rows: list[list[str]]) -> list[list[str]]:
+        rows[line - 1][column] = text
+        return rows
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (without(2), "run.csv has no column speed; there are t, position, force"),
+        (without(3), "must have the columns of the inputs, force"),
+        (with_cell(1, 1, "position [km]"), "has position in km, and m is needed; convert it"),
+        (without(0), "must have the columns t, position [m], speed [m/s], force [N]"),
+        (lambda rows: rows[:15], "must have 21 times, 20 steps of 0.1 s, got 14"),
+        (lambda rows: rows[:1], "must have a header and at least two rows"),
+        (with_cell(5, 1, "n/a"), "run.csv, line 5: position [m] must be a number, got 'n/a'"),
+        (with_cell(5, 1, "nan"), "not finite"),
+        (with_cell(2, 1, "0.7"), "starts elsewhere: state 0 must start at 0 within"),
+        (with_cell(4, 0, "0.35"), "steps of 0.1 s: time 2 must be 0.2 s after the first, got 0.35 s"),
+        (lambda rows: [rows[0], *([str(2 * float(r[0])), *r[1:]] for r in rows[1:])], "time 1 must be 0.1 s"),
+    ],
+)
+def test_a_recording_of_something_else_is_refused_and_the_trial_stays_open(
+    invoke: Any, change: Any, sentence: str
+) -> None:
+    record(new(invoke)["folder"])
+    edit(change)
+    result = invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv")
+    assert result.exit_code in (2, 3)
+    assert "Traceback" not in result.stderr
+    assert sentence in result.stderr.replace("\n", " ")
+    assert Store("a.sqlite").trials()[0].state == "open"
+
+
+def test_a_start_that_is_elsewhere_can_be_allowed(invoke: Any) -> None:
+    record(new(invoke)["folder"])
+    edit(with_cell(2, 1, "0.3"))
+    assert "starts elsewhere" in refused(invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv"))
+    given = ("--trajectory", "run.csv", "--start-tolerance", "1")
+    assert invoke("tell", "a.sqlite", "0", *given).exit_code == 0
+
+
+def test_a_recording_at_other_times_is_resampled_on_request(invoke: Any) -> None:
+    report = new(invoke)
+    record(report["folder"], substeps=5)
+    assert "must have 21 times" in refused(invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv"))
+    answer = invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv", "--resample", "--json")
+    whole, kept = record(report["folder"], "plain.csv"), Store("a.sqlite").trajectory(0, "system")
+    assert kept is not None
+    np.testing.assert_allclose(kept.states, whole.states, atol=1e-12)
+    np.testing.assert_array_equal(kept.inputs, whole.inputs)
+    assert json.loads(answer.stdout)["state"] == "completed"
+    asked(invoke, "a.sqlite")
+    edit(lambda rows: rows[:60])
+    sentence = refused(invoke("tell", "a.sqlite", "1", "--trajectory", "run.csv", "--resample"))
+    assert "the recording ends after 1.16 s, and 2 s are needed" in sentence
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["7", "--failed", "x"], "there is no trial 7; the campaign has 1"),
+        (["0"], "exactly one of --trajectory, --npz, --distance, --failed must be given"),
+        (["0", "--failed", "x", "--distance", "1"], "exactly one of"),
+        (["0", "--distance", "-1"], "finite number >= 0, got -1.0"),
+        (["0", "--distance", "nan"], "finite number >= 0, got nan"),
+        (["0", "--trajectory", "none.csv"], "there is no file none.csv"),
+        (["0", "--npz", "none.npz"], "there is no file none.npz"),
+        (["0", "--trajectory", "."], ". cannot be read: it is a folder"),
+        (["0", "--trajectory", "no_inputs.csv"], "no_inputs.csv must have the columns of the inputs, force"),
+        (["0", "--failed", " "], "--failed needs a reason"),
+        (["0", "--distance", "1", "--resample"], "--resample and --start-tolerance are for a recording"),
+        (["0", "--failed", "x", "--start-tolerance", "0.1"], "are for a recording, and there is none"),
+        (["0", "--trajectory", "no_inputs.csv", "--start-tolerance", "nan"], "a finite number >= 0, got nan"),
+        (["0", "--trajectory", "no_inputs.csv", "--start-tolerance", "-1"], "a finite number >= 0, got -1.0"),
+        (["0", "--npz", "my_rig.py"], "my_rig.py cannot be read as a trajectory"),
+    ],
+)
+def test_what_cannot_be_told_is_one_sentence(invoke: Any, arguments: list[str], sentence: str) -> None:
+    new(invoke)
+    Path("no_inputs.csv").write_text("t,position,speed\n" + "".join(f"{t / 10},0,0\n" for t in range(21)))
+    assert sentence in refused(invoke("tell", "a.sqlite", *arguments))
+    assert Store("a.sqlite").trials()[0].state == "open"
+
+
+def test_a_trial_is_told_once(invoke: Any) -> None:
+    new(invoke)
+    assert invoke("tell", "a.sqlite", "0", "--distance", "1").exit_code == 0
+    sentence = refused(invoke("tell", "a.sqlite", "0", "--failed", "x"))
+    assert "trial 0 is completed, so nothing more can be told of it" in sentence
+    assert Store("a.sqlite").trials()[0].distance == 1
+
+
+# Importing
+
+
+def test_known_runs_come_in_once_with_their_origin(invoke: Any) -> None:
+    record(asked(invoke, "my_rig:experiment", "--store", "a.sqlite", "--set", "goal=0.75")["folder"])
+    Path("runs.csv").write_text("goal,trajectory,distance,failed\n0.75,run.csv,,\n\n1.5,,0.25,\n2,,,cable too short\n")
+    report = json.loads(invoke("import", "a.sqlite", "runs.csv", "--json").stdout)
+    assert [(r["task"]["goal"], r["state"]) for r in report["imported"]] == [
+        (0.75, "completed"),
+        (1.5, "completed"),
+        (2.0, "failed"),
+    ]
+    second = invoke("import", "a.sqlite", "runs.csv", "--json")
+    assert second.exit_code == 0, second.stderr
+    again = json.loads(second.stdout)
+    assert (again["imported"], again["known"]) == ([], 3)
+    store = Store("a.sqlite")
+    assert [(t.origin, t.state, t.executed) for t in store.trials()] == [
+        ("manual", "open", False),
+        ("manual", "completed", True),
+        ("manual", "completed", True),
+        ("manual", "failed", True),
+    ]
+    assert store.trajectory(1, "system") is not None
+    assert store.trajectory(2, "system") is None
+    one = invoke("import", "a.sqlite", "run.csv", "--set", "goal=0.75")
+    assert "0 imported, 1 were there already" in one.stdout
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ("goal,distance\n1,0.5\n9,0.5\n", "runs.csv, line 3: goal = 9 is outside the task space"),
+        ("goal,distance\n1,0.5\n\n\n1,x\n", "runs.csv, line 5: distance must be a number, got 'x'"),
+        ("goal,distance\n1,0.5\n1,-1\n", "runs.csv, line 3: the distance must be a finite number >= 0"),
+        ("goal,distance,failed\n1,0.5,x\n", "line 2: exactly one of trajectory, distance, failed"),
+        (
+            "gaol,distance\n1,0.5\n",
+            "the columns goal and one of trajectory, distance, failed; it has gaol",
+        ),
+        ("goal,trajectory\n1,none.csv\n", "line 2: there is no file none.csv"),
+        ("goal,distance\n", "runs.csv has no run below its header"),
+        ("goal,distance,goal\n1,2,3\n", "runs.csv must have columns of different names, got goal, distance, goal"),
+        ("", "it has none"),
+        ("\x00\x01", "runs.csv"),
+    ],
+)
+def test_a_table_with_one_wrong_row_brings_nothing_in(invoke: Any, table: str, sentence: str) -> None:
+    new(invoke)
+    Path("runs.csv").write_text(table)
+    assert sentence in refused(invoke("import", "a.sqlite", "runs.csv"))
+    assert len(Store("a.sqlite").trials()) == 1
+
+
+def test_a_table_of_runs_is_read_with_a_bound(invoke: Any) -> None:
+    new(invoke)
+    Path("runs.csv").touch()
+    os.truncate("runs.csv", 2**33)
+    assert "runs.csv cannot be read as a table of runs: it has 8589934592 bytes" in refused(
+        invoke("import", "a.sqlite", "runs.csv")
+    )
+    Path("runs.csv").write_text("distance,goal\n0.5\n")
+    assert "line 2: goal must be a number, got None" in refused(invoke("import", "a.sqlite", "runs.csv"))
+
+
+def test_what_is_imported_must_be_there(invoke: Any) -> None:
+    new(invoke)
+    assert "there is no file none.csv" in refused(invoke("import", "a.sqlite", "none.csv"))
+    assert "finite number >= 0" in refused(invoke("import", "a.sqlite", "none.csv", "--start-tolerance", "inf"))
+    assert "cannot be read: File name too long" in refused(invoke("import", "a.sqlite", "x" * 300))
+
+
+def test_the_search_knows_what_was_imported(invoke: Any) -> None:
+    plain = [asked(invoke, "my_rig:experiment", "--store", "plain.sqlite")["task"] for _ in range(1)]
+    new(invoke)
+    Path("runs.csv").write_text("goal,distance\n" + "".join(f"{g},{0.1 * g}\n" for g in (0.6, 0.9, 1.2, 1.5, 1.8)))
+    assert invoke("import", "a.sqlite", "runs.csv").exit_code == 0
+    assert asked(invoke, "a.sqlite")["origin"] == "acquisition"
+    assert plain[0] == Store("a.sqlite").trials()[0].parameters
+
+
+# Many terminals
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen([*PYTHON, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def ends(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
+    ended = []
+    for process in processes:
+        stdout, stderr = process.communicate(timeout=120)
+        ended.append((process.returncode, stdout, stderr))
+    return ended
+
+
+def test_several_terminals_ask_and_tell_at_once(invoke: Any) -> None:
+    ask = ["ask", "my_rig:experiment", "--store", "a.sqlite", "--search", "random", "--json"]
+    first = ends([start(*ask) for _ in range(4)])
+    assert [status for status, _, _ in first] == [0] * 4, first
+    reports = [json.loads(stdout) for _, stdout, _ in first]
+    assert sorted(report["trial"] for report in reports) == [0, 1, 2, 3]
+    assert len({report["task"]["goal"] for report in reports}) == 4
+    told = ends(
+        [start("tell", "a.sqlite", str(n), "--distance", f"0.{n}{who}") for n in (2, 0) for who in (1, 2)]
+        + [start("ask", "a.sqlite", "--json")]
+    )
+    assert Counter(status for status, _, _ in told[:4]) == {0: 2, 2: 2}
+    for status, _, stderr in told[:4]:
+        assert status == 0 or re.search(r"trial \d is completed, so nothing more can be told of it", stderr)
+    assert (told[4][0], json.loads(told[4][1])["trial"]) == (0, 4)
+    assert [trial.state for trial in Store("a.sqlite").trials()] == ["completed", "open", "completed", "open", "open"]
+
+
+def test_an_asking_campaign_learns_what_others_stored(validation: Any, tmp_path: Path) -> None:
+    first, second = (Campaign(validation, store=tmp_path / "a.sqlite", seed=3) for _ in range(2))
+    opened = first.ask()
+    assert second.ask().number == 1
+    assert first.ask().number == 2
+    second.tell(0, validation.execute(opened.plan))
+    with pytest.raises(InputError, match="trial 0 is completed"):
+        first.tell(opened, failed="x")
+    assert first.executions == 1
+    with second.store.sole_writer(), pytest.raises(StoreAccessError, match="run by another process"):
+        first.ask()
+
+
+def test_a_point_that_was_asked_for_twice_does_not_hinder_a_resumption(validation: Any, tmp_path: Path) -> None:
+    campaign = Campaign(validation, store=tmp_path / "a.sqlite", seed=3)
+    for _ in range(2):
+        campaign.ask({"goal": 1.0})
+    campaign.tell(1, failed="x")
+    campaign.ask({"goal": 1.0})
+    campaign.tell(2, distance=1.0)
+    campaign.run(7)
+    again = Campaign(validation, store=tmp_path / "a.sqlite", seed=3)
+    np.testing.assert_array_equal(again.ask().trial.unit_point, campaign.reopen(8).trial.unit_point)
+
+
+def test_an_execution_that_ended_early_is_no_whole_recording(validation: Any) -> None:
+    campaign = Campaign(validation)
+    opened = campaign.ask()
+    whole = validation.execute(opened.plan)
+    with pytest.raises(ExecutionError, match="the operator stopped it"):
+        campaign.tell(opened, Trajectory(whole.times, whole.states, whole.inputs, "the operator stopped it"))
+    assert campaign.tell(opened, distance=2).distance == 2.0

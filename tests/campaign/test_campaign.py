@@ -1,0 +1,543 @@
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from conftest import interrupt_at_once, make_validation
+from ctxval import Campaign, TaskSpace, Validation, controllers, models, searches
+from ctxval._util.arrays import Array
+from ctxval.certificates import RESOLUTION, farthest_task
+from ctxval.core.trial import Trial
+from ctxval.errors import (
+    CtxvalError,
+    DistanceError,
+    InputError,
+    ModelError,
+    StoreAccessError,
+    StoreMismatchError,
+    UnknownNameError,
+)
+from ctxval.testing import FaultyRig
+
+
+class OneCorner(searches.SequentialSearch):
+    """Asks for points of the lowest tenth of the cube alone."""
+
+    def propose(self, rng: np.random.Generator) -> Array:
+        return 0.1 * rng.random(self.dimension)
+
+
+def facts(trials: tuple[Trial, ...]) -> list[tuple[object, ...]]:
+    """What a resumed campaign must share with one never stopped, bit for bit."""
+    return [(t.number, t.origin, t.state, t.unit_point.tobytes(), t.distance, t.failure) for t in trials]
+
+
+def test_gp_ucb_finds_the_worst_task(validation: Validation) -> None:
+    campaign = Campaign(validation, seed=4).run(20)
+    grid = validation.space.grid(2001)
+    truth = validation.distances(grid).max()
+    assert campaign.worst is not None
+    assert campaign.worst.distance == pytest.approx(truth, rel=0.01)
+    assert [t.origin for t in campaign.trials] == ["initial"] * 5 + ["acquisition"] * 15
+    assert campaign.estimate == campaign.worst.distance
+
+
+def test_a_surrogate_needs_two_distances_and_then_interpolates(validation: Validation) -> None:
+    campaign = Campaign(validation, search=searches.Random())
+    with pytest.raises(InputError, match="two known distances"):
+        campaign.run(1).surrogate()
+    campaign.run(8)
+    mean, deviation = campaign.surrogate().predict(np.array([t.unit_point for t in campaign.trials]))
+    np.testing.assert_allclose(mean, [t.distance for t in campaign.trials], atol=1e-3)
+    assert (deviation < 1e-2).all()
+
+
+@pytest.mark.parametrize("search", ["gp-ucb", "random", "sampling-discarding"])
+def test_running_in_pieces_equals_running_at_once(validation: Validation, tmp_path: Path, search: str) -> None:
+    whole = Campaign(validation, search=searches.by_name(search), seed=2).run(12)
+    for budget in (3, 4, 9, 12):
+        pieces = Campaign(validation, search=searches.by_name(search), seed=2, store=tmp_path / "a.sqlite").run(budget)
+        assert pieces.executions == budget
+    assert facts(pieces.trials) == facts(whole.trials)
+
+
+def test_the_budget_is_a_total(validation: Validation) -> None:
+    campaign = Campaign(validation).run(5)
+    assert len(campaign.run(5).trials) == 5
+    assert len(campaign.run(3).trials) == 5
+
+
+@pytest.mark.parametrize("draw", [lambda c: c.run(5), lambda c: c.audit(5)])
+def test_independent_draws_are_repeatable_but_not_shared_by_another_model(
+    validation: Validation, draw: Callable[[Campaign], Campaign], tmp_path: Path
+) -> None:
+    def drawn(model: object, store: Path | None = None) -> list[list[float]]:
+        campaign = Campaign(make_validation(model=model), search=searches.Random(), seed=5, store=store)
+        return [trial.unit_point.tolist() for trial in draw(campaign).trials]
+
+    learned = validation.model
+    other = models.Linear(learned.A * 1.001, learned.B, learned.c)  # type: ignore[attr-defined]
+    assert drawn(learned) == drawn(copy.deepcopy(learned)) == drawn(learned, tmp_path / "a.sqlite")
+    assert not np.isclose(drawn(learned), drawn(other)).any()
+
+
+def test_a_model_whose_weights_are_private_has_draws_of_its_own(validation: Validation) -> None:
+    class Private:
+        def __init__(self, model: models.Linear, bias: float) -> None:
+            self._model, self._bias = model, bias
+
+        def step(self, x: Array, u: Array) -> Array:
+            return np.asarray(
+                self._model.step(x, u) + self._bias * np.exp(-50 * np.sum((x - 0.7) ** 2, axis=-1))[..., None]
+            )
+
+    def drawn(bias: float) -> list[list[float]]:
+        private = make_validation(model=Private(validation.model, bias))  # type: ignore[arg-type]
+        private.synthesizer = controllers.Policy(lambda t, x, task: -x[..., :1])
+        return [trial.unit_point.tolist() for trial in Campaign(private, seed=5).audit(3).trials]
+
+    assert drawn(1e-3) == drawn(1e-3) != drawn(2e-3)
+
+
+def test_discarding_lowers_the_estimate_but_not_the_facts(validation: Validation) -> None:
+    campaign = Campaign(validation, search=searches.SamplingDiscarding(discard=2), seed=1)
+    assert campaign.run(2).estimate is None
+    distances = sorted(t.distance or 0 for t in campaign.run(10).trials)
+    assert campaign.estimate == distances[-3]
+    assert campaign.worst is not None
+    assert campaign.worst.distance == distances[-1]
+
+
+def test_failures_are_data(validation: Validation) -> None:
+    rig = FaultyRig(validation.system, {1: "raise", 3: "nan", 6: "short", 8: "wrong shape"})
+    campaign = Campaign(make_validation(system=rig), seed=3).run(15)
+    reasons = [t.failure for t in campaign.failed]
+    assert campaign.executions == 15
+    assert [t.number for t in campaign.failed] == [1, 3, 6, 8]
+    for reason, expected in zip(reasons, ["motor cut out", "not finite", "operator", "must have states"], strict=True):
+        assert reason is not None
+        assert expected in reason
+    failed = np.array([t.unit_point for t in campaign.failed])
+    others = np.array([t.unit_point for t in campaign.completed])
+    assert np.abs(failed[:, None] - others[None]).min() > 0
+
+
+def test_failures_do_not_change_what_a_resumed_campaign_chooses(validation: Validation, tmp_path: Path) -> None:
+    def campaign(store: Path | None, done: int) -> Campaign:
+        faults = {k - done: "raise" for k in (1, 6) if k >= done}
+        return Campaign(make_validation(system=FaultyRig(validation.system, faults)), seed=3, store=store)
+
+    # The store describes the rig too, so one rig stands for both: what failed before stays failed.
+    whole = campaign(None, 0).run(12)
+    shared = FaultyRig(validation.system, {1: "raise", 6: "raise"})
+    first = Campaign(make_validation(system=shared), seed=3, store=tmp_path / "a.sqlite").run(7)
+    second = Campaign(make_validation(system=shared), seed=3, store=first.store).run(12)
+    assert facts(second.trials) == facts(whole.trials)
+
+
+def test_an_interrupted_execution_is_repeated_as_the_same_trial(validation: Validation, tmp_path: Path) -> None:
+    class Interrupting(FaultyRig):
+        def execute(self, controller, task):  # type: ignore[no-untyped-def]
+            if self._executions == 6:
+                self._executions += 1
+                interrupt_at_once()
+            return super().execute(controller, task)
+
+    whole = Campaign(make_validation(system=FaultyRig(validation.system)), seed=1).run(10)
+    stopped = make_validation(system=Interrupting(validation.system))
+    store = tmp_path / "a.sqlite"
+    with pytest.raises(KeyboardInterrupt):
+        Campaign(stopped, seed=1, store=store).run(10)
+    resumed = Campaign(stopped, seed=1, store=store).run(10)
+    assert facts(resumed.trials) == facts(whole.trials)
+    assert [t.attempts for t in resumed.trials] == [1] * 6 + [2] + [1] * 3
+
+
+def test_asking_and_telling_by_hand_equals_running(validation: Validation) -> None:
+    by_hand = Campaign(validation, seed=6)
+    for _ in range(9):
+        opened = by_hand.ask()
+        by_hand.tell(opened, validation.system.execute(opened.plan.controller, opened.plan.task))
+    assert facts(by_hand.trials) == facts(Campaign(validation, seed=6).run(9).trials)
+
+
+def test_a_trial_can_be_told_later_by_its_number(validation: Validation, tmp_path: Path) -> None:
+    first = Campaign(validation, store=tmp_path / "a.sqlite")
+    opened = first.ask()
+    trajectory = validation.execute(opened.plan)
+    second = Campaign(validation, store=tmp_path / "a.sqlite")
+    assert second.trials[0].state == "open"
+    assert second.tell(0, trajectory).distance == validation.measure(opened.plan, trajectory)
+
+
+def test_running_leaves_trials_that_were_asked_by_hand_open(validation: Validation) -> None:
+    campaign = Campaign(validation)
+    opened = campaign.ask()
+    campaign.run(4)
+    assert campaign.trials[0].state == "open"
+    assert campaign.executions == 4
+    campaign.tell(opened, failed="the battery was empty")
+    assert campaign.trials[0].failure == "the battery was empty"
+
+
+def test_a_manual_task_is_told_to_the_search_and_is_no_iid_draw(validation: Validation) -> None:
+    campaign = Campaign(validation, search=searches.Random())
+    opened = campaign.ask({"goal": 1.25})
+    assert opened.trial.origin == "manual"
+    assert opened.trial.parameters == {"goal": pytest.approx(1.25)}
+    with pytest.raises(UnknownNameError, match="did you mean 'goal'"):
+        campaign.ask({"gaol": 1.0})
+
+
+def test_a_short_trajectory_told_by_hand_leaves_the_trial_open(validation: Validation) -> None:
+    campaign = Campaign(validation)
+    opened = campaign.ask()
+    whole = validation.execute(opened.plan)
+    short = type(whole)(whole.times[:-1], whole.states[:-1], whole.inputs[:-1])
+    with pytest.raises(InputError, match=r"26 times, 25 steps of 0.02 s, got 25"):
+        campaign.tell(opened, short)
+    assert campaign.tell(opened, whole).state == "completed"
+
+
+@pytest.mark.parametrize(
+    ("told", "sentence"),
+    [((99,), "there is no trial 99"), ((0,), "one of a trajectory, a distance and the reason")],
+)
+def test_telling_nonsense_is_refused(validation: Validation, told: tuple[int, ...], sentence: str) -> None:
+    campaign = Campaign(validation)
+    campaign.ask()
+    with pytest.raises(InputError, match=sentence):
+        campaign.tell(*told)
+
+
+def test_a_model_that_fails_stops_the_campaign_and_the_next_run_goes_on_behind_it(validation: Validation) -> None:
+    class Bad:
+        fails = True
+
+        def step(self, x, u):  # type: ignore[no-untyped-def]
+            known = validation.model.step(x, u)
+            return known * np.nan if self.fails else known
+
+        def jacobian(self, x, u):  # type: ignore[no-untyped-def]
+            return validation.model.jacobian(x, u)  # type: ignore[attr-defined]
+
+        def describe(self) -> dict[str, object]:
+            return {}
+
+    model = Bad()
+    campaign = Campaign(make_validation(model=model))
+    with pytest.raises(ModelError, match="model's closed loop diverged at step 1"):
+        campaign.run(3)
+    assert (campaign.executions, len(campaign.failed)) == (0, 1)
+    model.fails = False
+    assert campaign.run(3).executions == 3
+    assert len(campaign.trials) == 4
+
+
+def test_a_distance_of_nan_stops_the_campaign_but_keeps_the_execution(validation: Validation) -> None:
+    campaign = Campaign(make_validation(distance=lambda a, b, task: np.nan))
+    with pytest.raises(DistanceError, match="one finite number"):
+        campaign.run(3)
+    assert campaign.executions == 1
+    assert campaign.trajectories(campaign.trials[0])[1] is not None
+
+
+def test_verdicts_are_executed_facts_or_undecided(validation: Validation) -> None:
+    campaign = Campaign(validation).run(8)
+    assert campaign.worst is not None
+    worst = campaign.worst.distance or 0
+    falsified = campaign.verdict(worst * 0.9)
+    assert falsified.answer == "falsified"
+    assert falsified.witness is campaign.worst
+    assert campaign.verdict(worst).answer == "undecided"
+    for threshold in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="positive number"):
+            campaign.verdict(threshold)
+
+
+def test_a_store_of_another_experiment_is_refused(validation: Validation, tmp_path: Path) -> None:
+    Campaign(validation, store=tmp_path / "a.sqlite").run(2)
+    longer = make_validation(horizon=26)
+    with pytest.raises(StoreMismatchError, match="horizon was 25 and is now 26"):
+        Campaign(longer, store=tmp_path / "a.sqlite")
+    with pytest.raises(StoreMismatchError, match="seed was 0 and is now 1"):
+        Campaign(validation, store=tmp_path / "a.sqlite", seed=1)
+    assert Campaign(validation, store=tmp_path / "a.sqlite").executions == 2
+
+
+@pytest.mark.parametrize("budget", [0, -3, 2.5, True, None])
+def test_a_budget_is_a_positive_integer(validation: Validation, budget: object) -> None:
+    with pytest.raises(InputError, match="positive integer"):
+        Campaign(validation).run(budget)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("arguments", [{"seed": -1}, {"seed": 1.5}, {"search": object()}])
+def test_bad_arguments_are_named(validation: Validation, arguments: dict[str, object]) -> None:
+    with pytest.raises(InputError, match=next(iter(arguments))):
+        Campaign(validation, **arguments)  # type: ignore[arg-type]
+
+
+def test_a_search_that_leaves_the_cube_is_told_so(validation: Validation) -> None:
+    class Outside(searches.Random):
+        def propose(self, rng: np.random.Generator) -> np.ndarray:
+            return np.array([1.5])
+
+    with pytest.raises(InputError, match="unit cube"):
+        Campaign(validation, search=Outside()).run(1)
+
+
+def test_the_sketch_of_the_readme_runs() -> None:
+    validation = make_validation()
+    space = TaskSpace(goal=(-3.0, 3.0))
+    again = Validation(
+        space=space,
+        task=validation.task,
+        system=validation.system,
+        model=validation.model.step,
+        synthesizer=validation.synthesizer,
+        distance=validation.distance,
+    )
+    assert Campaign(again, search=searches.GPUCB(beta=2.0), seed=7).run(budget=6).executions == 6
+
+
+# Audits, and stopping early
+
+
+def origins(campaign: Campaign) -> list[str]:
+    return [trial.origin for trial in campaign.trials]
+
+
+def test_an_audit_adds_independent_draws_until_there_are_so_many(validation: Validation) -> None:
+    campaign = Campaign(validation, seed=2).run(7)
+    assert origins(campaign.audit(4))[7:] == ["iid"] * 4
+    assert len(campaign.audit(4).trials) == 11  # a total, as the budget is
+    assert len(campaign.audit(6).trials) == 13
+    assert campaign.executions == 13
+    points = np.array([trial.unit_point for trial in campaign.trials if trial.origin == "iid"])
+    assert ((points >= 0) & (points < 1)).all()
+    assert len(np.unique(points)) == 6
+
+
+def test_the_draws_of_a_random_search_are_an_audit_already(validation: Validation) -> None:
+    campaign = Campaign(validation, search=searches.Random(), seed=2).run(5)
+    assert len(campaign.audit(5).trials) == 5
+    assert origins(campaign.audit(8)) == ["iid"] * 8
+
+
+@pytest.mark.parametrize("search", ["gp-ucb", "random"])
+def test_an_audit_draws_what_no_search_draws(validation: Validation, search: str) -> None:
+    searched = Campaign(validation, search=searches.by_name(search), seed=2).run(12)
+    audited = Campaign(validation, search=searches.by_name(search), seed=2).audit(12)
+    others = {trial.unit_point.tobytes() for trial in searched.trials}
+    assert not others & {trial.unit_point.tobytes() for trial in audited.trials}
+
+
+@pytest.mark.parametrize("search", ["gp-ucb", "random"])
+def test_what_an_audit_draws_does_not_depend_on_the_search(validation: Validation, search: str) -> None:
+    campaign = Campaign(validation, search=searches.by_name(search), seed=2).audit(5)
+    plain = Campaign(validation, seed=2).audit(5)
+    assert facts(campaign.trials) == facts(plain.trials)
+    other = Campaign(validation, seed=3).audit(5)
+    assert {t.unit_point.tobytes() for t in plain.trials}.isdisjoint(t.unit_point.tobytes() for t in other.trials)
+
+
+def test_the_points_of_many_audits_are_uniform() -> None:
+    cheap = make_validation(horizon=1)
+    points = np.array([t.unit_point[0] for seed in range(25) for t in Campaign(cheap, seed=seed).audit(8).trials])
+    assert kstest(points, "uniform").pvalue > 1e-3
+    assert abs(np.corrcoef(points[:-1], points[1:])[0, 1]) < 0.25
+
+
+def test_a_search_goes_on_after_an_audit_and_knows_what_it_showed(validation: Validation, tmp_path: Path) -> None:
+    whole = Campaign(validation, seed=4).run(6).audit(3).run(12)
+    for act in (
+        lambda c: c.run(6),
+        lambda c: c.audit(1),
+        lambda c: c.audit(3),
+        lambda c: c.run(10),
+        lambda c: c.run(12),
+    ):
+        pieces = act(Campaign(validation, seed=4, store=tmp_path / "a.sqlite"))
+    assert facts(pieces.trials) == facts(whole.trials)
+    assert origins(whole) == ["initial"] * 5 + ["acquisition"] + ["iid"] * 3 + ["acquisition"] * 3
+
+
+def test_an_audit_finishes_what_was_interrupted_first(validation: Validation, tmp_path: Path) -> None:
+    class Interrupting(FaultyRig):
+        def execute(self, controller, task):  # type: ignore[no-untyped-def]
+            if self._executions in (5, 9):
+                self._executions += 1
+                interrupt_at_once()
+            return super().execute(controller, task)
+
+    whole = Campaign(make_validation(system=FaultyRig(validation.system)), seed=1).run(7).audit(4)
+    stopped = make_validation(system=Interrupting(validation.system))
+    campaign = Campaign(stopped, seed=1, store=tmp_path / "a.sqlite")
+    with pytest.raises(KeyboardInterrupt):
+        campaign.run(7)
+    with pytest.raises(KeyboardInterrupt):
+        campaign.run(7).audit(4)
+    assert campaign.trials[-1].state == "open"
+    resumed = Campaign(stopped, seed=1, store=tmp_path / "a.sqlite").audit(4)
+    assert facts(resumed.trials) == facts(whole.trials)
+
+
+def test_a_failed_draw_of_an_audit_counts_as_one(validation: Validation) -> None:
+    rig = FaultyRig(validation.system, {1: "raise"})
+    seen: list[Trial] = []
+    campaign = Campaign(make_validation(system=rig)).audit(4, on_trial=seen.append)
+    assert [trial.state for trial in seen] == ["completed", "failed", "completed", "completed"]
+    assert origins(campaign) == ["iid"] * 4
+
+
+@pytest.mark.parametrize("draws", [0, -3, 2.5, True, None])
+def test_the_draws_of_an_audit_are_a_positive_integer(validation: Validation, draws: object) -> None:
+    with pytest.raises(InputError, match="positive number of draws"):
+        Campaign(validation).audit(draws)  # type: ignore[arg-type]
+
+
+def test_a_campaign_stops_before_the_execution_that_is_not_needed(validation: Validation) -> None:
+    asked: list[int] = []
+
+    def enough(campaign: Campaign) -> bool:
+        asked.append(campaign.executions)
+        return campaign.executions >= 7
+
+    campaign = Campaign(validation, seed=1)
+    assert campaign.run(20, until=enough).executions == 7
+    assert asked == list(range(8))
+    assert campaign.run(20, until=enough).executions == 7
+    assert campaign.run(5, until=lambda _: False).executions == 7
+    assert facts(campaign.trials) == facts(Campaign(validation, seed=1).run(7).trials)
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_a_campaign_executes_what_nothing_came_near_to_before_it_validates(tmp_path: Path) -> None:
+    def campaign(name: str) -> Campaign:
+        return Campaign(make_validation(), search=OneCorner(), seed=1, store=tmp_path / name)
+
+    # The search alone would never leave its corner.
+    decided = campaign("a").run_until_decided(1e3, 20)
+    origins = [trial.origin for trial in decided.trials]
+    assert decided.verdict(1e3).answer == "validated"
+    assert 0 < origins.count("covering") < decided.executions < 20
+    points = np.array([trial.unit_point for trial in decided.trials])
+    assert farthest_task(points) <= RESOLUTION
+    # Interrupted, it goes on as if it had not been, and beyond the verdict nothing is executed.
+
+    def interrupt(trial: Trial) -> None:
+        raise KeyboardInterrupt
+
+    for _ in range(decided.executions):
+        with pytest.raises(KeyboardInterrupt):
+            campaign("b").run_until_decided(1e3, 20, on_trial=interrupt)
+    assert facts(campaign("b").run_until_decided(1e3, 20).trials) == facts(decided.trials)
+
+
+def test_a_campaign_ends_at_its_counterexample(validation: Validation) -> None:
+    falsified = Campaign(validation, seed=1).run_until_decided(1e-6, 9)
+    assert falsified.executions == 1
+    assert falsified.verdict(1e-6).answer == "falsified"
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_workers_decide_together(validation: Validation) -> None:
+    decided = Campaign(validation, search=OneCorner(), seed=1).run_until_decided(1e3, 20, workers=2)
+    assert decided.verdict(1e3).answer == "validated"
+    assert decided.executions < 20
+
+
+# What an attack on the campaign found, and must not find again
+
+
+def test_an_interrupt_while_planning_leaves_no_ghost_in_the_search(validation: Validation) -> None:
+    class Impatient:
+        batched = True
+        designs = 0
+
+        def design(self, task, model):  # type: ignore[no-untyped-def]
+            self.designs += 1
+            if self.designs == 7:
+                raise KeyboardInterrupt
+            return validation.synthesizer.design(task, model)
+
+        def describe(self) -> dict[str, object]:
+            return {}
+
+    hasty = make_validation()
+    hasty.synthesizer = Impatient()
+    campaign = Campaign(hasty, seed=2)
+    with pytest.raises(KeyboardInterrupt):
+        campaign.run(10)
+    assert facts(campaign.run(10).trials) == facts(Campaign(validation, seed=2).run(10).trials)
+
+
+def test_an_interrupted_trial_that_cannot_be_planned_any_more_is_passed_over(tmp_path: Path) -> None:
+    class Stopped(FaultyRig):
+        def execute(self, controller, task):  # type: ignore[no-untyped-def]
+            interrupt_at_once()
+
+    plain = make_validation()
+    with pytest.raises(KeyboardInterrupt):
+        Campaign(make_validation(system=Stopped(plain.system)), store=tmp_path / "a.sqlite").run(3)
+    again = make_validation(system=Stopped(plain.system))
+    campaign = Campaign(again, store=tmp_path / "a.sqlite")
+    whole, again.synthesizer.design = again.synthesizer.design, None  # type: ignore[attr-defined, method-assign]
+    with pytest.raises(CtxvalError):
+        campaign.run(3)
+    again.synthesizer.design = whole  # type: ignore[method-assign]
+    again.system = plain.system
+    assert campaign.run(3).executions == 3
+    assert (campaign.trials[0].state, campaign.trials[0].executed) == ("failed", False)
+
+
+def test_a_failure_with_undecodable_text_is_stored(validation: Validation) -> None:
+    class Serial(FaultyRig):
+        def execute(self, controller, task):  # type: ignore[no-untyped-def]
+            raise RuntimeError("serial said \udcff")
+
+    campaign = Campaign(make_validation(system=Serial(validation.system))).run(1)
+    assert campaign.executions == 1
+    assert "serial said" in (campaign.trials[0].failure or "")
+
+
+def test_two_processes_do_not_run_one_store(validation: Validation, tmp_path: Path) -> None:
+    first, second = (Campaign(validation, store=tmp_path / "a.sqlite") for _ in range(2))
+    with first.store.sole_writer(), pytest.raises(StoreAccessError, match="run by another process"):
+        second.run(1)
+    assert second.run(1).executions == 1
+
+
+def test_an_open_trial_of_another_campaign_is_refused(validation: Validation) -> None:
+    here, there = Campaign(validation, seed=1), Campaign(validation, seed=2)
+    here.ask()
+    opened = there.ask()
+    with pytest.raises(InputError, match="another campaign"):
+        here.tell(opened, validation.execute(opened.plan))
+
+
+def test_independent_draws_know_how_many_there_were_to_be(validation: Validation) -> None:
+    campaign = Campaign(validation, search=searches.GPUCB(initial=2)).run(3)
+    campaign.audit(2)
+    campaign.audit(3)
+    assert [trial.note for trial in campaign.trials[3:]] == [{"draws": 2}, {"draws": 2}, {"draws": 3}]
+    assert all(trial.note is None for trial in campaign.trials[:3])
+    campaign.tell(campaign.ask(draw=True), distance=0.1)
+    assert campaign.trials[-1].note is None
+    drawn = Campaign(validation, search=searches.Random()).run(2).run_until_decided(90.0, 4, resolution=1.0)
+    assert [(trial.note or {}).get("draws") for trial in drawn.trials] == [2, 2, 0, 0]
+    assert Campaign(validation, search=searches.Random()).run(2, until=lambda _: False).trials[0].note == {"draws": 0}
+
+
+def test_a_resumed_random_search_keeps_its_plan(validation: Validation, tmp_path: Path) -> None:
+    stopped = Campaign(validation, search=searches.Random(), store=tmp_path / "a.sqlite")
+    with pytest.raises(KeyboardInterrupt):
+        stopped.run(3, on_trial=lambda _: interrupt_at_once())
+    stopped.store.close()
+    trials = Campaign(validation, search=searches.Random(), store=tmp_path / "a.sqlite").run(3).trials
+    assert [trial.note for trial in trials] == [{"draws": 3}] * 3

@@ -1,0 +1,332 @@
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import make_validation
+from ctxval import Campaign, Store, TaskSpace, Validation, distances, models, searches
+from ctxval._util.arrays import Array
+from ctxval.config.settings import read_settings
+from ctxval.errors import DistanceError, InputError, StoreMismatchError
+from ctxval.testing import FaultyRig
+
+DATA = Path(__file__).parents[1] / "data"
+SEARCH = searches.GPUCB
+
+
+class Scaled:
+    """A distance whose scale can be seen or is private."""
+
+    def __init__(self, scale: float = 1.0, private: float = 1.0) -> None:
+        self.scale, self._private = scale, private
+        self.distance = distances.FinalState(norm=1)
+
+    def __call__(self, model: Any, system: Any, task: Any) -> Any:
+        return self.scale * self._private * self.distance(model, system, task)
+
+
+class Private:
+    """A model whose weights nobody sees, as those of many network libraries."""
+
+    def __init__(self, model: Any, gain: float = 1.0) -> None:
+        self._model, self._gain = model, gain
+
+    def step(self, x: Array, u: Array) -> Array:
+        return np.asarray(self._model.step(x, self._gain * u))
+
+    def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
+        A, B = self._model.jacobian(x, u)
+        return A, self._gain * B
+
+
+def campaign(store: Path, validation: Validation | None = None, **options: Any) -> Campaign:
+    return Campaign(validation or make_validation(), search=SEARCH(), store=store, seed=2, **options)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("made") / "a.sqlite"
+    campaign(path).run(7)
+    return path
+
+
+@pytest.fixture
+def store(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(made, tmp_path / "a.sqlite"))
+
+
+# The model
+
+
+def test_a_model_learned_again_is_noticed_even_if_its_weights_are_private(tmp_path: Path) -> None:
+    learned = make_validation().model
+    campaign(tmp_path / "a.sqlite", make_validation(model=Private(learned))).run(4)
+    assert campaign(tmp_path / "a.sqlite", make_validation(model=Private(learned))).executions == 4
+    other = make_validation(model=Private(learned, gain=1.01))
+    for reason in (None, "learned from more data"):
+        with pytest.raises(StoreMismatchError, match=r"for the task of trial \d differs .* use another store"):
+            campaign(tmp_path / "a.sqlite", other, accept_change=reason)
+
+
+def test_a_model_that_fails_now_is_noticed(tmp_path: Path) -> None:
+    class Failing(Private):
+        def step(self, x: Array, u: Array) -> Array:
+            raise ValueError("no weights")
+
+    learned = make_validation().model
+    campaign(tmp_path / "a.sqlite", make_validation(model=Private(learned))).run(3)
+    failing = make_validation(model=Failing(learned))
+    failing.model.__class__.__name__ = failing.model.__class__.__qualname__ = "Private"
+    with pytest.raises(StoreMismatchError):
+        campaign(tmp_path / "a.sqlite", failing)
+
+
+def test_a_controller_design_that_differs_each_time_is_not_taken_for_another_one(tmp_path: Path) -> None:
+    class Drawing:
+        rng = np.random.default_rng(0)
+
+        def design(self, task: Any, model: Any) -> Any:
+            gain = self.rng.normal(-1, 0.3)
+            return lambda t, x: gain * x[..., :1]
+
+        def describe(self) -> dict[str, object]:
+            return {}
+
+    validation = make_validation()
+    validation.synthesizer = Drawing()
+    campaign(tmp_path / "a.sqlite", validation).run(3)
+    assert campaign(tmp_path / "a.sqlite", validation).run(5).executions == 5
+
+
+# The distance
+
+
+@pytest.mark.parametrize("other", [Scaled(scale=2.0), Scaled(private=2.0)])
+def test_another_distance_is_refused_until_everything_is_measured_anew(tmp_path: Path, other: Scaled) -> None:
+    path = tmp_path / "a.sqlite"
+    before = campaign(path, make_validation(distance=Scaled())).run(6)
+    with pytest.raises(StoreMismatchError, match="ctxval remeasure STORE"):
+        campaign(path, make_validation(distance=other))
+    if other.scale == 1:
+        with pytest.raises(StoreMismatchError, match=r"was .* and is now"):
+            campaign(path, make_validation(distance=other), accept_change="it is the same")
+    after = campaign(path, make_validation(distance=other), remeasure=True)
+    np.testing.assert_allclose([t.distance for t in after.trials], [2 * (t.distance or 0) for t in before.trials])
+    assert after.executions == 6
+    (change,) = after.store.history()
+    assert change.what == "remeasured"
+    assert change.content["before"]["3"] == {
+        "state": "completed",
+        "distance": before.trials[3].distance,
+        "failure": None,
+    }
+    assert campaign(path, make_validation(distance=other)).run(7).executions == 7
+
+
+def test_a_distance_that_is_only_written_otherwise_can_be_accepted(store: Path) -> None:
+    same = make_validation(distance=lambda model, system, task: distances.FinalState(norm=1)(model, system, task))
+    with pytest.raises(StoreMismatchError, match="remeasure"):
+        campaign(store, same)
+    accepted = campaign(store, same, accept_change="rewritten")
+    assert [(c.what, c.why) for c in accepted.store.history()] == [("accepted", "rewritten")]
+    assert campaign(store, same).run(8).executions == 8
+
+
+def test_a_live_campaign_takes_another_distance(store: Path) -> None:
+    running = campaign(store)
+    before = [trial.distance for trial in running.trials]
+    changed = running.remeasure(Scaled(scale=3.0))
+    assert len(changed) == 7
+    np.testing.assert_allclose([t.distance for t in running.trials], 3 * np.array(before))
+    assert running.remeasure() == []
+    assert running.run(8).executions == 8
+    resumed = campaign(store, make_validation(distance=Scaled(scale=3.0)))
+    assert [t.distance for t in resumed.trials] == [t.distance for t in running.trials]
+
+
+def test_a_distance_that_raises_now_changes_nothing(store: Path) -> None:
+    def broken(model: Any, system: Any, task: Any) -> float:
+        raise ZeroDivisionError("no")
+
+    before = Store(store).trials()
+    with pytest.raises(DistanceError, match="trial 0 cannot be measured anew, and nothing is changed"):
+        campaign(store, make_validation(distance=broken), remeasure=True)
+    with pytest.raises(DistanceError, match="nothing is changed"):
+        campaign(store).remeasure(broken)
+    assert [t.distance for t in Store(store).trials()] == [t.distance for t in before]
+    assert campaign(store).executions == 7
+
+
+def test_a_distance_that_was_told_alone_is_none_of_another_definition(store: Path) -> None:
+    told = campaign(store)
+    told.tell(told.ask(), distance=0.25)
+    after = campaign(store, make_validation(distance=Scaled(scale=2.0)), remeasure=True)
+    assert (after.trials[7].state, after.trials[7].distance, after.executions) == ("unmeasured", None, 8)
+    assert "told without a trajectory" in str(after.trials[7].failure)
+    assert after.store.history()[0].content["before"]["7"]["distance"] == 0.25
+
+
+# The rest
+
+
+def test_a_repaired_system_goes_on_with_a_note(store: Path) -> None:
+    repaired = make_validation(system=FaultyRig(make_validation().system))
+    with pytest.raises(StoreMismatchError, match=r"validation\.system.*--accept-change"):
+        campaign(store, repaired)
+    with pytest.raises(InputError, match="needs a reason"):
+        campaign(store, repaired, accept_change=" ")
+    accepted = campaign(store, repaired, accept_change="gripper replaced")
+    (change,) = accepted.store.history()
+    assert (change.why, change.content["trials"]) == ("gripper replaced", 7)
+    assert campaign(store, repaired).run(8).executions == 8
+
+
+def test_another_question_cannot_be_accepted(store: Path) -> None:
+    for change in (
+        {"seed": 3},
+        {"search": searches.Random()},
+        {"name": "other"},
+    ):
+        with pytest.raises(StoreMismatchError, match="use another store"):
+            Campaign(make_validation(), **{"search": SEARCH(), "seed": 2, **change}, store=store, accept_change="x")
+
+
+def test_the_unit_of_a_parameter_is_part_of_the_question(store: Path) -> None:
+    other = make_validation()
+    other.space = TaskSpace(goal=(-3.0, 3.0, "deg"))
+    with pytest.raises(StoreMismatchError, match=r"space\.goal\[2\] was 'rad' and is now 'deg'"):
+        campaign(store, other, accept_change="x")
+
+
+# Stores of version 0.1.0
+
+
+@pytest.fixture
+def old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a folder with what version 0.1.0 wrote."""
+    for file in DATA.glob("*"):
+        shutil.copy(file, tmp_path / file.name)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "cart_system", raising=False)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("target", "seed", "executed"), [("pendulum", 3, 8), ("cart.toml", 0, 7)], ids=["pendulum", "cart"]
+)
+def test_a_store_of_version_0_1_0_opens_and_goes_on(old: Path, target: str, seed: int, executed: int) -> None:
+    path = old / f"{target.removesuffix('.toml')}-0.1.0.sqlite"
+    settings = read_settings(target, {"search": "gp-ucb", "seed": seed})
+    for budget in (executed, executed + 2):
+        resumed = settings.campaign(settings.load(), path)
+        assert resumed.executions >= executed
+        assert resumed.run(budget).executions == budget
+    assert [change.what for change in resumed.store.history()] == ["described anew"]
+
+
+def test_a_store_of_version_0_1_0_of_another_model_is_refused(old: Path) -> None:
+    settings = read_settings("cart.toml", {"search": "gp-ucb"})
+    experiment = settings.load()
+    experiment.validation.model = models.Linear([[1.0, 0.05], [0.0, 0.99]], [[0.0], [0.05]])
+    with pytest.raises(StoreMismatchError, match=r"model\.A\[1\]\[1\] was 1.0 and is now 0.99"):
+        settings.campaign(experiment, old / "cart-0.1.0.sqlite")
+
+
+# Changed while it is open
+
+
+def test_a_campaign_that_has_not_seen_another_distance_writes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    stale = campaign(path)
+    stale.run(2)
+    opened = stale.ask()
+    whole = stale.validation.execute(opened.plan)
+    fresh = campaign(path, make_validation(distance=Scaled(scale=100.0)), remeasure=True)
+    for act in (
+        lambda: stale.run(5),
+        lambda: stale.tell(opened, whole),
+        lambda: stale.add({"goal": 1.0}, stale.validation.execute(stale.validation.plan([1.0]))),
+        lambda: stale.ask(),
+    ):
+        with pytest.raises(StoreMismatchError, match="made by another experiment"):
+            act()
+    assert [t.state for t in Store(path).trials()] == ["completed", "completed", "open"]
+    assert fresh.run(5).executions == 5
+
+
+def test_what_is_measured_by_the_old_distance_at_the_same_time_is_kept_beside(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    stale = campaign(path)
+    opened = stale.ask()
+    whole = stale.validation.execute(opened.plan)
+    before = stale.store.signature()
+    campaign(path, make_validation(distance=Scaled(scale=100.0)), remeasure=True)
+    stale.store.signature = lambda: before  # type: ignore[method-assign]  # it has looked just before
+    stale.store._require_unchanged = Store(path)._require_unchanged  # type: ignore[method-assign]
+    with pytest.raises(StoreMismatchError, match=r"was changed meanwhile.*kept in .*a\.trial-0\.npz"):
+        stale.tell(opened, whole)
+
+
+def test_what_is_told_while_distances_are_measured_anew_is_measured_anew_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    first = campaign(path).run(2)
+    opened = first.ask()
+    whole = first.validation.execute(opened.plan)
+    told: list[int] = []
+
+    class Telling(Scaled):
+        def __call__(self, model: Any, system: Any, task: Any) -> Any:
+            if not told:
+                told.append(1)
+                first.tell(opened, whole)
+            return super().__call__(model, system, task)
+
+    second = campaign(path)
+    second.remeasure(Telling(scale=100.0))
+    plain = [
+        first.validation.measure(first._plan(t), m) for t in second.trials for m in [second.trajectories(t)[1]] if m
+    ]
+    np.testing.assert_allclose([t.distance for t in second.trials], 100 * np.array(plain))
+    assert len(plain) == 3
+
+
+def test_an_interrupted_remeasure_changes_neither_store_nor_campaign(store: Path) -> None:
+    def interrupted(model: Any, system: Any, task: Any) -> float:
+        raise KeyboardInterrupt
+
+    running = campaign(store)
+    before = [trial.distance for trial in running.trials]
+    with pytest.raises((KeyboardInterrupt, DistanceError)):
+        running.remeasure(interrupted)
+    assert running.run(8).executions == 8
+    assert [trial.distance for trial in campaign(store).trials][:7] == before
+
+
+def test_a_reason_is_kept_although_no_code_differs(store: Path) -> None:
+    repaired = campaign(store, accept_change="gripper replaced")
+    assert [(c.what, c.why) for c in repaired.store.history()] == [("accepted", "gripper replaced")]
+
+
+def test_counters_of_a_system_do_not_go_into_the_store_with_another_distance(tmp_path: Path) -> None:
+    rig = FaultyRig(make_validation().system)
+    rig.executed = 0  # type: ignore[attr-defined]
+    running = campaign(tmp_path / "a.sqlite", make_validation(system=rig)).run(2)
+    rig.executed = 2  # type: ignore[attr-defined]
+    running.remeasure(Scaled(scale=2.0))
+    rig.executed = 0  # type: ignore[attr-defined]
+    assert campaign(tmp_path / "a.sqlite", make_validation(system=rig, distance=Scaled(scale=2.0))).executions == 2
+
+
+def test_a_task_that_was_told_in_another_distance_counts_again_once_it_is_executed(store: Path) -> None:
+    told = campaign(store)
+    told.tell(told.ask({"goal": 1.0}), distance=0.25)
+    told.remeasure(Scaled(scale=2.0))
+    assert "Trial 7 was executed, but the distance could not be measured" in told.verdict(1e6).reason
+    again = told.ask({"goal": 1.0})
+    told.tell(again, told.validation.execute(again.plan))
+    assert "could not be measured" not in told.verdict(1e6).reason

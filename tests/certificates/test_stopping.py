@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ctxval import Trial
+from ctxval.certificates.stopping import standing
+from ctxval.certificates.verdict import judge
+
+pytestmark = pytest.mark.usefixtures("few_draws")
+
+
+def trial(number: int, x: float, distance: float) -> Trial:
+    return Trial(number, "acquisition", "completed", np.array([x]), {"x": x}, 1, True, distance)
+
+
+def test_a_corner_that_a_trial_is_only_near_to_is_executed_before_anything_is_validated() -> None:
+    known = [trial(k, x, 0.1 * np.sin(3 * x)) for k, x in enumerate(np.linspace(0.0, 0.95, 9).tolist())]
+    now = standing(known, 0.9, left=5)
+    assert not now.decided
+    assert now.uncovered is not None
+    assert now.uncovered.tolist() == [1.0]
+    verdict = judge(known, 0.9)
+    assert verdict.answer == "undecided"
+    assert "1 of the 2 ends of the task parameter's range" in verdict.reason
+    # What rises towards the end, and nowhere else, is found there.
+    assert standing([*known, trial(9, 1.0, 1.0)], 0.9, left=4).decided
+    assert judge([*known, trial(9, 1.0, 1.0)], 0.9).answer == "falsified"
+    assert judge([*known, trial(9, 1.0, 0.01)], 0.9).answer == "validated"
+
+
+def test_corners_of_two_parameters_come_first() -> None:
+    points = [[0.5, 0.5], [0.05, 0.05], [0.95, 0.0], [0.0, 0.95], [0.5, 0.0], [0.0, 0.5]]
+    known = [replace(trial(k, 0.0, 0.1 * k), unit_point=np.array(point)) for k, point in enumerate(points)]
+    asked = []
+    while len(known) < 10:
+        now = standing(known, 1e3, left=60)
+        assert now.uncovered is not None
+        asked.append(now.uncovered.tolist())
+        known.append(replace(trial(len(known), 0.0, 0.3), unit_point=now.uncovered))
+    assert sorted(asked) == [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]
+
+
+def test_a_bound_is_put_to_the_test_twice_before_it_decides() -> None:
+    known = [trial(k, x, 0.5 + 0.3 * np.sin(9 * x)) for k, x in enumerate([0.0, 0.2, 0.42, 0.6, 0.8, 1.0])]
+    for _ in range(2):
+        now = standing(known, 50.0, left=5)
+        assert not now.decided
+        assert now.uncovered is not None
+        x = float(now.uncovered[0])
+        assert min(abs(x - one.unit_point[0]) for one in known) > 0.01
+        known.append(trial(len(known), x, 0.5 + 0.3 * np.sin(9 * x)))
+    assert standing(known, 50.0, left=3).decided
+    # Without a budget for that, the verdict is what the bound makes it.
+    assert standing(known[:-1], 50.0, left=0).decided
+    # A test that lifts the bound above the threshold leaves it undecided.
+    lifted = [*known[:-1], replace(known[-1], distance=49.0)]
+    now = standing(lifted, 50.0, left=3)
+    assert not now.decided

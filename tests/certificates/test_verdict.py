@@ -1,0 +1,352 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ctxval import TaskSpace, Trial
+from ctxval.certificates import (
+    Certificate,
+    Sample,
+    certify_audit,
+    certify_posterior,
+    certify_scenario,
+)
+from ctxval.certificates.covering import resolved_volume
+from ctxval.certificates.stopping import standing
+from ctxval.certificates.verdict import counterexample, judge, judge_by, remarks_on, require_threshold
+from ctxval.core.trial import Change, Origin, State
+from ctxval.errors import CertificateError, InputError
+
+pytestmark = pytest.mark.usefixtures("few_draws")
+
+WORST = 1.0
+
+
+def trial(
+    number: int, x: float, distance: float | None, origin: Origin = "acquisition", state: State | None = None
+) -> Trial:
+    ended: State = state or ("failed" if distance is None else "completed")
+    return Trial(number, origin, ended, np.array([x]), {"x": x}, 1, ended != "open", distance)
+
+
+def trials(n: int = 8, origin: Origin = "acquisition") -> list[Trial]:
+    """A bump of height 1, known at n even points."""
+    return [trial(k, x, WORST * np.sin(3 * x)) for k, x in enumerate(np.linspace(0, 1.0, n).tolist())]
+
+
+def certificate(upper: float, doubt: str | None = None, volume: float = 0.0) -> Certificate:
+    return Certificate("posterior", "", upper, 0.95, volume, 5, (), doubt=doubt)
+
+
+# Counterexamples
+
+
+def test_an_executed_distance_above_the_threshold_falsifies() -> None:
+    known = trials()
+    largest = max(t.distance or 0.0 for t in known)
+    found = counterexample(known, 0.5)
+    assert found is not None
+    assert found.answer == "falsified"
+    assert found.witness is not None
+    assert found.witness.distance == largest
+    assert f"trial {found.witness.number} was executed" in str(found)
+    assert str(found).startswith("falsified: ")
+
+
+def test_a_distance_at_the_threshold_is_no_counterexample_and_neither_is_a_failure() -> None:
+    known = [trial(0, 0.1, 0.5), trial(1, 0.2, None), trial(2, 0.3, None, state="open")]
+    assert counterexample(known, 0.5) is None
+    assert counterexample(known, np.nextafter(0.5, 0)) is not None
+    assert counterexample([], 0.5) is None
+
+
+@pytest.mark.parametrize("threshold", [0.0, -1.0, np.nan, np.inf, "1", None])
+def test_a_threshold_is_a_positive_number(threshold: object) -> None:
+    with pytest.raises(InputError, match="positive number"):
+        require_threshold(threshold)  # type: ignore[arg-type]
+    for function in (counterexample, judge, lambda known, tau: standing(known, tau, 0)):
+        with pytest.raises(InputError, match="positive number"):
+            function(trials(), threshold)  # type: ignore[operator]
+
+
+# By a certificate
+
+
+def test_a_bound_at_most_the_threshold_validates() -> None:
+    verdict = judge_by(certificate(1.2), trials(), 1.2)
+    assert verdict.answer == "validated"
+    assert verdict.certificate is not None
+    assert "with confidence 0.95" in verdict.reason
+
+
+def test_a_counterexample_wins_over_any_bound() -> None:
+    verdict = judge_by(certificate(0.1), trials(), 0.5)
+    assert verdict.answer == "falsified"
+    assert verdict.witness is not None
+    assert verdict.certificate is not None
+
+
+def test_a_bound_above_the_threshold_leaves_it_undecided() -> None:
+    verdict = judge_by(certificate(1.3), trials(), 1.2)
+    assert verdict.answer == "undecided"
+    assert "d* may be up to 1.3" in verdict.reason
+
+
+def test_a_withdrawn_bound_validates_nothing() -> None:
+    verdict = judge_by(certificate(1.1, doubt="trial 3 is too large"), trials(), 1.2)
+    assert verdict.answer == "undecided"
+    assert verdict.reason == "trial 3 is too large."
+
+
+def test_a_volume_is_left_out_only_where_that_is_accepted() -> None:
+    partial = certificate(1.1, volume=0.05)
+    refused = judge_by(partial, trials(), 1.2)
+    assert refused.answer == "undecided"
+    assert "leaves out 5 % of the task space" in refused.reason
+    assert judge_by(partial, trials(), 1.2, volume=0.04).answer == "undecided"
+    accepted = judge_by(partial, trials(), 1.2, volume=0.05)
+    assert accepted.answer == "validated"
+    assert "but for 5 % of the task space" in accepted.reason
+
+
+def test_scenario_and_audit_bounds_judge_too() -> None:
+    drawn = [trial(k, x, 0.5 * x, "iid") for k, x in enumerate(np.linspace(0, 1, 60).tolist())]
+    for made in (certify_scenario(Sample.of(drawn), 0.9), certify_audit(Sample.of(drawn), 0.9)):
+        assert judge_by(made, drawn, 0.6).answer == "undecided"
+        assert judge_by(made, drawn, 0.6, volume=0.05).answer == "validated"
+        assert judge_by(made, drawn, 0.4, volume=0.05).answer == "falsified"
+
+
+# By the posterior
+
+
+def test_the_posterior_bound_validates_what_is_far_above_it() -> None:
+    verdict = judge(trials(), 50.0)
+    assert verdict.answer == "validated"
+    assert verdict.certificate is not None
+    assert verdict.certificate.kind == "posterior"
+    assert verdict.expected is None
+
+
+def test_a_counterexample_needs_no_certificate_and_no_model() -> None:
+    known = [*trials(3), trial(3, 0.7, None), trial(4, 0.8, None, state="open")]
+    assert judge(known, 0.5).answer == "falsified"
+    assert standing(known, 0.5, 0).decided
+
+
+def test_undecided_says_what_more_would_take() -> None:
+    known = trials(5)
+    upper = certify_posterior(Sample.of(known)).upper_bound
+    tau = 0.5 * (upper + max(t.distance or 0.0 for t in known))
+    verdict = judge(known, tau)
+    assert verdict.answer == "undecided"
+    assert verdict.expected is not None
+    assert verdict.expected.executions is None or verdict.expected.executions >= 1
+    assert "more executions are expected to decide" in verdict.reason
+    assert not standing(known, tau, 0).decided
+
+
+def test_a_bound_that_is_withdrawn_is_not_forecast() -> None:
+    known = [*trials(25), trial(25, 0.51, 30.0)]
+    verdict = judge(known, 1e6)
+    assert verdict.answer == "undecided"
+    assert "withdrawn" in verdict.reason
+    assert verdict.expected is None
+    assert not standing(known, 1e6, 0).decided
+
+
+@pytest.mark.parametrize(
+    ("known", "sentence"),
+    [
+        ([], "nothing was executed"),
+        (trials(3), "at least 4 trials"),
+        ([*trials(), trial(8, 0.4, None)], "1 of 9 executions failed"),
+        ([*trials(), trial(8, 0.4, None, state="open")], "are open"),
+        ([trial(k, k / 9, 0.3) for k in range(9)], "they say nothing of d"),
+    ],
+)
+def test_where_nothing_can_be_certified_the_verdict_is_open_and_says_why(known: list[Trial], sentence: str) -> None:
+    verdict = judge(known, 5.0)
+    assert verdict.answer == "undecided"
+    assert sentence in verdict.reason
+    assert sentence == "are open" or not standing(known, 5.0, 0).decided
+
+
+def test_a_confidence_beyond_the_draws_is_undecided_and_one_that_is_none_is_refused() -> None:
+    verdict = judge(trials(), 50.0, confidence=1 - 1e-9)
+    assert verdict.answer == "undecided"
+    assert "needs more than" in verdict.reason
+    for tau, confidence in ((50.0, 1.5), (0.5, 0.0)):
+        with pytest.raises(CertificateError, match="strictly between 0 and 1"):
+            judge(trials(), tau, confidence=confidence)
+        with pytest.raises(CertificateError, match="strictly between 0 and 1"):
+            standing(trials(), tau, 0, confidence=confidence)
+
+
+@pytest.mark.parametrize("stochastic", [False, True])
+def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> None:
+    known = trials(6)
+    upper = certify_posterior(Sample.of(known), 0.95, stochastic=stochastic).upper_bound
+    best = max(t.distance or 0.0 for t in known)
+    for threshold in (0.9 * best, 1.02 * upper, best + 0.2 * (upper - best)):
+        verdict = judge(known, threshold, stochastic=stochastic)
+        assert standing(known, threshold, 0, stochastic=stochastic).decided == (verdict.answer != "undecided")
+
+
+def test_what_nothing_came_near_to_is_missing_where_the_bound_keeps_the_threshold() -> None:
+    known = [one for one in trials(9) if not 0.3 < one.unit_point[0] < 0.7]
+    now = standing(known, 50.0, left=1)
+    assert not now.decided
+    assert now.uncovered is not None
+    assert now.uncovered[0] == pytest.approx(0.5, abs=0.01)
+    assert "1 more executions would come near" in judge(known, 50.0).reason
+    # Being executed is as good as covered.
+    pending = [*known, trial(9, 0.5, None, state="open")]
+    challenged = standing(pending, 50.0, left=1)
+    assert challenged.uncovered is not None
+    assert abs(challenged.uncovered[0] - 0.5) > 0.01
+    # Neither where the budget does not suffice, nor where the bound is too high, is an execution spent on it.
+    assert standing(known, 50.0, left=0).uncovered is None
+    assert standing(known, max(t.distance or 0.0 for t in known) * 1.0001, left=1).uncovered is None
+
+
+def test_a_reason_does_not_round_its_comparison_away() -> None:
+    falsified = counterexample([trial(0, 0, 0.50000001)], 0.5)
+    assert falsified is not None
+    assert "its distance 0.50000001 exceeds 0.5." in falsified.reason
+    assert "is 1.234561, at most 1.234569" in judge_by(certificate(1.234561), trials(), 1.234569).reason
+    assert (
+        "above 1.23456 was executed, but d* may be up to 1.235"
+        in judge_by(certificate(1.23457), trials(), 1.23456).reason
+    )
+
+
+@pytest.mark.parametrize("resolution", [np.nan, 0.0, -0.1, np.inf])
+def test_a_resolution_that_is_no_positive_number_is_refused_before_anything_is_said(resolution: float) -> None:
+    for trials_of in (trials(), [trial(0, 0.5, 9.0)]):  # a counterexample among them or not
+        with pytest.raises(CertificateError, match="resolution must be a positive number"):
+            judge(trials_of, 1.0, resolution=resolution)
+        with pytest.raises(CertificateError, match="resolution must be a positive number"):
+            standing(trials_of, 1.0, 5, resolution=resolution)
+
+
+def test_a_failure_that_was_made_good_counts_no_more() -> None:
+    known = trials()
+    failed = trial(len(known), 0.31, None, state="failed")
+    again = trial(len(known) + 1, 0.31, WORST * np.sin(3 * 0.31))
+    failed_later = [*known, replace(again, number=len(known)), replace(failed, number=99)]
+    for not_made_good in ([*known, failed], failed_later):
+        assert "executions failed" in judge(not_made_good, 1e3).reason
+    made_good, never_failed = judge([*known, failed, again], 1e3), judge([*known, again], 1e3)
+    assert (made_good.answer, never_failed.answer) == ("undecided", "validated")
+    assert "for no stated reason" in made_good.reason
+    explained = judge([*known, failed, replace(again, because="fuse replaced")], 1e3)
+    assert explained.answer == "validated"
+    assert explained.rests_on is not None
+    assert "your word that what made trial 8 fail is removed for good" in explained.rests_on
+    assert made_good.certificate is not None
+    assert never_failed.certificate is not None
+    assert made_good.certificate.upper_bound == never_failed.certificate.upper_bound
+    sample = Sample.of([*known, failed, again])
+    assert list(sample.numbers) == [*range(len(known)), len(known) + 1]
+
+
+def test_a_failed_draw_stays_one_whatever_came_later() -> None:
+    drawn = [*trials(origin="iid"), trial(8, 0.31, None, state="failed", origin="iid"), trial(9, 0.31, 0.1)]
+    assert Sample.of(drawn).failed == 1
+
+
+# What a verdict promises, in its own line
+
+
+@pytest.mark.parametrize("confidence", [0.1, 0.49])
+def test_a_confidence_below_a_half_is_refused(confidence: float) -> None:
+    with pytest.raises(InputError, match="wrong more often than right"):
+        judge(trials(), 50.0, confidence)
+    with pytest.raises(InputError, match="wrong more often than right"):
+        standing(trials(), 50.0, 0, confidence)
+    with pytest.raises(InputError, match="wrong more often than right"):
+        judge_by(replace(certificate(1.0), confidence=confidence), trials(), 50.0)
+
+
+def test_a_volume_of_most_of_the_tasks_is_refused() -> None:
+    with pytest.raises(InputError, match="leave out most of the tasks"):
+        judge_by(certificate(1.0, volume=0.05), trials(), 1.2, volume=0.99)
+
+
+SPACE = TaskSpace(goal=(0.0, 2.0, "rad"))
+
+
+def test_a_resolution_other_than_the_usual_one_stands_in_the_verdict_in_the_units_of_the_task() -> None:
+    usual = judge(trials(), 50.0, space=SPACE)
+    assert "resolution" not in usual.reason
+    coarse = judge(trials(), 50.0, resolution=0.25, space=SPACE)
+    assert "to a resolution of 0.5 rad in goal, 50 % of the task space (0.25 diagonals; usual: 0.125)" in coarse.reason
+    assert "to a resolution of 0.25 of each parameter's range, 50 %" in judge(trials(), 50.0, resolution=0.25).reason
+    none = judge(trials(), 50.0, resolution=1, space=SPACE)
+    assert "whole regions without a trial taken to be like the rest (1 diagonals; usual: 0.125)" in none.reason
+
+
+def test_a_quarter_of_the_diagonal_is_39_percent_of_a_plane() -> None:
+    assert resolved_volume(0.25, 2) == pytest.approx(0.3927, abs=1e-4)
+    assert resolved_volume(0.125, 1) == pytest.approx(0.25)
+    assert resolved_volume(0.125, 3) == pytest.approx(4 / 3 * np.pi * (0.125 * np.sqrt(3)) ** 3)
+    assert resolved_volume(1.0, 2) == 1.0
+
+
+def test_a_validation_names_what_it_rests_on() -> None:
+    verdict = judge(trials(), 50.0, space=SPACE)
+    assert verdict.rests_on == (
+        "It rests on the distance being as smooth between the trials as at them, to a resolution of 0.25 rad in goal "
+        "(a peak inside a gap of that radius, 25 % of the task space, may be missed); on each task having one "
+        "distance, however often it is executed; on this campaign not being chosen among several."
+    )
+    noisy = judge(trials(), 50.0, stochastic=True, space=SPACE)
+    assert noisy.rests_on is not None
+    assert "single executions may exceed it" in noisy.rests_on
+    assert judge(trials(), 0.5).rests_on is None
+    drawn = [trial(k, x, 0.5 * x, "iid") for k, x in enumerate(np.linspace(0, 1, 60).tolist())]
+    audited = judge_by(certify_audit(Sample.of(drawn), 0.9), drawn, 0.6, volume=0.05)
+    assert audited.rests_on is not None
+    assert "from which M was not learned (how large the distance is in the 3.77 % that are left out" in audited.rests_on
+
+
+def test_a_threshold_within_the_error_of_the_bound_is_undecided() -> None:
+    near = replace(certificate(1.0), error=0.05)
+    for threshold in (1.0, 1.09):
+        verdict = judge_by(near, trials(), threshold)
+        assert verdict.answer == "undecided"
+        assert "the posterior bound is 1 ± 0.05" in verdict.reason
+        assert "too near to it for the random draws" in verdict.reason
+    assert "more executions tighten it" in judge_by(near, trials(), 1.09).reason
+    assert judge_by(near, trials(), 1.11).answer == "validated"
+    assert "is 1 ± 0.05, at most 1.11" in judge_by(near, trials(), 1.11).reason
+
+
+def test_the_error_is_in_the_verdict_of_the_posterior() -> None:
+    verdict = judge(trials(5), 50.0, resolution=1)
+    assert verdict.certificate is not None
+    assert verdict.certificate.error > 0
+    assert "±" in verdict.reason
+
+
+def test_remarks_are_among_the_assumptions() -> None:
+    verdict = judge(trials(), 50.0, remarks=["S was changed after trial 3: oil"])
+    assert verdict.certificate is not None
+    assert verdict.certificate.assumptions[-1] == "S was changed after trial 3: oil"
+    assert any("several is wrong more often" in sentence for sentence in verdict.certificate.assumptions)
+
+
+def test_what_was_changed_in_a_store_is_remarked() -> None:
+    changes = [
+        Change("described anew", "made by an older version", {}),
+        Change("accepted", "gripper replaced", {"differences": ["x was 1 and is now 2", "y is new"], "trials": 7}),
+        Change("remeasured", "another norm", {"before": {}}),
+    ]
+    assert remarks_on(changes) == (
+        "what was changed after 7 trials makes no difference to them, as you state: 'gripper replaced' (x was 1 and is "
+        "now 2)",
+        "the distances are those measured anew: 'another norm'",
+    )

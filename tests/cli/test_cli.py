@@ -1,0 +1,580 @@
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from conftest import make_validation
+from ctxval import Campaign, Store, TaskSpace, Validation, searches
+from ctxval.cli import app
+from ctxval.searches import CMAES
+
+EXPERIMENT = """
+import sys
+from conftest import make_validation
+from ctxval import Experiment
+from ctxval.core import truth
+from ctxval.testing import FaultyRig
+
+validation = make_validation()
+
+def experiment(seed=0, horizon=25):
+    made = make_validation(horizon=horizon)
+    return Experiment("short", made, budget=6, truth=lambda: truth.grid_truth(made, 101), units="rad")
+
+def slow(seed):
+    raise KeyboardInterrupt
+
+def crashing(seed):
+    return {}["nothing"]
+
+def faulty(*executions):
+    return make_validation(FaultyRig(validation.system, dict.fromkeys(executions, "raise")))
+
+def sometimes(seed):
+    return Experiment("sometimes", faulty(1))
+
+def never(seed):
+    return Experiment("never", faulty(0, 1))
+
+leaving = lambda seed: sys.exit(0)
+broken = make_validation(model=lambda x, u: x * float("nan"))
+number = 3
+"""
+
+
+pytestmark = pytest.mark.usefixtures("few_draws")
+
+
+@pytest.fixture
+def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+    """Run the command line in an empty folder with one module in it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
+    (tmp_path / "rig.py").write_text(EXPERIMENT)
+    sys.modules.pop("rig", None)
+
+    def run(*arguments: str) -> Result:
+        return CliRunner().invoke(app, quick(*arguments))
+
+    return run
+
+
+def quick(*arguments: str) -> list[str]:
+    """Add the paper's search to what names none: what is tested here does not depend on it, and it costs least."""
+    named = arguments[:1] != ("run",) or "--search" in arguments or any(a.endswith(".toml") for a in arguments)
+    return [*arguments] if named else [*arguments, "--search", "gp-ucb"]
+
+
+def test_the_default_search_learns_from_trajectories(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = CliRunner().invoke(app, ["run", "rig:experiment", "--budget", "3", "--json"])
+    report = json.loads(result.stdout)
+    assert (report["search"], report["store"]) == ("auto", "runs/short-auto-seed0.sqlite")
+    assert Store(Path(report["store"])).trials()[-1].note["engine"] == "climb"  # type: ignore[index]
+
+
+def test_json_is_one_object_with_everything_asked_for(invoke) -> None:  # type: ignore[no-untyped-def]
+    asked = ("--budget", "8", "--seed", "3", "--truth", "--threshold", "9", "--resolution", "1", "--json")
+    result = invoke("run", "rig:experiment", *asked)
+    report = json.loads(result.stdout)
+    assert result.exit_code == 0
+    assert report["case"] == "short"
+    assert (report["search"], report["seed"], report["budget"], report["executions"]) == ("gp-ucb", 3, 8, 8)
+    assert report["failed"] == 0
+    assert list(report["worst"]["task"]) == ["goal"]
+    assert report["truth"]["distance"] >= report["worst"]["distance"] * (1 - 1e-9)
+    error = 100 * (report["truth"]["distance"] - report["estimate"]) / report["truth"]["distance"]
+    assert report["error_percent"] == pytest.approx(error)
+    assert (report["verdict"], report["threshold"]) == ("validated", 9.0)
+    assert report["certificate"]["kind"] == "posterior"
+    assert report["worst"]["distance"] <= report["certificate"]["upper_bound"] <= 9.0
+    assert report["store"] == "runs/short-gp-ucb-seed3.sqlite"
+    assert all(Path(picture).stat().st_size > 1000 for picture in report["pictures"])
+
+
+def test_running_again_resumes(invoke) -> None:  # type: ignore[no-untyped-def]
+    first = json.loads(invoke("run", "rig:experiment", "--budget", "5", "--json").stdout)
+    again = json.loads(invoke("run", "rig:experiment", "--budget", "5", "--json").stdout)
+    assert first == again
+    assert json.loads(invoke("run", "rig:experiment", "--budget", "7", "--json").stdout)["executions"] == 7
+
+
+def test_a_falsified_model_exits_with_1(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:experiment", "--threshold", "0.001", "--json")
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["verdict"] == "falsified"
+
+
+def test_the_human_report_names_the_worst_task_and_the_verdict(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:validation", "--budget", "6", "--threshold", "5", "--resolution", "1")
+    assert result.exit_code == 0
+    assert "goal =" in result.stdout
+    assert "validated against 5" in result.stdout
+    assert "with confidence 0.95" in " ".join(result.stdout.split())
+
+
+@pytest.mark.parametrize("search", ["random", "sampling-discarding"])
+def test_the_random_baselines_run(invoke, search: str) -> None:  # type: ignore[no-untyped-def]
+    report = json.loads(invoke("run", "rig:experiment", "--search", search, "--budget", "7", "--json").stdout)
+    assert report["search"] == search
+    assert (report["estimate"] == report["worst"]["distance"]) == (search == "random")
+
+
+def test_an_experiment_file_runs_and_the_command_line_wins(invoke) -> None:  # type: ignore[no-untyped-def]
+    Path("e.toml").write_text(
+        'experiment = "rig:experiment"\nbudget = 9\nseed = 2\nstore = "x.sqlite"\n'
+        '[options]\nhorizon = 20\n[search]\nname = "gp-ucb"\nbeta = 3.0\n'
+    )
+    report = json.loads(invoke("run", "e.toml", "--budget", "6", "--json").stdout)
+    assert (report["executions"], report["seed"], report["store"]) == (6, 2, "x.sqlite")
+    assert report["options"] == {"horizon": 20}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["run", "pendulm"], "did you mean 'pendulum'"),
+        (["run", "rig:experiment", "--search", "gpucb"], "did you mean 'gp-ucb'"),
+        (["run", "rig:experiment", "--budget", "0"], "budget"),
+        (["run", "rig:experiment", "--threshold", "nan"], "threshold"),
+        (["run", "rig:experiment", "--threshold", "-1"], "threshold"),
+        (["run", "rig:experiment", "--seed", "-1"], "seed"),
+        (["run", "rig:nothing"], "cannot be loaded"),
+        (["run", "nowhere:nothing"], "cannot be loaded"),
+        (["run", "rig:number"], "must be an Experiment or a Validation"),
+        (["run", "rig:experiment", "--dim", "3"], "callable with a seed and its options"),
+        (["run", "pendulum", "--dim", "3"], "no option of the case 'pendulum' is called 'dim'"),
+        (["run", "rig:crashing"], "rig:crashing failed: KeyError"),
+        (["run", "none.toml"], "there is no experiment file none.toml; `ctxval init none.toml` writes one"),
+        (["run", "rig:validation", "--truth"], "truth of 'validation' is not known"),
+        (["run", "rig:experiment", "--store", "/proc/none/x.sqlite"], "cannot be used as a store"),
+        (["run", "rig:experiment", "--store", "rig.py"], "cannot be read as a store"),
+        (["status", "none.sqlite"], "there is no store"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_status_2(invoke, arguments: list[str], sentence: str) -> None:  # type: ignore[no-untyped-def]
+    result = invoke(*arguments)
+    assert result.exit_code == 2
+    assert sentence in result.stderr.replace("\n", " ")
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("toml", "sentence"),
+    [
+        ('experiment = "pendulum"\nbudgit = 3', "budgit"),
+        ('experiment = "pendulum"\nbudget = "many"', "budget"),
+        ("budget = 3", "experiment"),
+        ("not toml at all", "not valid TOML"),
+        ('experiment = "pendulum"\noptions = 3', "[options] must be a table"),
+        ('experiment = "pendulum"\nsearch = 3', "search"),
+        ('experiment = "pendulum"\n[search]\nname = "gp-ucb"\nbetta = 1', "betta"),
+    ],
+)
+def test_bad_experiment_files_are_named_with_what_is_wrong(invoke, toml: str, sentence: str) -> None:  # type: ignore[no-untyped-def]
+    Path("e.toml").write_text(toml)
+    result = invoke("run", "e.toml")
+    assert result.exit_code == 2
+    assert sentence in result.stderr.replace("\n", " ")
+
+
+def test_a_store_of_another_seed_is_refused_and_kept(invoke) -> None:  # type: ignore[no-untyped-def]
+    invoke("run", "rig:experiment", "--store", "a.sqlite", "--budget", "5", "--json")
+    result = invoke("run", "rig:experiment", "--store", "a.sqlite", "--seed", "4")
+    assert result.exit_code == 2
+    assert "another experiment: seed was 0 and is now 4" in result.stderr
+    assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 5
+
+
+def test_a_campaign_that_cannot_go_on_exits_with_3(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:broken")
+    assert result.exit_code == 3
+    assert "Jacobian is not finite" in result.stderr
+
+
+def test_an_interrupt_says_how_to_go_on(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:slow")
+    assert result.exit_code == 130
+    assert "run the same command to go on" in result.stderr
+
+
+def test_a_confidence_that_no_bound_can_have_does_not_lose_the_report(invoke) -> None:  # type: ignore[no-untyped-def]
+    given = ("--budget", "6", "--threshold", "9", "--confidence", "0.9999999", "--json")
+    result = invoke("run", "rig:experiment", *given)
+    report = json.loads(result.stdout)
+    assert (result.exit_code, report["executions"], report["verdict"]) == (0, 6, "undecided")
+    assert "needs more than" in report["reason"]
+
+
+def test_a_campaign_stops_as_soon_as_its_verdict_is_reached(invoke) -> None:  # type: ignore[no-untyped-def]
+    given = ("run", "rig:experiment", "--budget", "30", "--until-decided", "--json")
+    validated = json.loads(invoke(*given, "--threshold", "9").stdout)
+    assert validated["verdict"] == "validated"
+    assert 4 <= validated["executions"] < 14
+    falsified = invoke(*given, "--threshold", "0.001", "--seed", "1")
+    assert falsified.exit_code == 1
+    assert json.loads(falsified.stdout)["executions"] == 1
+    assert "needs a threshold" in invoke(*given).stderr
+
+
+# Certificates of what is stored
+
+
+def stored(folder: Path, *arguments: str) -> Path:
+    """Return the store of a campaign that was run in a folder."""
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        result = CliRunner().invoke(app, quick("run", *arguments, "--json"))
+        assert result.exit_code in (0, 1), result.stderr
+        return folder / json.loads(result.stdout)["store"]
+    finally:
+        os.chdir(before)
+
+
+@pytest.fixture(scope="session")
+def campaigns(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Campaigns of two cases, searched and drawn."""
+    folder = tmp_path_factory.mktemp("campaigns")
+    linear = ("linear", "--dim", "1", "--seed", "1")
+    return {
+        "pendulum": stored(folder, "pendulum", "--budget", "12"),
+        "linear": stored(folder, *linear, "--budget", "12"),
+        "pendulum drawn": stored(folder, "pendulum", "--budget", "12", "--search", "random"),
+        "linear drawn": stored(folder, *linear, "--budget", "20", "--search", "random"),
+    }
+
+
+KINDS = {
+    "posterior": ("--resolution", "1"),
+    "scenario": (),
+    "sampling-discarding": ("--discard", "2"),
+    "convergence": ("--theorem", "0.5,1e-4,1,3,1"),
+    "audit": (),
+}
+
+
+def of_kind(campaigns: dict[str, Path], case: str, kind: str) -> list[str]:
+    drawn = kind in ("scenario", "sampling-discarding", "audit")
+    return ["certify", str(campaigns[f"{case} drawn" if drawn else case]), "--kind", kind, *KINDS[kind]]
+
+
+@pytest.mark.parametrize("case", ["pendulum", "linear"])
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_every_kind_certifies_stored_campaigns(invoke, campaigns: dict[str, Path], case: str, kind: str) -> None:  # type: ignore[no-untyped-def]
+    volume = () if kind in ("posterior", "convergence") else ("--volume", "0.5")
+    result = invoke(*of_kind(campaigns, case, kind), *volume, "--threshold", "90", "--confidence", "0.9", "--json")
+    assert result.exit_code == 0, result.stderr
+    report = json.loads(result.stdout)
+    answer = "undecided" if kind == "convergence" else "validated"  # its search took a fixed beta
+    assert (report["kind"], report["confidence"], report["verdict"]) == (kind, 0.9, answer)
+    assert (report["rests_on"] is None) == (kind == "convergence")
+    assert 0 < report["upper_bound"] <= 90
+    assert report["assumptions"]
+    assert report["trials"] >= 12
+    assert (report["volume"] == 0) == (kind in ("posterior", "convergence"))
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_every_kind_speaks_to_people(invoke, campaigns: dict[str, Path], kind: str) -> None:  # type: ignore[no-untyped-def]
+    result = invoke(*of_kind(campaigns, "linear", kind))
+    assert result.exit_code == 0
+    text = " ".join(result.stdout.split())
+    assert text.startswith(f"{kind}: With ")
+    assert "It assumes that - the " in text
+    assert "verdict" not in text
+    assert "version 0.1.0" in text
+    assert "1 other store of this experiment beside this one" in text
+
+
+def test_what_was_executed_falsifies_without_any_certificate(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
+    arguments = ["certify", str(campaigns["linear"]), "--kind", "scenario", "--threshold", "0.001"]
+    refused = invoke(*arguments, "--json")
+    report = json.loads(refused.stdout)
+    assert refused.exit_code == 1
+    assert report["verdict"] == "falsified"
+    assert "independent draws alone" in report["refused"]
+    spoken = invoke(*arguments)
+    assert spoken.exit_code == 1
+    assert "falsified against 0.001" in spoken.stdout
+    assert "no certificate" in spoken.stdout
+
+
+def test_what_is_undecided_says_how_many_more_executions_would_decide(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
+    plain = json.loads(invoke("certify", str(campaigns["linear"]), "--resolution", "1", "--json").stdout)
+    tau = 0.5 * (plain["details"]["best"] + plain["upper_bound"])
+    report = json.loads(
+        invoke("certify", str(campaigns["linear"]), "--resolution", "1", "--threshold", str(tau), "--json").stdout
+    )
+    assert report["verdict"] == "undecided"
+    assert set(report["expected"]) == {"executions", "validated", "falsified"}
+    assert "verdict" not in plain
+
+
+def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
+    shutil.copy(campaigns["linear"], "a.sqlite")
+    arguments = ("certify", "a.sqlite", "--audit", "5", "--threshold", "90", "--volume", "0.5", "--json")
+    report = json.loads(invoke(*arguments).stdout)
+    assert (report["kind"], report["trials"], report["verdict"]) == ("audit", 5, "validated")
+    assert report["volume"] == pytest.approx(1 - 0.05 ** (1 / 5))
+    assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 17
+    assert json.loads(invoke(*arguments).stdout) == report
+    assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 17
+    # The campaign goes on with its own search.
+    again = invoke("run", "linear", "--dim", "1", "--seed", "1", "--store", "a.sqlite", "--budget", "18", "--json")
+    assert json.loads(again.stdout)["executions"] == 18
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--kind", "scenaro"], "did you mean 'scenario'"),
+        (["--kind", "scenario"], "independent draws alone, but 12 of 12"),
+        (["--kind", "audit"], "there is none; run certify --audit N"),
+        (["--kind", "sampling-discarding"], "how many to discard"),
+        (["--kind", "convergence"], "needs its constant C"),
+        (["--kind", "convergence", "--constant", "-1"], "must be a positive number"),
+        (["--kind", "convergence", "--theorem", "1,2,3"], "five numbers"),
+        (["--kind", "convergence", "--theorem", "1,2,3,4,x"], "five numbers"),
+        (["--kind", "convergence", "--theorem", "1,2,3,4,0"], "gain of the theorem"),
+        (["--threshold", "-1"], "threshold must be a positive number"),
+        (["--threshold", "nan"], "threshold must be a positive number"),
+        (["--confidence", "0"], "strictly between 0 and 1"),
+        (["--confidence", "1.5"], "strictly between 0 and 1"),
+        (["--volume", "1.5"], "share of the task space"),
+        (["--volume", "nan"], "share of the task space"),
+        (["--audit", "0"], "positive number of draws"),
+        (["--audit", "5", "--kind", "scenaro"], "did you mean 'scenario'"),
+        (["--audit", "5", "--confidence", "95"], "strictly between 0 and 1"),
+        (["--audit", "5", "--kind", "scenario"], "there are others; say --kind audit"),
+        (["--audit", "5", "--kind", "sampling-discarding"], "how many to discard"),
+        (["--audit", "5", "--kind", "convergence", "--constant", "1"], "no use for an audit"),
+        (
+            ["--kind", "scenario", "--constant", "3"],
+            "constant is for certificates of the kind convergence; the kind here is scenario",
+        ),
+        (
+            ["--discard", "2"],
+            "discard is for certificates of the kind sampling-discarding; the kind here is posterior",
+        ),
+        (
+            ["--kind", "audit", "--stochastic"],
+            "stochastic is for certificates of the kind posterior; the kind here is audit",
+        ),
+        (
+            ["--audit", "5", "--resolution", "1"],
+            "resolution is for certificates of the kind posterior; the kind here is audit",
+        ),
+        (["--kind", "scenario", "--theorem", "1,2,3,4,5"], "theorem is for certificates of the kind convergence"),
+        (
+            ["--volume", "0.1", "--threshold", "9"],
+            "volume is for certificates of the kind audit or scenario or sampling-discarding",
+        ),
+        (["--kind", "audit", "--volume", "0.1"], "may exceed a threshold; say --threshold too"),
+        (["--kind", "convergence", "--constant", "1", "--theorem", "1,2,3,4,5"], "only one can be given"),
+        (["--confidence", "1e-300"], "the confidence must be strictly between 0 and 1"),
+        (["--confidence", "0.1"], "wrong more often than right"),
+        (["--audit", "5", "--confidence", "0.1"], "wrong more often than right"),
+        (["--audit", "5", "--threshold", "9", "--volume", "0.99"], "leave out most of the tasks"),
+    ],
+)
+def test_what_cannot_be_certified_is_one_sentence_and_costs_no_execution(  # type: ignore[no-untyped-def]
+    invoke, campaigns: dict[str, Path], arguments: list[str], sentence: str
+) -> None:
+    shutil.copy(campaigns["linear"], "a.sqlite")
+    result = invoke("certify", "a.sqlite", *arguments)
+    assert result.exit_code == 2
+    assert sentence in result.stderr.replace("\n", " ")
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+    assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 12
+
+
+def test_an_audit_that_is_extended_counts_what_was_decided_on_last(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
+    shutil.copy(campaigns["linear"], "a.sqlite")
+    assert json.loads(invoke("certify", "a.sqlite", "--audit", "5", "--json").stdout)["trials"] == 5
+    extended = json.loads(invoke("certify", "a.sqlite", "--audit", "9", "--json").stdout)
+    assert (extended["trials"], extended["details"]["not_counted"]) == (4, 5)
+    assert any("5 other independent draws do not count" in sentence for sentence in extended["assumptions"])
+    said = json.loads(invoke("certify", "a.sqlite", "--audit", "9", "--threshold", "90", "--json").stdout)["reason"]
+    assert "5 draws do not count, as their number was changed after they were known" in said
+
+
+def test_draws_that_ended_with_the_verdict_have_no_number_chosen_beforehand(invoke) -> None:  # type: ignore[no-untyped-def]
+    arguments = ("run", "rig:experiment", "--search", "random", "--store", "a.sqlite")
+    invoke(*arguments, "--threshold", "90", "--resolution", "1", "--until-decided", "--budget", "12")
+    for kind, sentence in (("scenario", "were chosen otherwise (covering)"), ("audit", "none counts")):
+        result = invoke("certify", "a.sqlite", "--kind", kind)
+        assert result.exit_code == 2
+        assert sentence in result.stderr
+
+
+def test_a_scenario_bound_of_a_budget_that_was_raised_is_refused(invoke) -> None:  # type: ignore[no-untyped-def]
+    for budget in ("6", "9"):
+        invoke("run", "rig:experiment", "--search", "random", "--store", "a.sqlite", "--budget", budget)
+    refused = invoke("certify", "a.sqlite", "--kind", "scenario")
+    assert "changed from 6 to 9 after the first were known" in refused.stderr
+    assert json.loads(invoke("certify", "a.sqlite", "--kind", "audit", "--json").stdout)["trials"] == 3
+
+
+def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -> None:  # type: ignore[no-untyped-def]
+    arguments = ("run", "rig:experiment", "--budget", "12", "--threshold", "90", "--resolution", "0.6")
+    arguments += ("--until-decided",)
+    alone = invoke(*arguments)
+    text = " ".join(alone.stdout.split())
+    assert "validated against 90" in text
+    assert "to a resolution of 3.6 rad in goal, 100 % of the task space (0.6 diagonals; usual: 0.125)" in text
+    assert "It rests on the distance being as smooth between the trials as at them" in text
+    assert "other store" not in text
+    again = invoke(*arguments, "--seed", "1")
+    assert "1 other store of this experiment beside this one: runs/short-gp-ucb-seed0.sqlite" in again.stdout
+    report = json.loads(invoke(*arguments, "--seed", "1", "--json").stdout)
+    assert report["other_stores"] == ["runs/short-gp-ucb-seed0.sqlite"]
+    assert report["rests_on"].startswith("It rests on")
+
+
+def test_a_certificate_tells_its_resolution_in_the_units_of_the_stored_task_space(invoke) -> None:  # type: ignore[no-untyped-def]
+    space = TaskSpace(goal=(-3.0, 3.0, "rad"), load=([0.0, 0.0], [1.0, 2.0], "kg"))
+    validation = make_validation()
+    wider = Validation(
+        space=space,
+        task=validation.task,
+        system=validation.system,
+        model=validation.model,
+        synthesizer=validation.synthesizer,
+        distance=validation.distance,
+    )
+    campaign = Campaign(wider, search=searches.Random(), store="own.sqlite").run(6)
+    for goal, load in itertools.product((-3.0, 3.0), ([0.0, 0.0], [0.0, 2.0], [1.0, 0.0], [1.0, 2.0])):
+        opened = campaign.ask({"goal": goal, "load": load})
+        campaign.tell(opened, wider.execute(opened.plan))
+    result = invoke("certify", "own.sqlite", "--threshold", "1e6", "--resolution", "0.5766")
+    text = " ".join(result.stdout.split())
+    assert "to a resolution of 6 rad in goal and 1 kg in load[0] and 2 kg in load[1]" in text
+
+
+@pytest.mark.parametrize("value", ["0.1", "0.4999"])
+def test_a_run_with_a_confidence_worse_than_a_coin_is_refused(invoke, value: str) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:experiment", "--threshold", "9", "--confidence", value)
+    assert result.exit_code == 2
+    assert "confidence: input should be greater than or equal to 0.5" in result.stderr.replace("\n", " ")
+    assert not Path("runs").exists()
+
+
+def test_an_audit_waits_for_what_people_are_executing(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
+    shutil.copy(campaigns["linear"], "a.sqlite")
+    assert invoke("ask", "a.sqlite").exit_code == 0
+    result = invoke("certify", "a.sqlite", "--audit", "3")
+    assert result.exit_code == 2
+    assert "trials are open: 12; tell how they ended before auditing" in result.stderr.replace("\n", " ")
+    assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 12
+
+
+def test_proposition_1_is_refused_where_another_search_chose_the_tasks(invoke) -> None:  # type: ignore[no-untyped-def]
+    Campaign(make_validation(), search=CMAES(), store="own.sqlite").run(6)
+    result = invoke("certify", "own.sqlite", "--kind", "convergence", "--constant", "1")
+    assert result.exit_code == 2
+    assert "CMAES chose these" in result.stderr
+
+
+def test_a_run_on_a_stochastic_system_says_so(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:experiment", "--threshold", "50", "--stochastic", "--json")
+    assert "independent normal noise" in json.loads(result.stdout)["certificate"]["assumptions"][2]
+
+
+def test_a_store_that_no_command_made_cannot_be_audited_but_certified(invoke) -> None:  # type: ignore[no-untyped-def]
+    Campaign(make_validation(), store="own.sqlite").run(6)
+    result = invoke("certify", "own.sqlite", "--audit", "3")
+    assert result.exit_code == 2
+    assert "does not say what was run into it" in result.stderr.replace("\n", " ")
+    assert invoke("certify", "own.sqlite").exit_code == 0
+    assert "there is no store" in invoke("certify", "none.sqlite").stderr
+
+
+def test_status_and_cases_speak_to_people_and_to_programs(invoke) -> None:  # type: ignore[no-untyped-def]
+    invoke("run", "rig:experiment", "--store", "a.sqlite", "--json")
+    assert "executions  6" in invoke("status", "a.sqlite").stdout
+    assert "pendulum" in invoke("cases").stdout
+    assert "pendulum" in json.loads(invoke("cases", "--json").stdout)
+
+
+def test_a_store_is_certified_against_the_threshold_of_its_file(invoke) -> None:  # type: ignore[no-untyped-def]
+    Path("e.toml").write_text('experiment = "pendulum"\nbudget = 5\nthreshold = 0.01\nstore = "e.sqlite"')
+    assert invoke("run", "e.toml").exit_code == 1
+    result = invoke("certify", "e.sqlite", "--json")
+    assert result.exit_code == 1
+    report = json.loads(result.stdout)
+    assert (report["verdict"], report["threshold"]) == ("falsified", 0.01)
+    assert json.loads(invoke("certify", "e.sqlite", "--threshold", "90", "--json").stdout)["threshold"] == 90
+
+
+def test_why_executions_failed_is_said(invoke) -> None:  # type: ignore[no-untyped-def]
+    assert invoke("run", "rig:sometimes", "--budget", "4", "--store", "a.sqlite").exit_code == 0
+    for command in (["status", "a.sqlite"], ["run", "rig:sometimes", "--budget", "4", "--store", "a.sqlite"]):
+        assert "the motor cut out" in invoke(*command).stderr
+        report = json.loads(invoke(*command, "--json").stdout)
+        assert [failure["trials"] for failure in report["failures"]] == [[1]]
+        assert report["failed"] == 1
+
+
+def test_a_run_without_any_distance_is_an_error(invoke) -> None:  # type: ignore[no-untyped-def]
+    result = invoke("run", "rig:never", "--budget", "2", "--store", "a.sqlite")
+    assert result.exit_code == 3
+    assert "all 2 executions failed" in result.stderr
+    assert "2 trials failed" in result.stderr
+    assert "the motor cut out" in result.stderr
+
+
+def test_what_is_no_store_is_not_exported(invoke) -> None:  # type: ignore[no-untyped-def]
+    Path("e.toml").write_text('experiment = "pendulum"')
+    result = invoke("export", "e.toml")
+    assert result.exit_code == 2
+    assert "nothing can be read in e.toml" in result.stderr
+    assert not Path("e.export").exists()
+
+
+def test_a_reader_that_goes_away_is_no_error(tmp_path: Path) -> None:
+    command = f"{sys.executable} -c 'from ctxval.cli import main; main()' cases --help | head -c 1"
+    script = f"set -o pipefail; for i in 1 2 3 4 5; do {command}; done"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, cwd=tmp_path)
+    assert "error" not in done.stderr
+
+
+def test_every_command_is_in_the_readme() -> None:
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    commands = [c.name or (c.callback.__name__ if c.callback else "") for c in app.registered_commands]
+    for command in commands:
+        assert f"ctxval {command}" in readme
+
+
+def test_the_installed_command_runs_without_a_traceback(tmp_path: Path) -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "ctxval.cli", "run", "nothing"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr
+
+
+def test_user_code_that_leaves_python_is_not_taken_for_done(invoke) -> None:  # type: ignore[no-untyped-def]
+    assert invoke("run", "rig:leaving").exit_code == 3
+
+
+def test_a_picture_that_cannot_be_written_does_not_hide_the_verdict(invoke) -> None:  # type: ignore[no-untyped-def]
+    Path("a.worst.png").mkdir()
+    result = invoke("run", "rig:experiment", "--store", "a.sqlite", "--threshold", "0.001", "--json")
+    assert result.exit_code == 1
+    report = json.loads(result.stdout)
+    assert (report["verdict"], report["pictures"]) == ("falsified", [])
+    assert "no pictures" in result.stderr

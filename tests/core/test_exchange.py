@@ -1,0 +1,260 @@
+"""Controllers and tasks survive being files; other files do not get in."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from ctxval import Task, controllers
+from ctxval.core.controller import AffineFeedback, Limits
+from ctxval.core.exchange import read_controller, read_task, write_controller, write_task
+from ctxval.errors import CtxvalError, InputError, ShapeError
+from ctxval.models import Linear
+
+KINDS = ["json", "npz"]
+MODEL = Linear([[1.0, 0.1], [-0.2, 0.9]], [[0.0], [0.1]], [0.01, 0.0])
+TASK = Task([np.pi, -1e-300], goal=[1 / 3, 0.0], horizon=12, dt=0.02)
+PARTS = ("gains", "inputs", "states")
+
+
+def designed(limits: Limits | None = None) -> AffineFeedback:
+    feedback = controllers.LQR([1.0, 0.1], [0.01]).design(TASK, MODEL)
+    return AffineFeedback(feedback.gains, feedback.inputs, feedback.states, limits)
+
+
+def assert_same(one: AffineFeedback, other: AffineFeedback) -> None:
+    for name in PARTS:
+        assert np.ascontiguousarray(getattr(one, name)).tobytes() == getattr(other, name).tobytes()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("limits", [None, Limits.of(2.5, 1), Limits.of([[-1 / 3, np.inf]], 1)])
+def test_a_controller_comes_back_bit_for_bit(kind: str, limits: Limits | None, tmp_path: Path) -> None:
+    path, controller = tmp_path / f"controller.{kind}", designed(limits)
+    write_controller(path, controller, dt=TASK.dt, states={"angle": "rad", "rate": "rad/s"}, inputs={"torque": "N m"})
+    found = read_controller(path)
+    assert_same(controller, found.controller)
+    assert found.dt == TASK.dt
+    assert found.states == {"angle": "rad", "rate": "rad/s"}
+    assert found.inputs == {"torque": "N m"}
+    for x in np.random.default_rng(0).normal(scale=10, size=(5, 2)):
+        np.testing.assert_array_equal(found.controller(3, x), controller(3, x))
+    assert (found.controller.limits is None) == (limits is None)
+    if limits is not None and found.controller.limits is not None:
+        np.testing.assert_array_equal(found.controller.limits.low, limits.low)
+        np.testing.assert_array_equal(found.controller.limits.high, limits.high)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=25)
+@given(
+    gains=arrays(np.float64, (4, 2, 3), elements=st.floats(allow_nan=False, allow_infinity=False)),
+    inputs=arrays(np.float64, (4, 2), elements=st.floats(allow_nan=False, allow_infinity=False)),
+)
+def test_any_finite_numbers_come_back(kind: str, gains: Any, inputs: Any, tmp_path_factory: Any) -> None:
+    path = tmp_path_factory.mktemp("any") / f"controller.{kind}"
+    controller = AffineFeedback(gains, inputs, np.zeros((4, 3)))
+    write_controller(path, controller, dt=0.1)
+    assert_same(controller, read_controller(path).controller)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_file_says_by_itself_what_is_in_it(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"controller.{kind}"
+    write_controller(path, designed(Limits.of(2.0, 1)), dt=TASK.dt)
+    if kind == "json":
+        content = json.loads(path.read_text())
+    else:
+        with np.load(path, allow_pickle=False) as arrays_:
+            content = {**json.loads(str(arrays_["about"])), **arrays_}
+    assert content["law"].startswith("u = min(max(inputs[t] + gains[t] (x - states[t]), low), high)")
+    assert content["state_names"] == ["x0", "x1"]
+    x, t = np.array([0.3, -0.2]), 5
+    law = np.array(content["inputs"])[t] + np.array(content["gains"])[t] @ (x - np.array(content["states"])[t])
+    np.testing.assert_allclose(np.clip(law, content["low"], content["high"]), designed(Limits.of(2.0, 1))(t, x))
+
+
+def test_json_is_json_also_with_infinite_limits(tmp_path: Path) -> None:
+    path = tmp_path / "controller.json"
+    write_controller(path, designed(Limits.of([(-np.inf, 1.0)], 1)), dt=0.1)
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(constant)
+
+    assert json.loads(path.read_text(), parse_constant=refuse)["low"] == [None]
+
+
+def test_a_task_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    path = tmp_path / "task.json"
+    write_task(path, TASK, states={"angle": "rad", "rate": "rad/s"})
+    found = read_task(path)
+    assert (found.horizon, found.dt) == (TASK.horizon, TASK.dt)
+    assert found.initial_state.tobytes() == TASK.initial_state.tobytes()
+    assert found.reference.tobytes() == np.ascontiguousarray(TASK.reference).tobytes()
+    assert json.loads(path.read_text())["state_units"] == ["rad", "rad/s"]
+
+
+# What cannot be written
+
+
+def test_only_affine_feedback_of_one_task_can_be_written(tmp_path: Path) -> None:
+    path = tmp_path / "controller.json"
+    with pytest.raises(InputError, match="only affine feedback, such as LQR and iLQR design"):
+        write_controller(path, lambda t, x: x, dt=0.1)
+    batch = controllers.LQR([1.0, 0.1], [0.01]).design(Task(np.zeros((3, 2)), horizon=4, dt=0.1), MODEL)
+    with pytest.raises(ShapeError, match="the controller of one task"):
+        write_controller(path, batch, dt=0.1)
+    write_controller(path, batch[1], dt=0.1)
+    with pytest.raises(ShapeError, match="a file holds one task"):
+        write_task(path, Task(np.zeros((3, 2)), horizon=4, dt=0.1))
+
+
+def test_what_is_written_must_make_sense(tmp_path: Path) -> None:
+    controller = designed()
+    with pytest.raises(ShapeError, match="there must be 2 names of states, got angle"):
+        write_controller(tmp_path / "c.json", controller, dt=0.1, states={"angle": "rad"})
+    with pytest.raises(InputError, match="dt must be a positive number of seconds, got 0"):
+        write_controller(tmp_path / "c.json", controller, dt=0)
+    with pytest.raises(InputError, match=r"must end in \.json or \.npz"):
+        write_controller(tmp_path / "c.pkl", controller, dt=0.1)
+    with pytest.raises(InputError, match="cannot be written: No such file"):
+        write_controller(tmp_path / "none" / "c.json", controller, dt=0.1)
+    broken = AffineFeedback(controller.gains * np.nan, controller.inputs, controller.states)
+    with pytest.raises(InputError, match="gains must be finite"):
+        write_controller(tmp_path / "c.npz", broken, dt=0.1)
+
+
+# Hostile files
+
+
+def content() -> dict[str, Any]:
+    named = {"state_names": ["a", "b"], "state_units": ["", ""], "input_names": ["u"], "input_units": [""]}
+    numbers = {"gains": [[[1.0, 2.0]]] * 3, "inputs": [[0.0]] * 3, "states": [[0.0, 0.0]] * 3}
+    return {"format": "ctxval controller", "version": 1, "dt": 0.1, "horizon": 3, **named, **numbers}
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"format": "something else"}, "its format must be 'ctxval controller', got 'something else'"),
+        ({"version": 99}, "reads version 1, got 99"),
+        ({"gains": None}, "gains must be finite"),
+        ({"gains": [[["a", "b"]]] * 3}, "gains must be numbers"),
+        ({"gains": [[[1.0, float("nan")]]] * 3}, "gains must be finite"),
+        ({"gains": [[[1.0, 10**400]]] * 3}, "cannot be read"),
+        ({"gains": [1.0]}, r"gains \(H, m, n\), inputs \(H, m\) and states \(H, n\), got \(1,\)"),
+        ({"inputs": [[0.0]] * 2}, r"got \(3, 1, 2\), \(2, 1\) and \(3, 2\)"),
+        ({"horizon": 10**9}, "says that its horizon is 1000000000, its gains are 3"),
+        ({"dt": "0.1"}, "dt must be a positive number of seconds"),
+        ({"dt": -1}, "dt must be a positive number of seconds"),
+        ({"low": [1.0], "high": [-1.0]}, "low < high"),
+        ({"low": [1.0]}, "KeyError"),
+        ({"low": 3, "high": 4}, "cannot be read"),
+        ({"state_names": ["a", "a"]}, "names and units of 2 states"),
+        ({"state_names": [["a"], {}]}, "names and units of 2 states"),
+        ({"state_names": 7}, "cannot be read"),
+    ],
+)
+def test_a_made_up_controller_is_refused(change: dict[str, Any], sentence: str, tmp_path: Path) -> None:
+    path = tmp_path / "controller.json"
+    path.write_text(json.dumps(content()))
+    read_controller(path)
+    path.write_text(json.dumps(content() | change))
+    with pytest.raises(InputError, match=sentence):
+        read_controller(path)
+
+
+class Trap:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (Path("sprung"),))
+
+
+def test_nothing_in_a_file_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path("controller.npz")
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=True, about=np.array(json.dumps(content())), gains=np.array([Trap()], dtype=object))
+    with pytest.raises(InputError, match="cannot be read as a ctxval controller"):
+        read_controller(path)
+    path.write_bytes(pickle.dumps(Trap()))
+    with pytest.raises(InputError, match="cannot be read as a ctxval controller"):
+        read_controller(path)
+    assert not Path("sprung").exists()
+
+
+def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
+    huge = io.BytesIO()
+    np.lib.format.write_array_header_2_0(huge, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
+    bomb = io.BytesIO()
+    with zipfile.ZipFile(bomb, "w") as archive:
+        archive.writestr("about.npy", huge.getvalue())
+    deep = b"[" * 100_000
+    for name, data in {
+        "a.npz": bomb.getvalue(),
+        "b.json": deep,
+        "c.json": b"\xff\xfe",
+        "d.json": b"3",
+        "e.npz": b"",
+    }.items():
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(InputError, match="cannot be read as a ctxval controller"):
+            read_controller(tmp_path / name)
+    with pytest.raises(InputError, match=r"missing\.json cannot be read"):
+        read_controller(tmp_path / "missing.json")
+    with pytest.raises(InputError, match="cannot be read as a ctxval task"):
+        read_task(tmp_path / "d.json")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_damage_gives_anything_but_an_error_of_ours(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"controller.{kind}"
+    write_controller(path, designed(Limits.of(2.0, 1)), dt=0.1)
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(150):
+        broken = bytearray(whole)
+        for position in rng.integers(len(whole), size=3):
+            broken[position] = rng.integers(256)
+        path.write_bytes(bytes(broken[: rng.integers(1, len(whole) + 1)] if rng.random() < 0.3 else broken))
+        with contextlib.suppress(CtxvalError):
+            read_controller(path)
+
+
+def test_an_archive_that_unpacks_to_much_is_refused_before_it_does(tmp_path: Path) -> None:
+    path = tmp_path / "controller.npz"
+    write_controller(path, designed(), dt=0.1)
+    with np.load(path, allow_pickle=False) as whole:
+        content = dict(whole)
+    header = np.lib.format.header_data_from_array_1_0(np.zeros(1)) | {"shape": (2**40, 1, 1)}
+    huge = io.BytesIO()
+    np.lib.format.write_array_header_1_0(huge, header)
+    np.savez(path, **{name: array for name, array in content.items() if name != "gains"})
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("gains.npy", huge.getvalue())
+    with pytest.raises(InputError, match=r"cannot be read as a ctxval controller: its array gains .* is too large"):
+        read_controller(path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fifo_is_no_file(kind: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / f"controller.{kind}")
+    with pytest.raises(InputError, match="it is a FIFO and not a regular file"):
+        read_controller(tmp_path / f"controller.{kind}")
+
+
+@pytest.mark.parametrize("content", ["[1, 2]", "3", '"text"', "null"])
+def test_json_that_is_no_object_is_refused(content: str, tmp_path: Path) -> None:
+    (tmp_path / "task.json").write_text(content)
+    with pytest.raises(InputError, match=r"cannot be read as a ctxval task: it must be an object with names"):
+        read_task(tmp_path / "task.json")

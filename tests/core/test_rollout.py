@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ctxval import Task
+from ctxval.core.controller import AffineFeedback
+from ctxval.core.rollout import rollout
+from ctxval.errors import ShapeError
+from ctxval.models import Linear
+from ctxval.systems.integrate import rk4
+
+
+def derivative(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return np.stack([x[..., 1], 14.7 * np.sin(x[..., 0]) + 3 * u[..., 0]], axis=-1)
+
+
+PENDULUM = rk4(derivative, 0.05)
+
+
+def damp(t: int, x: np.ndarray) -> np.ndarray:
+    return -2 * x[..., :1] - x[..., 1:] + 0.1 * t
+
+
+def zero(t: int, x: np.ndarray) -> np.ndarray:
+    return np.zeros((*x.shape[:-1], 1))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_linear_closed_loop_is_the_power_of_its_matrix(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model = Linear(0.4 * rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), rng.normal(size=3))
+    K, horizon = 0.2 * rng.normal(size=(2, 3)), 20
+    controller = AffineFeedback(np.tile(K, (horizon, 1, 1)), np.zeros((horizon, 2)), np.zeros((horizon, 3)))
+    task = Task(rng.normal(size=3), horizon=horizon, dt=0.1)
+    loop = rollout(model.step, controller, task)
+    closed = model.A + model.B @ K
+    rest = np.linalg.solve(np.eye(3) - closed, model.c)
+    powers = [np.linalg.matrix_power(closed, t) for t in range(horizon + 1)]
+    states = np.array([rest + power @ (task.initial_state - rest) for power in powers])
+    np.testing.assert_allclose(loop.states, states, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(loop.inputs, states[:-1] @ K.T, rtol=1e-9, atol=1e-10)
+    np.testing.assert_array_equal(loop.times, task.times)
+    assert loop.ended == "complete"
+
+
+@pytest.mark.parametrize("batch", [(1,), (7,), (2, 3)])
+def test_a_batch_of_loops_is_the_loop_over_them(batch: tuple[int, ...]) -> None:
+    starts = np.random.default_rng(0).normal(size=(*batch, 2))
+    whole = rollout(PENDULUM, damp, Task(starts, horizon=30, dt=0.05))
+    assert whole.batch_shape == batch
+    for i in np.ndindex(batch):
+        alone = rollout(PENDULUM, damp, Task(starts[i], horizon=30, dt=0.05))
+        np.testing.assert_allclose(whole.states[i], alone.states, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(whole.inputs[i], alone.inputs, rtol=0, atol=1e-10)
+
+
+def test_the_controller_is_asked_once_for_each_step_with_the_state_then() -> None:
+    asked = []
+
+    def record(t: int, x: np.ndarray) -> np.ndarray:
+        asked.append((t, x.tolist()))
+        return np.array([1.0])
+
+    loop = rollout(lambda x, u: x + u, record, Task([5.0], horizon=3, dt=0.1))
+    assert asked == [(0, [5.0]), (1, [6.0]), (2, [7.0])]
+    assert loop.states.tolist() == [[5], [6], [7], [8]]
+
+
+def test_the_task_is_left_alone_by_a_step_that_works_in_place() -> None:
+    def in_place(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        x += 1
+        return x
+
+    task = Task([0.0], horizon=3, dt=0.1)
+    assert rollout(in_place, zero, task).states.tolist() == [[0], [1], [2], [3]]
+    assert task.initial_state.tolist() == [0]
+
+
+def test_the_divergence_of_one_task_leaves_the_others_alone() -> None:
+    task = Task([[0.5, 1e3, -0.5]], horizon=20, dt=0.1)
+    loop = rollout(lambda x, u: x**3 + u, zero, task)
+    assert loop.finite.tolist() == [True, False, True]
+    for i in (0, 2):
+        alone = rollout(lambda x, u: x**3 + u, zero, task[i])
+        np.testing.assert_array_equal(loop.states[i], alone.states)
+        assert alone.ended == "complete"
+
+
+def test_a_loop_that_diverges_says_at_which_step() -> None:
+    blow_up = rollout(lambda x, u: np.where(x < 3, x + 1, np.nan), zero, Task([0.0], horizon=9, dt=0.1))
+    assert blow_up.ended == "diverged at step 4"
+    assert np.isfinite(blow_up.states[:4]).all()
+    assert not blow_up.finite
+
+
+def test_an_input_that_is_not_finite_is_told_as_such() -> None:
+    loop = rollout(lambda x, u: x, lambda t, x: np.array([np.nan]), Task([0.0], horizon=2, dt=0.1))
+    assert loop.ended == "not finite in its inputs"
+    assert not loop.finite
+
+
+@pytest.mark.parametrize(
+    ("output", "shape"),
+    [(0.0, "()"), (np.zeros((3, 2)), "(3, 2)"), (np.zeros((2, 1)), "(2, 1)"), (np.zeros(4), "(4,)")],
+)
+def test_a_first_input_of_the_wrong_shape_is_refused_with_both_shapes(output: object, shape: str) -> None:
+    task = Task([np.zeros(4), 0.0], horizon=2, dt=0.1)
+    with pytest.raises(ShapeError) as caught:
+        rollout(PENDULUM, lambda t, x: output, task)
+    assert "(4, 'm')" in str(caught.value)
+    assert f"got {shape}" in str(caught.value)
+
+
+@pytest.mark.parametrize("later", [[0.0, 0.0], 0.0, []])
+def test_an_input_that_changes_its_shape_is_refused_with_both_shapes(later: object) -> None:
+    with pytest.raises(ShapeError) as caught:
+        rollout(PENDULUM, lambda t, x: np.asarray(later if t else [0.0]), Task([1.0, 0.0], horizon=3, dt=0.1))
+    assert f"inputs of shape (1,) at every step, got {np.shape(later)}" in str(caught.value)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (1, 2)])
+def test_a_state_of_the_wrong_shape_is_refused_with_both_shapes(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ShapeError) as caught:
+        rollout(lambda x, u: np.zeros(shape), zero, Task([1.0, 0.0], horizon=3, dt=0.1))
+    assert "states of shape (2,)" in str(caught.value)
+    assert f"got {shape}" in str(caught.value)

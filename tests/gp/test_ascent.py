@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ctxval._util.arrays import Array
+from ctxval.gp.ascent import Ascent
+
+
+def maximum(function: object, dimension: int, budget: int = 1500, seed: int = 0) -> tuple[Array, float]:
+    ascent = Ascent(function, np.zeros(dimension), np.ones(dimension), budget)  # type: ignore[arg-type]
+    points, values = ascent.run(np.empty((0, dimension)), np.random.default_rng(seed))
+    return points[0], float(values[0])
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 6])
+def test_it_finds_an_interior_maximum(dimension: int) -> None:
+    point, _ = maximum(lambda X: -((X - 0.3) ** 2).sum(axis=1), dimension)
+    np.testing.assert_allclose(point, 0.3, atol=0.02)
+
+
+@pytest.mark.parametrize("dimension", [2, 11, 20])
+def test_it_finds_a_corner_exactly(dimension: int) -> None:
+    corner = (np.arange(dimension) % 3 > 0).astype(float)
+    point, _ = maximum(lambda X: np.exp(-np.abs(X - corner).sum(axis=1)), dimension)
+    np.testing.assert_array_equal(point, corner)
+
+
+def test_it_finds_a_maximum_behind_jumps() -> None:
+    point, _ = maximum(lambda X: np.floor(5 * X).sum(axis=1) + 0.1 * X.sum(axis=1), 4)
+    np.testing.assert_array_equal(point, 1.0)
+
+
+def test_it_stays_in_its_box_and_its_budget_and_sorts_what_it_saw() -> None:
+    seen: list[Array] = []
+
+    def function(X: Array) -> Array:
+        seen.append(X)
+        return X.sum(axis=1)
+
+    low, high = np.array([0.2, 0.0, 0.1, 0.5]), np.array([0.4, 0.3, 0.9, 0.52])
+    points, values = Ascent(function, low, high, 300).run(np.full((3, 4), 0.7), np.random.default_rng(0))
+    asked = np.concatenate(seen)
+    assert ((asked >= low - 1e-12) & (asked <= high + 1e-12)).all()
+    assert len(asked) <= 1.2 * 300
+    assert len(points) == len(values) == len(asked)
+    assert (np.diff(values) <= 0).all()
+
+
+@pytest.mark.parametrize("dimension", [2, 5])
+def test_what_is_not_finite_is_no_maximum(dimension: int) -> None:
+    point, value = maximum(lambda X: np.where(X[:, 0] > 0.5, np.nan, X[:, 0]), dimension)
+    assert 0.45 < point[0] <= 0.5
+    assert np.isfinite(value)
+    _, nothing = maximum(lambda X: np.full(len(X), np.nan), dimension)
+    assert nothing == -np.inf
+
+
+def test_the_same_randomness_finds_the_same_points() -> None:
+    first, again = (maximum(lambda X: np.sin(9 * X).prod(axis=1), 5, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(first[0], again[0])

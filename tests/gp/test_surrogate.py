@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ctxval.errors import InputError
+from ctxval.gp import regression as gp
+from ctxval.gp.kernels import Linear, Matern
+from ctxval.gp.surrogate import Learned, fit_surrogate, learn
+
+
+def data(n: int = 15, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    X = np.random.default_rng(seed).random((n, 2))
+    return X, np.sin(5 * X[:, 0]) + X[:, 1]
+
+
+def where() -> np.ndarray:
+    return np.random.default_rng(99).random((30, 2))
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(-1e3, 1e3), st.floats(1e-3, 1e3))
+def test_predictions_are_in_the_units_of_the_values(shift: float, scale: float) -> None:
+    X, y = data()
+    mean, deviation = fit_surrogate(X, y).predict(where())
+    moved, widened = fit_surrogate(X, shift + scale * y).predict(where())
+    np.testing.assert_allclose(moved, shift + scale * mean, rtol=0, atol=1e-3 * scale + 1e-9 * abs(shift))
+    np.testing.assert_allclose(widened, scale * deviation, rtol=1e-2, atol=1e-3 * scale)
+
+
+def test_the_surrogate_goes_through_noise_free_values() -> None:
+    X, y = data()
+    mean, deviation = fit_surrogate(X, y).predict(X)
+    np.testing.assert_allclose(mean, y, atol=1e-3)
+    assert deviation.max() < 0.01
+
+
+def test_the_surrogate_is_close_to_the_function_between_many_values() -> None:
+    X, y = data(60)
+    mean, deviation = fit_surrogate(X, y, Matern(2.5, ard=True)).predict(where())
+    truth = np.sin(5 * where()[:, 0]) + where()[:, 1]
+    np.testing.assert_allclose(mean, truth, atol=0.05)
+    assert (np.abs(mean - truth) <= 4 * deviation + 1e-3).all()
+
+
+def test_the_given_kernel_and_noise_are_used() -> None:
+    X, y = data()
+    surrogate = fit_surrogate(X, y, Linear(), noise=(0.3, 0.3))
+    assert surrogate.process.kernel == Linear()
+    assert surrogate.process.noise == pytest.approx(0.3)
+
+
+def test_points_of_unknown_value_narrow_the_surrogate_and_move_nothing() -> None:
+    X, y = data()
+    pending = np.array([[0.95, 0.05], [0.05, 0.95]])
+    alone = fit_surrogate(X, y)
+    with_pending = fit_surrogate(np.concatenate([X, pending]), np.append(y, [np.nan, np.nan]))
+    np.testing.assert_allclose(with_pending.predict(where())[0], alone.predict(where())[0], atol=1e-6)
+    assert (with_pending.predict(where())[1] <= alone.predict(where())[1] + 1e-9).all()
+    assert (with_pending.predict(pending)[1] < 0.1 * alone.predict(pending)[1]).all()
+
+
+def test_equal_values_make_a_flat_surrogate_in_their_own_units() -> None:
+    X, _ = data()
+    mean, deviation = fit_surrogate(X, np.full(15, 7.0)).predict(where())
+    np.testing.assert_allclose(mean, 7.0, rtol=1e-12)
+    assert np.isfinite(deviation).all()
+
+
+def test_an_exact_prior_mean_is_predicted_everywhere() -> None:
+    X, y = data(4)
+    prior = lambda X: np.sin(5 * X[:, 0]) + X[:, 1]  # noqa: E731
+    np.testing.assert_allclose(fit_surrogate(X, y, prior_mean=prior).predict(where())[0], prior(where()), atol=1e-12)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(1e-2, 1e2))
+def test_a_prior_mean_is_in_the_units_of_the_values(scale: float) -> None:
+    X, y = data()
+    prior = lambda X: X[:, 1]  # noqa: E731
+    mean, deviation = fit_surrogate(X, y, prior_mean=prior).predict(where())
+    scaled, widened = fit_surrogate(X, scale * y, prior_mean=lambda X: scale * prior(X)).predict(where())
+    np.testing.assert_allclose(scaled, scale * mean, rtol=0, atol=1e-3 * scale)
+    np.testing.assert_allclose(widened, scale * deviation, rtol=1e-2, atol=1e-3 * scale)
+
+
+@pytest.mark.parametrize("known", [0, 1])
+def test_fewer_than_two_known_values_are_refused(known: int) -> None:
+    X, y = data(3)
+    y[known:] = np.nan
+    with pytest.raises(InputError, match=rf"at least two known distances, got {known}"):
+        fit_surrogate(X, y)
+
+
+@pytest.mark.parametrize("prior", [lambda X: np.full(len(X), np.nan), lambda X: X, lambda X: 0.0])
+def test_a_prior_mean_without_one_finite_value_a_point_is_refused(prior: gp.Mean) -> None:
+    with pytest.raises(InputError, match="one finite value for each point"):
+        fit_surrogate(*data(), prior_mean=prior)
+
+
+# Learned once, conditioned often
+
+
+def many(d: int = 6, n: int = 40, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((n, d))
+
+
+def test_what_matters_gets_the_shorter_length_scales() -> None:
+    X = many()
+    learned = learn(X, np.sin(6 * X[:, 2]) + 0.01 * X[:, 4])
+    scales = learned.theta[1:7]
+    assert scales.argmin() == 2
+    assert scales[2] < np.delete(scales, 2).min() - 0.3
+
+
+def test_a_heavy_tail_is_a_process_of_the_logarithm_and_a_plain_function_is_not() -> None:
+    X = many(3)
+    steep = np.exp(6 * np.sin(2 * X).sum(axis=1))
+    assert np.isfinite(learn(X, steep).warp.offset)
+    assert np.isinf(learn(X, X.sum(axis=1)).warp.offset)
+    assert np.isinf(learn(X, steep - steep.max()).warp.offset)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_what_is_learned_does_not_depend_on_the_units(scale: float) -> None:
+    X = many(3)
+    y = 1 + np.sin(4 * X).sum(axis=1) ** 2
+    np.testing.assert_allclose(learn(X, scale * y).theta, learn(X, y).theta, atol=1e-3)
+
+
+def test_the_process_goes_through_known_values_and_believes_what_it_predicts_elsewhere() -> None:
+    X = many(2, 12)
+    y = np.sin(5 * X).sum(axis=1)
+    learned = learn(X[:8], y[:8])
+    values = np.where(np.arange(12) % 4 == 3, np.nan, y)
+    process = learned.condition(X, values)
+    np.testing.assert_allclose(process.predict(X)[0][::4], learned.standardised(y)[::4], atol=1e-3)
+    alone = learned.condition(X[np.isfinite(values)], values[np.isfinite(values)])
+    np.testing.assert_allclose(process.predict(where())[0], alone.predict(where())[0], atol=1e-5)
+    assert (process.predict(X)[1] < 1e-3).all()
+
+
+@pytest.mark.parametrize("values", [np.zeros(5), np.full(5, 3.0), np.array([0.0, 0.0, 0.0, 0.0, 1.0])])
+def test_values_that_say_nothing_are_learned_from_without_harm(values: np.ndarray) -> None:
+    learned = learn(many(2, 5), values)
+    assert isinstance(learned, Learned)
+    assert np.isfinite(learned.condition(many(2, 5), values).predict(where())[0]).all()
+
+
+def test_the_prior_of_the_hyperparameters_has_the_gradient_that_differences_show() -> None:
+    from ctxval.gp.surrogate import _LogPrior
+
+    prior, at = _LogPrior(4), np.random.default_rng(0).normal(size=8)
+    numeric = [(prior(at + 1e-6 * e)[0] - prior(at - 1e-6 * e)[0]) / 2e-6 for e in np.eye(8)]
+    np.testing.assert_allclose(prior(at)[1], numeric, rtol=1e-6, atol=1e-6)
+
+
+def test_of_very_many_values_the_largest_and_a_spread_of_the_others_are_learned_from() -> None:
+    X = many(2, 700)
+    y = np.sin(4 * X).sum(axis=1)
+    learned = learn(X, y)
+    np.testing.assert_allclose(
+        learned.condition(X, y).predict(where())[0],
+        learned.standardised(np.sin(4 * where()).sum(axis=1)),
+        atol=0.05,
+    )

@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from conftest import make_validation
+from ctxval import Task, TaskSpace, Validation, controllers, distances, models, systems
+from ctxval._util.arrays import Array
+from ctxval.cases import linear
+from ctxval.core.trajectory import Trajectory
+from ctxval.learning import prediction
+from ctxval.learning.prediction import predict_distance
+
+MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
+
+
+def executed(validation: Validation, points: Array) -> list[tuple[Array, Trajectory]]:
+    space = validation.space
+    return [(point, validation.outcome(space.from_unit(point)).system_trajectory) for point in points]
+
+
+def test_the_model_s_own_data_predict_the_distance_before_any_execution() -> None:
+    validation = make_validation()
+    prediction = predict_distance(validation, [])
+    assert prediction is not None
+    points = np.linspace(0, 1, 41)[:, None]
+    expected, doubt = prediction.expected(points)
+    np.testing.assert_allclose(expected, validation.distances(validation.space.from_unit(points)), rtol=0.02, atol=1e-3)
+    assert (doubt >= 0).all()
+
+
+def test_without_executions_and_data_nothing_is_predicted() -> None:
+    assert predict_distance(linear.experiment(0, dim=2).validation, []) is None
+
+
+def test_linear_dynamics_are_known_once_every_goal_s_direction_was_seen() -> None:
+    validation = linear.experiment(0, dim=2).validation
+    rng = np.random.default_rng(0)
+    prediction = predict_distance(validation, executed(validation, rng.random((4, 4))))
+    assert prediction is not None
+    points = rng.random((50, 4))
+    np.testing.assert_allclose(
+        prediction.expected(points)[0], validation.distances(validation.space.from_unit(points)), rtol=1e-2
+    )
+
+
+def test_an_execution_left_out_is_predicted_from_the_others() -> None:
+    validation = linear.experiment(0, dim=1).validation
+    runs = executed(validation, np.random.default_rng(1).random((5, 2)))
+    prediction = predict_distance(validation, runs)
+    assert prediction is not None
+    values = validation.distances(validation.space.from_unit(np.array([point for point, _ in runs])))
+    np.testing.assert_allclose(prediction.left_out(np.arange(5)), values, rtol=0.1)
+    assert prediction.left_out(np.array([3])).shape == (1,)
+
+
+def test_a_distance_composed_of_a_vector_has_a_second_prediction_from_the_vectors() -> None:
+    validation = linear.experiment(0, dim=2).validation
+    rng = np.random.default_rng(0)
+    prediction = predict_distance(validation, executed(validation, rng.random((12, 4))))
+    assert prediction is not None
+    assert prediction.otherwise is not None
+    second = prediction.otherwise()
+    assert second is not None
+    points = rng.random((50, 4))
+    values = validation.distances(validation.space.from_unit(points))
+    assert np.abs(second.expected(points)[0] - values).max() < 0.05 * values.max()
+    validation.distance = distances.WholeTrajectory()
+    first = predict_distance(validation, executed(validation, rng.random((2, 4))))
+    assert first is not None
+    assert first.otherwise is not None
+    assert first.otherwise() is None
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_a_task_that_cannot_be_planned_has_no_prediction_and_costs_the_others_nothing(batched: bool) -> None:
+    class Picky(controllers.LQR):
+        def design(self, task: Task, model: models.Model) -> controllers.AffineFeedback:
+            if (np.abs(task.goal[..., 0]) > 2.9).any():
+                raise RuntimeError("out of reach")
+            return super().design(task, model)
+
+    validation = make_validation()
+    validation.synthesizer = Picky([1.0, 0.1], [1e-2], [10.0, 1.0])
+    validation.synthesizer.batched = batched  # type: ignore[misc]
+    prediction = predict_distance(validation, [])
+    assert prediction is not None
+    expected, doubt = prediction.expected(np.array([[0.001], [0.3], [0.5], [0.999]]))
+    assert np.isfinite(expected).tolist() == np.isfinite(doubt).tolist() == [False, True, True, False]
+
+
+def test_a_synthesizer_that_designs_one_by_one_has_a_smaller_budget_and_the_same_prediction() -> None:
+    class OneByOne(controllers.LQR):
+        batched = False
+
+    validation, slow = make_validation(), make_validation()
+    slow.synthesizer = OneByOne([1.0, 0.1], [1e-2], [10.0, 1.0])
+    points = np.array([[0.2], [0.7]])
+    fast_prediction, slow_prediction = predict_distance(validation, []), predict_distance(slow, [])
+    assert fast_prediction is not None
+    assert slow_prediction is not None
+    assert slow_prediction.budget < fast_prediction.budget
+    np.testing.assert_allclose(slow_prediction.expected(points)[0], fast_prediction.expected(points)[0], rtol=0.02)
+
+
+def test_nothing_is_predicted_where_no_task_can_be_planned() -> None:
+    def refuse(p: object) -> Task:
+        raise RuntimeError("not today")
+
+    plain = make_validation()
+    validation = Validation(
+        space=TaskSpace(goal=(-3.0, 3.0)),
+        task=refuse,
+        system=systems.Simulated(MODEL),
+        model=plain.model,
+        synthesizer=plain.synthesizer,
+        distance=distances.FinalState(norm=1),
+    )
+    assert predict_distance(validation, []) is None
+
+
+def test_slow_designs_are_spread_over_processes_and_come_out_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Seen(controllers.LQR):
+        batched = False
+
+        def design(self, task: Task, model: models.Model) -> controllers.AffineFeedback:
+            designers.append(os.getpid())
+            return super().design(task, model)
+
+    designers: list[int] = []
+    validation, points = make_validation(), np.linspace(0.1, 0.9, 6)[:, None]
+    validation.synthesizer = Seen([1.0, 0.1], [1e-2], [10.0, 1.0])
+    results = []
+    for slow in (np.inf, 0.0):
+        monkeypatch.setattr(prediction, "_SLOW", slow)
+        predicted = predict_distance(validation, [])
+        assert predicted is not None
+        before = len(designers)
+        results.append(np.array(predicted.expected(points)))
+        # What other processes design leaves no trace here.
+        assert (len(designers) > before) == (slow > 0)
+    np.testing.assert_array_equal(*results)

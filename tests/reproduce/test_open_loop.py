@@ -1,0 +1,206 @@
+"""Open-loop validation: exact where the answer is known, and never worse than what is easily found."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from ctxval import Task, Trajectory, distances, models, systems
+from ctxval._util.arrays import Array
+from ctxval.cases.pendulum import Pendulum
+from ctxval.errors import InputError, ModelError, ShapeError
+from ctxval.reproduce.open_loop import OpenLoopWorst, _Pair, worst_open_loop
+
+FINAL = distances.FinalState(norm=1)
+WHOLE = distances.WholeTrajectory(norm=np.inf)
+STILL = models.Linear(np.eye(2), np.zeros((2, 1)))
+"""A model that does nothing: its worst open loop is the largest motion of the system."""
+
+
+def linear_pair(seed: int, n: int = 2, m: int = 1) -> tuple[models.Linear, models.Linear]:
+    rng = np.random.default_rng(seed)
+
+    def draw() -> models.Linear:
+        A = rng.normal(size=(n, n))
+        return models.Linear(A / np.abs(np.linalg.eigvals(A)).max(), rng.normal(size=(n, m)), 0.1 * rng.normal(size=n))
+
+    return draw(), draw()
+
+
+def final_gaps(step: models.Linear, x: Array, horizon: int) -> tuple[Array, Array]:
+    """Return the state without input, and the effect of each input on it, shapes (n,) and (H, n, m)."""
+    effects = [np.linalg.matrix_power(step.A, horizon - 1 - t) @ step.B for t in range(horizon)]
+    for _ in range(horizon):
+        x = step.A @ x + step.c
+    return x, np.array(effects)
+
+
+def worst_functional(pair: tuple[models.Linear, ...], x: Array, horizon: int, bound: Array, direction: Array) -> float:
+    """Return the exact maximum of ``direction' (x_S - x_M)`` at the horizon, by the sum of absolute responses."""
+    (free_s, effect_s), (free_m, effect_m) = (final_gaps(step, x, horizon) for step in pair)
+    responses = np.einsum("i,tij->tj", direction, effect_s - effect_m)
+    return float(direction @ (free_s - free_m) + (np.abs(responses) * bound).sum())
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("m", [1, 2])
+def test_the_final_distance_of_linear_systems_is_the_sum_of_absolute_responses(seed: int, m: int) -> None:
+    pair, x, bound = linear_pair(seed, n=3, m=m), np.array([1.0, -2.0, 0.5]), np.array([2.0, 0.3])[:m]
+    found = worst_open_loop(*pair, Task(x, horizon=40, dt=0.1), bound, FINAL, restarts=8)
+    signs = np.array(list(itertools.product([-1.0, 1.0], repeat=3)))
+    expected = max(worst_functional(pair, x, 40, bound, sign) for sign in signs)
+    assert found.distance == pytest.approx(expected, rel=1e-10)
+    assert (np.abs(found.inputs) == bound).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_trajectory_distance_of_linear_systems_is_the_largest_response_at_any_time(seed: int) -> None:
+    pair, x, bound = linear_pair(seed), np.array([1.0, -2.0]), np.array([0.5])
+    found = worst_open_loop(*pair, Task(x, horizon=40, dt=0.1), 0.5, WHOLE, restarts=16)
+    directions = [sign * row for row in np.eye(2) for sign in (-1, 1)]
+    expected = max(worst_functional(pair, x, t, bound, row) for t in range(1, 41) for row in directions)
+    assert found.distance == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    "distance",
+    [
+        distances.FinalState(norm=1),
+        distances.FinalState(norm=2),
+        distances.FinalState(norm=np.inf, components=[1]),
+        distances.WholeTrajectory(norm=1, components=[0]),
+        distances.WholeTrajectory(norm=2, per_step=True),
+        distances.WholeTrajectory(norm=np.inf),
+    ],
+    ids=str,
+)
+def test_every_norm_finds_the_best_of_all_sequences_at_the_bound(
+    distance: distances.FinalState | distances.WholeTrajectory,
+) -> None:
+    # With linear systems the distance is convex in the inputs, so that one of the 2^9 vertices is its maximum.
+    system, model = linear_pair(7)
+    task = Task([0.3, -1.0], horizon=9, dt=0.1)
+    found = worst_open_loop(system, model, task, 1.5, distance, restarts=24)
+    every = 1.5 * np.array(list(itertools.product([-1.0, 1.0], repeat=9)))[..., None]
+    assert found.distance == pytest.approx(distances_of(system, model, task, every, distance).max(), rel=1e-10)
+
+
+def distances_of(
+    system: models.Model,
+    model: models.Model,
+    task: Task,
+    inputs: Array,
+    distance: Callable[[Trajectory, Trajectory, Task], Array],
+) -> Array:
+    """Return the open-loop distances of inputs ``(N, H, m)``, by the public parts alone."""
+    batch = Task(np.tile(task.initial_state, (len(inputs), 1)), horizon=task.horizon, dt=task.dt)
+
+    def run(step: models.Model) -> Trajectory:
+        return systems.Simulated(step).execute(lambda t, x: inputs[:, t], batch)
+
+    return distance(run(model), run(system), batch)
+
+
+@pytest.fixture(scope="module")
+def pendulum() -> models.Model:
+    return models.Function(systems.rk4(Pendulum().derivative, 0.02), vectorized=True)
+
+
+def pump(pendulum: models.Model, restarts: int = 8, seed: int = 0, horizon: int = 150) -> OpenLoopWorst:
+    """Move the hanging pendulum as far as possible with a torque that cannot hold it level."""
+    task = Task([np.pi, 0.0], horizon=horizon, dt=0.02)
+    return worst_open_loop(pendulum, STILL, task, 1.0, FINAL, restarts=restarts, seed=seed)
+
+
+def test_the_pendulum_is_pumped_as_by_dynamic_programming(pendulum: models.Model) -> None:
+    # Dynamic programming on a grid of 720 x 1601 states, its policy executed, gives 6.0184.
+    assert pump(pendulum).distance >= 6.0183
+
+
+def test_the_worst_beats_random_sequences_and_stays_within_the_bound(pendulum: models.Model) -> None:
+    found, rng = pump(pendulum, restarts=4, horizon=60), np.random.default_rng(0)
+    sequences = rng.choice([-1.0, 1.0], size=(1000, 60, 1)), rng.uniform(-1, 1, size=(1000, 60, 1))
+    task = Task([np.pi, 0.0], horizon=60, dt=0.02)
+    assert found.distance > distances_of(pendulum, STILL, task, np.concatenate(sequences), FINAL).max()
+    assert np.abs(found.inputs).max() <= 1.0
+
+
+def test_more_restarts_never_find_less(pendulum: models.Model) -> None:
+    few, more = pump(pendulum, 2, horizon=60), pump(pendulum, 6, horizon=60)
+    assert more.distance >= few.distance - 1e-9
+    assert more.restarts.shape == (6,)
+    assert (np.diff(more.restarts) <= 0).all()
+    assert more.restarts[0] == more.distance
+
+
+def test_the_result_is_what_its_inputs_do(pendulum: models.Model) -> None:
+    found = pump(pendulum, 2, horizon=30)
+    assert found.inputs.shape == (30, 1)
+    assert found.system_trajectory.states[0].tolist() == [np.pi, 0.0]
+    np.testing.assert_array_equal(found.system_trajectory.inputs, found.inputs)
+    task = Task([np.pi, 0.0], horizon=30, dt=0.02)
+    again = FINAL(found.model_trajectory, found.system_trajectory, task)
+    assert found.distance == pytest.approx(float(again), rel=1e-12)
+    np.testing.assert_array_equal(pump(pendulum, 2, horizon=30).inputs, found.inputs)
+
+
+def test_no_single_switch_improves_the_result(pendulum: models.Model) -> None:
+    found = pump(pendulum, 1, seed=3, horizon=40)
+    switched = np.repeat(found.inputs[None], 40, axis=0)
+    switched[np.arange(40), np.arange(40)] *= -1
+    task = Task([np.pi, 0.0], horizon=40, dt=0.02)
+    values = distances_of(pendulum, STILL, task, switched, FINAL)
+    assert values.max() <= found.distance * (1 + 1e-9)
+
+
+def test_the_gradient_is_that_of_finite_differences(pendulum: models.Model) -> None:
+    rng = np.random.default_rng(0)
+    pair = _Pair(pendulum, linear_pair(0)[0], Task([1.0, -0.5], horizon=12, dt=0.02), np.array([1.0]))
+    inputs, weights = rng.normal(size=(12, 1)), rng.normal(size=(13, 2))
+    moves = 1e-5 * np.eye(12)[..., None]
+    up, down = ((weights * pair.gap(inputs + sign * moves)).sum(axis=(-1, -2)) for sign in (1, -1))
+    np.testing.assert_allclose(pair.gradient(inputs, weights)[:, 0], (up - down) / 2e-5, rtol=1e-6, atol=1e-8)
+
+
+def test_plain_functions_serve_as_system_and_model() -> None:
+    task = Task([0.0], horizon=5, dt=1.0)
+    found = worst_open_loop(lambda x, u: x + np.tanh(u), lambda x, u: 0 * x, task, 2.0, FINAL, restarts=2)
+    assert found.distance == pytest.approx(5 * np.tanh(2.0))
+
+
+def test_a_model_without_any_error_has_no_distance() -> None:
+    found = worst_open_loop(STILL, STILL, Task([1.0, 2.0], horizon=5, dt=1.0), 1.0, WHOLE, restarts=2)
+    assert found.distance == 0
+
+
+def test_systems_that_diverge_have_no_worst_open_loop() -> None:
+    explosive = models.Function(lambda x, u: 1e200 * (x + u) ** 3, vectorized=True)
+    with pytest.raises(ModelError, match="no maximum"):
+        worst_open_loop(explosive, STILL, Task([1.0, 1.0], horizon=5, dt=1.0), 1.0, FINAL, restarts=2)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"bound": 0.0}, "positive number for each input"),
+        ({"bound": [[1.0]]}, "positive number for each input"),
+        ({"bound": np.inf}, "bound must be finite"),
+        ({"restarts": 0}, "restarts must be an integer >= 1"),
+        ({"restarts": True}, "restarts must be an integer >= 1"),
+        ({"seed": -1}, "seed must be an integer >= 0"),
+        ({"iterations": 0}, "iterations must be an integer >= 1"),
+        ({"distance": distances.GoalError()}, "needs a FinalState or WholeTrajectory"),
+    ],
+)
+def test_arguments_that_cannot_be_used_are_refused(change: dict[str, object], message: str) -> None:
+    given = {"task": Task([1.0, 2.0], horizon=3, dt=1.0), "bound": 1.0, "distance": FINAL} | change
+    with pytest.raises(InputError, match=message):
+        worst_open_loop(STILL, STILL, **given)  # type: ignore[arg-type]
+
+
+def test_a_batch_of_tasks_is_refused() -> None:
+    with pytest.raises(ShapeError, match="takes one task"):
+        worst_open_loop(STILL, STILL, Task(np.zeros((3, 2)), horizon=3, dt=1.0), 1.0, FINAL)

@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ctxval._util.arrays import Array, Rows
+from ctxval.errors import InputError, ShapeError
+from ctxval.searches import Auto, Climbs, Prediction, Random, Scalar
+from ctxval.searches.base import Note
+from ctxval.testing import check_search
+
+Function = Callable[[Array], Array]
+
+
+def hill(X: Array) -> Array:
+    """Return a function whose maximum, 1.0, is at (0.3, 0.8, ...)."""
+    return np.exp(-4 * ((X - np.resize([0.3, 0.8], X.shape[1])) ** 2).sum(axis=1))
+
+
+def predicting(guess: Function, doubt: Function | None = None, known: Array | None = None) -> Prediction:
+    def expected(X: Array) -> tuple[Array, Array]:
+        return guess(X), np.full(len(X), 0.01) if doubt is None else doubt(X)
+
+    def left_out(rows: Rows) -> Array:
+        return np.zeros(len(rows)) if known is None else guess(known)[rows]
+
+    return Prediction(expected, left_out, budget=600)
+
+
+def run(search: Climbs, function: Function, guess: Function, budget: int, dimension: int = 2, seed: int = 0) -> Array:
+    search.reset(dimension, seed)
+    for _ in range(budget):
+        known = search.points[np.isfinite(search.values)]
+        search.use_prediction(predicting(guess, known=known))
+        point = search.ask(1)
+        search.tell(point, function(point))
+    return search.values
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 6])
+def test_a_right_prediction_leads_straight_to_the_top(dimension: int) -> None:
+    assert run(Climbs(), hill, hill, 2, dimension)[0] > 0.99
+
+
+def test_a_prediction_that_is_too_small_by_a_factor_does_as_well() -> None:
+    assert run(Climbs(), hill, lambda X: 0.3 * hill(X), 2)[0] > 0.99
+
+
+def test_a_wrong_prediction_does_not_keep_the_top_hidden() -> None:
+    search = Climbs()
+    assert run(search, hill, lambda X: 1.0 - 0.9 * hill(X), 25).max() > 0.97
+    fallen = [note for note in search.notes if note is not None and note["engine"] == "scalar"]
+    assert fallen
+    assert "leaving one out, the prediction errs by" in fallen[0]["why"]
+
+
+def test_without_a_prediction_the_scalar_search_goes_on_and_says_so() -> None:
+    search, random = Climbs(), Random()
+    search.reset(2, 5)
+    random.reset(2, 5)
+    np.testing.assert_array_equal(search.ask(1), random.ask(1))
+    assert search.note() == {"engine": "scalar", "how": "initial", "why": "there is no prediction"}
+    check_search(Climbs())
+    check_search(Auto())
+
+
+def test_a_prediction_of_nothing_is_none() -> None:
+    search = Climbs()
+    search.reset(2, 0)
+    search.use_prediction(predicting(lambda X: np.full(len(X), np.nan)))
+    assert np.isfinite(search.ask(1)).all()
+    assert search.note() == {"engine": "scalar", "how": "initial", "why": "nothing is predicted anywhere"}
+
+
+def test_doubt_draws_the_search_to_what_was_not_seen() -> None:
+    def doubt(X: Array) -> Array:
+        return np.where(X[:, 0] > 0.9, 5.0, 0.0)
+
+    search = Climbs()
+    search.reset(2, 0)
+    search.use_prediction(predicting(lambda X: 1.0 + 0.1 * X[:, 1], doubt))
+    assert search.ask(1)[0, 0] > 0.9
+
+
+def test_a_wrong_prediction_shrinks_the_box_and_misses_end_the_climb() -> None:
+    search = Climbs(misses=2)
+    run(search, lambda X: 0.1 + 1e-6 * X[:, 0], lambda X: 1.0 + X[:, 0], 5)
+    notes = [note for note in search.notes if note is not None and note["engine"] == "climb"]
+    assert notes[0]["radius"] == notes[1]["radius"] == 1.0
+    assert notes[2]["radius"] == 0.5
+    assert max(note["climb"] for note in notes) >= 1
+
+
+def test_no_point_is_asked_twice_and_what_failed_is_kept_away_from() -> None:
+    def holed(X: Array) -> Array:
+        return np.where(np.linalg.norm(X - [0.3, 0.8], axis=1) < 0.1, np.nan, hill(X))
+
+    search = Climbs()
+    run(search, holed, hill, 15)
+    gaps = np.abs(search.points[:, None] - search.points[None]).max(axis=2) + np.eye(15)
+    assert gaps.min() > 1e-6
+    failed = search.points[np.isnan(search.values)]
+    climbs = [note is not None and note["engine"] == "climb" for note in search.notes]
+    for point in failed:
+        later = search.points[np.flatnonzero((search.points == point).all(axis=1))[0] + 1 :]
+        near = np.linalg.norm(later - point, axis=1) < 0.05 * np.sqrt(2)
+        assert not near[np.array(climbs[-len(later) :], dtype=bool)].any()
+
+
+def test_a_batch_of_questions_spreads() -> None:
+    search = Climbs()
+    search.reset(2, 0)
+    search.use_prediction(predicting(hill))
+    asked = search.ask(4)
+    gaps = [np.linalg.norm(asked[i] - asked[j]) for i in range(4) for j in range(i)]
+    assert min(gaps) > 0.05
+
+
+def test_without_any_prediction_it_goes_on_as_the_scalar_search_does() -> None:
+    search, scalar = Climbs(), Scalar(initial=1)
+    for each in (search, scalar):
+        each.reset(3, 4)
+        for _ in range(6):
+            point = each.ask(1)
+            each.tell(point, hill(point))
+    np.testing.assert_array_equal(search.points, scalar.points)
+
+
+def test_a_prediction_that_is_no_good_is_replaced_by_the_one_it_names() -> None:
+    asked: list[int] = []
+
+    def wrong(known: Array) -> Prediction:
+        def otherwise() -> Prediction:
+            asked.append(len(known))
+            return predicting(hill, known=known)
+
+        return replace(predicting(lambda X: 1.0 - 0.9 * hill(X), known=known), otherwise=otherwise)
+
+    search = Climbs()
+    search.reset(2, 0)
+    for _ in range(10):
+        search.use_prediction(wrong(search.points))
+        point = search.ask(1)
+        search.tell(point, hill(point))
+    assert asked
+    assert min(asked) >= 6  # it is not computed before it is needed
+    assert search.values.max() > 0.99
+    assert all(note is not None and note["engine"] == "climb" for note in search.notes)
+
+
+@pytest.mark.parametrize("told", [1, 3, 6])
+def test_told_its_history_with_its_notes_it_asks_for_the_same_point(told: int) -> None:
+    whole = Climbs()
+    run(whole, hill, lambda X: 0.5 * hill(X - 0.1), 7)
+    fresh = Climbs()
+    fresh.reset(2, 0)
+    fresh.tell(whole.points[:told], whole.values[:told])
+    stored: list[Note | None] = json.loads(json.dumps(whole.notes[:told]))
+    fresh.remember(stored)
+    fresh.use_prediction(predicting(lambda X: 0.5 * hill(X - 0.1), known=whole.points[:told]))
+    np.testing.assert_array_equal(fresh.ask(1)[0], whole.points[told])
+    assert fresh.note() == whole.notes[told]
+
+
+def test_notes_must_fit_the_history() -> None:
+    search = Climbs()
+    search.reset(2, 0)
+    with pytest.raises(ShapeError, match="one note for each of 0 points, got 1"):
+        search.remember([None])
+
+
+def test_a_reset_forgets_the_prediction() -> None:
+    search = Climbs()
+    run(search, hill, hill, 2)
+    search.reset(2, 0)
+    search.ask(1)
+    assert search.note() == {"engine": "scalar", "how": "initial", "why": "there is no prediction"}
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"), [({"optimism": -1.0}, "optimism"), ({"misses": 0}, "one miss, got 0")]
+)
+def test_options_that_cannot_be_are_refused_by_value(options: dict[str, float], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        Climbs(**options)  # type: ignore[arg-type]

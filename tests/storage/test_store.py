@@ -1,0 +1,208 @@
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ctxval import Store, Trajectory, Trial
+from ctxval.core.trial import Change
+from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
+from ctxval.storage.migrations import MIGRATIONS
+
+TRAJECTORY = Trajectory(np.arange(4.0), np.random.default_rng(0).normal(size=(4, 2)), np.ones((3, 1)))
+
+
+def trial(number: int = 0) -> Trial:
+    point = np.array([1 / 3, np.nextafter(0.5, 1)])
+    return Trial(number, "iid", "open", point, {"a": 0.1, "b": [1.0, 2.0]}, attempts=1)
+
+
+def test_a_trial_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    store.open_trial(trial(), TRAJECTORY)
+    ended = replace(trial(), state="completed", executed=True, distance=0.1 + 0.2, seconds=1.5)
+    store.close_trial(ended, TRAJECTORY)
+    store.close()
+    (back,) = Store(tmp_path / "a.sqlite").trials()
+    np.testing.assert_array_equal(back.unit_point, ended.unit_point)
+    assert (back.distance, back.origin, back.state, back.parameters) == (
+        0.1 + 0.2,
+        "iid",
+        "completed",
+        ended.parameters,
+    )
+    assert (back.attempts, back.executed, back.failure, back.seconds) == (1, True, None, 1.5)
+
+
+def test_a_note_comes_back_bit_for_bit_and_none_as_none(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    note = {"engine": "climb", "climb": 2, "expected": 0.1 + 0.2, "radius": 1.0, "why": None}
+    store.open_trial(replace(trial(), note=note), TRAJECTORY)
+    store.open_trial(trial(1), TRAJECTORY)
+    store.record_failed_plan(replace(trial(2), state="failed", failure="x", note=note))
+    store.close()
+    assert [t.note for t in Store(tmp_path / "a.sqlite").trials()] == [note, None, note]
+
+
+def test_a_store_without_notes_is_migrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr("ctxval.storage.store.MIGRATIONS", MIGRATIONS[:1])
+        old = Store(tmp_path / "a.sqlite")
+        old._connection.execute(
+            "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, opened_at) "
+            "VALUES (0, 'iid', 'open', '[0.5, 0.5]', '{}', 1, '')"
+        )
+        old.close()
+    migrated = Store(tmp_path / "a.sqlite")
+    assert [t.note for t in migrated.trials()] == [None]
+    migrated.record_failed_plan(replace(trial(1), state="failed", failure="x", note={"climb": 1}))
+    assert migrated.trials()[1].note == {"climb": 1}
+
+
+def test_trajectories_come_back_bit_for_bit_and_absent_ones_as_none() -> None:
+    store = Store()
+    store.open_trial(trial(), TRAJECTORY)
+    back = store.trajectory(0, "model")
+    assert back is not None
+    np.testing.assert_array_equal(back.states, TRAJECTORY.states)
+    assert store.trajectory(0, "system") is None
+
+
+def test_an_ended_trial_cannot_end_again() -> None:
+    store = Store()
+    store.open_trial(trial(), TRAJECTORY)
+    store.close_trial(replace(trial(), state="failed", failure="x"), None)
+    with pytest.raises(InputError, match="nothing more can be told"):
+        store.close_trial(replace(trial(), state="completed", distance=1.0), TRAJECTORY)
+    assert store.trials()[0].state == "failed"
+
+
+def test_two_writers_of_one_trial_collide_with_a_clear_error(tmp_path: Path) -> None:
+    first, second = Store(tmp_path / "a.sqlite"), Store(tmp_path / "a.sqlite")
+    first.open_trial(trial(), TRAJECTORY)
+    with pytest.raises(StoreAccessError, match="written by another process"):
+        second.open_trial(trial(), TRAJECTORY)
+    assert len(second.trials()) == 1
+
+
+def test_the_first_description_stays_until_a_change_is_stated() -> None:
+    store = Store()
+    assert store.describe_first({"seed": 1}) == {"seed": 1}
+    assert store.describe_first({"seed": 2}) == {"seed": 1}
+    store.keep_draws(7)
+    store.keep_draws(8)
+    store.describe_anew({"seed": 2}, Change("accepted", "new battery", {"differences": ["seed"]}))
+    assert store.description() == {"seed": 2}
+    assert store.draws() == 7
+    (change,) = store.history()
+    assert (change.what, change.why, change.content) == ("accepted", "new battery", {"differences": ["seed"]})
+    assert change.at
+
+
+def test_a_foreign_database_is_refused_and_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "photos.sqlite"
+    with sqlite3.connect(path) as other:
+        other.execute("CREATE TABLE photos (name TEXT)")
+    other.close()
+    before = path.read_bytes()
+    with pytest.raises(ForeignStoreError, match="not a ctxval store"):
+        Store(path)
+    assert path.read_bytes() == before
+
+
+def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("just some notes, long enough to be read as a page header by anyone who tries. " * 20)
+    with pytest.raises(ForeignStoreError, match="cannot be read"):
+        Store(path)
+
+
+def test_a_newer_schema_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    Store(path).close()
+    connection = sqlite3.connect(path)
+    connection.execute("PRAGMA user_version = 99")
+    connection.close()
+    with pytest.raises(ForeignStoreError, match="newer ctxval"):
+        Store(path)
+
+
+def test_an_impossible_path_is_an_access_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreAccessError, match="cannot be used"):
+        Store(tmp_path / "file" / "a.sqlite")
+    with pytest.raises(StoreAccessError, match="there is no store"):
+        Store.existing(tmp_path / "none.sqlite")
+
+
+def test_a_full_disk_loses_nothing_that_was_stored(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    store.open_trial(trial(), TRAJECTORY)
+    pages = store._connection.execute("PRAGMA page_count").fetchone()[0]
+    store._connection.execute(f"PRAGMA max_page_count = {pages}")
+    big = Trajectory(np.arange(5001.0), np.random.default_rng(1).normal(size=(5001, 4)), np.zeros((5000, 1)))
+    with pytest.raises(StoreAccessError, match="full"):
+        store.open_trial(trial(1), big)
+    store.close()
+    assert [t.number for t in Store(tmp_path / "a.sqlite").trials()] == [0]
+
+
+def test_migrations_are_recorded(tmp_path: Path) -> None:
+    Store(tmp_path / "a.sqlite").close()
+    connection = sqlite3.connect(tmp_path / "a.sqlite")
+    rows = connection.execute("SELECT version, title FROM migrations").fetchall()
+    version = connection.execute("PRAGMA user_version").fetchone()[0]
+    connection.close()
+    assert [row[0] for row in rows] == list(range(1, version + 1))
+
+
+def test_settings_come_back_and_the_last_ones_count(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    assert store.settings() == {}
+    store.keep_settings({"experiment": "pendulum", "budget": 5, "old": True})
+    kept = {"experiment": "pendulum", "budget": None, "search": {"name": "gp-ucb", "beta": 2.0}}
+    store.keep_settings(kept)
+    store.close()
+    assert Store(tmp_path / "a.sqlite").settings() == kept
+
+
+def test_settings_do_not_change_which_experiment_it_is() -> None:
+    store = Store()
+    store.describe_first({"seed": 1})
+    store.keep_settings({"budget": 5})
+    assert store.description() == {"seed": 1}
+
+
+@pytest.mark.parametrize("version", range(1, len(MIGRATIONS)))
+def test_a_store_of_any_older_version_is_brought_up_with_its_trials(tmp_path: Path, version: int) -> None:
+    path = tmp_path / "old.sqlite"
+    connection = sqlite3.connect(path, isolation_level=None)
+    for number, (title, script) in enumerate(MIGRATIONS[:version], start=1):
+        connection.executescript(script)
+        connection.execute("INSERT INTO migrations VALUES (?, ?, 'then')", (number, title))
+    connection.execute("PRAGMA application_id = 0x63747876")
+    connection.execute(f"PRAGMA user_version = {version}")
+    connection.execute(
+        "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, distance, executed, opened_at) "
+        "VALUES (0, 'iid', 'completed', '[0.25, 0.5]', '{\"a\": 1.5}', 1, 0.7, 1, 'then')"
+    )
+    connection.close()
+    store = Store(path)
+    (old,) = store.trials()
+    assert (old.origin, old.state, old.distance, old.parameters, old.note) == (
+        "iid",
+        "completed",
+        0.7,
+        {"a": 1.5},
+        None,
+    )
+    assert store.settings() == {}
+    store.keep_settings({"experiment": "pendulum"})
+    store.open_trial(trial(1), TRAJECTORY)
+    store.close()
+    again = Store(path)
+    assert [t.number for t in again.trials()] == [0, 1]
+    assert again.settings() == {"experiment": "pendulum"}
