@@ -37,7 +37,7 @@ import rig_command  # noqa: E402
 from attack import FAMILIES  # noqa: E402
 from conftest import make_validation  # noqa: E402
 from ctxval import Campaign, Store, searches  # noqa: E402
-from ctxval.storage.recovery import salvage  # noqa: E402
+from ctxval.storage.recovery import recover  # noqa: E402
 from rig_workers import campaign as logged  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "results" / "reliability.json"
@@ -216,7 +216,7 @@ def damage(count: int, folder: Path, seed: int, *, cut: bool) -> dict[str, int]:
             counts["noticed" if check_damaged(path, expected) else "harmless"] += 1
         except AssertionError:
             counts["silent"] += 1
-        for trial in salvage(path).trials.values():
+        for trial in recover(path).trials.values():
             assert trial.distance == expected[0][trial.number][4]
     return counts
 

@@ -11,12 +11,12 @@ import pytest
 
 from ctxval._util import temporary as module
 from ctxval._util.locks import FileLock
-from ctxval._util.temporary import Scratch, scratch
+from ctxval._util.temporary import TemporaryFolder, temporary_folder
 
 HOLD = """
 import sys
-from ctxval._util.temporary import Scratch
-folder = Scratch()
+from ctxval._util.temporary import TemporaryFolder
+folder = TemporaryFolder()
 (folder.path / "file").write_text("content")
 print(folder.path, flush=True)
 sys.stdin.read()
@@ -24,14 +24,15 @@ sys.stdin.read()
 
 FORK = """
 import os, subprocess, sys
-from ctxval._util.temporary import Scratch, scratch
-mine = Scratch()
+from ctxval._util.temporary import TemporaryFolder, temporary_folder
+mine = TemporaryFolder()
 child = os.fork()
 if not child:
-    with scratch():
+    with temporary_folder():
         os._exit(0 if mine.path.exists() else 1)
 print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0)
-subprocess.run([sys.executable, "-c", "from ctxval._util.temporary import Scratch; Scratch()"], check=True)
+code = "from ctxval._util.temporary import TemporaryFolder; TemporaryFolder()"
+subprocess.run([sys.executable, "-c", code], check=True)
 print(mine.path.exists())
 """
 
@@ -57,7 +58,7 @@ def ended(holder: subprocess.Popen[str], number: int) -> None:
 
 
 def test_a_folder_is_empty_and_goes_in_the_end(tmp_path: Path) -> None:
-    with scratch() as folder:
+    with temporary_folder() as folder:
         assert folder.is_dir()
         assert not list(folder.iterdir())
         (folder / "file").write_text("content")
@@ -65,7 +66,7 @@ def test_a_folder_is_empty_and_goes_in_the_end(tmp_path: Path) -> None:
 
 
 def test_it_goes_after_an_error(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), scratch():
+    with pytest.raises(RuntimeError), temporary_folder():
         raise RuntimeError("something else")
     assert not list(tmp_path.iterdir())
 
@@ -74,16 +75,16 @@ def test_what_a_killed_process_leaves_goes_with_the_next() -> None:
     holder, left = held_elsewhere()
     ended(holder, signal.SIGKILL)
     assert (left / "file").exists()
-    with scratch():
+    with temporary_folder():
         assert not left.exists()
         assert not left.parent.exists()
 
 
 def test_folders_in_use_stay_whoever_has_them() -> None:
-    mine = Scratch()
+    mine = TemporaryFolder()
     holder, theirs = held_elsewhere()
     for _ in range(3):
-        with scratch():
+        with temporary_folder():
             assert mine.path.exists()
             assert (theirs / "file").exists()
     ended(holder, signal.SIGKILL)
@@ -99,7 +100,7 @@ def test_a_fork_leaves_its_parents_folder_alone() -> None:
 def test_what_somebody_else_made_there_stays(tmp_path: Path) -> None:
     other = tmp_path / "ctxval-notes"
     other.mkdir()
-    with scratch():
+    with temporary_folder():
         pass
     assert other.exists()
 
@@ -111,6 +112,6 @@ def test_without_locks_a_folder_is_made_and_removed_all_the_same(
         raise OSError("no locks available")
 
     monkeypatch.setattr(module, "FileLock", refused)
-    with scratch() as folder:
+    with temporary_folder() as folder:
         assert folder.is_dir()
     assert not list(tmp_path.iterdir())

@@ -17,7 +17,7 @@ from ctxval import Campaign, Trajectory, searches
 from ctxval._util.texts import LONGEST, guarded, plain, reason_of, shortened, text_of, unguarded, visible
 from ctxval.campaign.by_hand import read_runs
 from ctxval.core.space import TaskSpace
-from ctxval.storage.recovery import export, salvage
+from ctxval.storage.recovery import export, recover
 from ctxval.testing import FaultyRig
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2J\x9b31m\x7f\u202egnp.exe\u2066\u2028\udc80\r"
@@ -132,7 +132,7 @@ def test_texts_of_an_exported_store_are_guarded_and_numbers_are_numbers(tmp_path
     campaign.add({"goal": -1.5}, distance=0.25)
     campaign.add({"goal": -2.5}, failed="=cmd|' /C calc'!A0\x1b[2J")
     campaign.store.close()
-    export(salvage(tmp_path / "a.sqlite"), tmp_path / "out")
+    export(recover(tmp_path / "a.sqlite"), tmp_path / "out")
     rows = list(csv.DictReader(io.StringIO((tmp_path / "out" / "trials.csv").read_text())))
     assert rows[1]["failure"] == r"'=cmd|' /C calc'!A0\x1b[2J"
     assert [float(row["goal"]) for row in rows] == [-1.5, -2.5]

@@ -27,7 +27,7 @@ from ctxval import Campaign, Store, Trajectory, searches
 from ctxval.cli import app
 from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError
 from ctxval.storage.disks import StoreWarning, file_system
-from ctxval.storage.recovery import salvage
+from ctxval.storage.recovery import recover
 from ctxval.storage.store import Side
 
 HERE = Path(__file__).parents[1]
@@ -92,7 +92,7 @@ def test_a_cut_store_is_a_clear_error_and_what_is_readable_is_exported(
     assert "cannot be read as a store" in stderr or "is damaged" in stderr or "cannot be used as a store" in stderr
     status, stdout, stderr = command("export", str(cut), "--json")
     assert cut.read_bytes() == before
-    found = salvage(cut)
+    found = recover(cut)
     if not found.trials and not found.trajectories:
         assert share < 0.1
         assert (status, stdout) == (2, "")
@@ -116,7 +116,7 @@ def test_rows_that_cannot_be_read_are_told_together(whole: Path, tmp_path: Path)
     data = bytearray(broken.read_bytes())
     data[(root - 1) * page : root * page] = b"\xff" * page
     broken.write_bytes(bytes(data))
-    found = salvage(broken)
+    found = recover(broken)
     assert len(found.trials) == 15
     assert len(found.damaged) < 5
     assert any(" rows from 0 to " in sentence for sentence in found.damaged)
@@ -167,7 +167,7 @@ def test_flipped_bytes_are_noticed_or_harmless(whole: Path, tmp_path: Path) -> N
                 status, _, stderr = command(*arguments)
                 assert status in (0, 2), stderr
                 assert "Traceback" not in stderr
-        for trial in salvage(path).trials.values() if number % 5 == 0 else ():
+        for trial in recover(path).trials.values() if number % 5 == 0 else ():
             assert (trial.number, trial.distance) == (expected[0][trial.number][0], expected[0][trial.number][4])
     assert noticed > 100
 
@@ -176,18 +176,18 @@ def test_an_edited_distance_is_noticed(whole: Path, tmp_path: Path) -> None:
     path = tmp_path / "edited.sqlite"
     shutil.copy(whole, path)
     store = Store(path)
-    store._connection.execute("UPDATE trials SET distance = distance * 1.5 WHERE number = 3")
+    store._database.execute("UPDATE trials SET distance = distance * 1.5 WHERE number = 3")
     with pytest.raises(ForeignStoreError, match="is damaged: its trial 3 cannot be read; `ctxval export` saves"):
         store.trials()
-    assert 3 not in salvage(path).trials
-    assert "trial 3: its checksum does not fit" in salvage(path).damaged
+    assert 3 not in recover(path).trials
+    assert "trial 3: its checksum does not fit" in recover(path).damaged
 
 
 def test_a_missing_trial_is_noticed(whole: Path, tmp_path: Path) -> None:
     path = tmp_path / "short.sqlite"
     shutil.copy(whole, path)
     store = Store(path)
-    store._connection.execute("DELETE FROM trials WHERE number = 3")
+    store._database.execute("DELETE FROM trials WHERE number = 3")
     with pytest.raises(ForeignStoreError, match="its trial 3 cannot be read"):
         store.trials()
 
@@ -296,7 +296,7 @@ def test_a_network_file_system_is_warned_of(tmp_path: Path, monkeypatch: pytest.
 
 def test_a_clock_that_is_set_back_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     years = iter(range(2040, 1970, -1))
-    monkeypatch.setattr("ctxval.storage.store._now", lambda: f"{next(years)}-01-01T00:00:00.000+00:00")
+    monkeypatch.setattr("ctxval.storage.store.now", lambda: f"{next(years)}-01-01T00:00:00.000+00:00")
     store = tmp_path / "a.sqlite"
     for budget in (3, 6, 8):
         campaign = Campaign(make_validation(), search=SEARCH(), store=store, seed=2).run(budget)
@@ -391,11 +391,11 @@ class Acts(RuleBasedStateMachine):
             def __getattr__(self, name: str) -> Any:
                 return getattr(connection, name)
 
-        connection = store._connection
-        store._connection = Cut()  # type: ignore[assignment]
+        connection = store._database._connection
+        store._database._connection = Cut()  # type: ignore[assignment]
         with pytest.raises(KeyboardInterrupt):
             act()
-        store._connection = connection
+        store._database._connection = connection
         self.die(who)
 
     @invariant()

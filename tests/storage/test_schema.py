@@ -22,7 +22,7 @@ from ctxval.cli import app
 from ctxval.errors import CtxvalError, ForeignStoreError, StoreAccessError
 from ctxval.storage import schema
 from ctxval.storage.migrations import MIGRATIONS
-from ctxval.storage.recovery import salvage
+from ctxval.storage.recovery import recover
 
 FOREVER = "WITH RECURSIVE t(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM t) SELECT {} FROM t"
 
@@ -118,7 +118,7 @@ def test_a_crafted_store_is_refused_and_export_saves_the_rest(store: Path, tmp_p
     before = store.read_bytes()
     for command in ("status", "certify"):
         assert sentence in said(store, command)
-    found = salvage(store)
+    found = recover(store)
     assert len(found.trials) == trials
     assert len(found.trajectories) == 9
     assert found.damaged
@@ -149,7 +149,7 @@ def test_crafted_rows_are_one_sentence_and_export_saves_the_rest(store: Path, tm
     else:
         with pytest.raises(ForeignStoreError, match="trajectory of its trial 2 cannot be read"):
             Store.existing(store).trajectory(2, "model")
-    found = salvage(store)
+    found = recover(store)
     assert len(found.trials) >= 4
     assert found.damaged
     assert CliRunner().invoke(app, ["export", str(store), "--out", str(tmp_path / "out")]).exit_code == 0
@@ -158,7 +158,7 @@ def test_crafted_rows_are_one_sentence_and_export_saves_the_rest(store: Path, tm
 def test_a_text_that_is_not_utf_8_is_one_sentence(store: Path) -> None:
     edit(store, "UPDATE trials SET failure = CAST(x'80ff' AS TEXT) WHERE number = 4")
     assert "store" in said(store)
-    assert len(salvage(store).trials) == 4
+    assert len(recover(store).trials) == 4
 
 
 def test_a_store_of_another_spelling_is_a_store(store: Path) -> None:
@@ -217,7 +217,7 @@ def test_what_lies_beside_must_be_a_file(store: Path, tmp_path: Path, ending: st
     victim.write_text("chapter 1")
     {"pipe": lambda: os.mkfifo(beside), "link": lambda: beside.symlink_to(victim), "folder": beside.mkdir}[kind]()
     assert f"{ending} is a {kind}; move it away" in said(store)
-    assert len(salvage(store).trials) == 5
+    assert len(recover(store).trials) == 5
     assert victim.read_text() == "chapter 1"
 
 
@@ -246,7 +246,7 @@ def test_a_journal_that_names_another_file_deletes_nothing(store: Path, tmp_path
     victim.write_text("chapter 1\n")
     (tmp_path / "a.sqlite-journal").write_bytes(journal(store, names=victim))
     assert "is of several files; move it away" in said(store)
-    assert len(salvage(store).trials) == 5
+    assert len(recover(store).trials) == 5
     assert victim.exists()
 
 
@@ -254,7 +254,7 @@ def test_the_journal_of_another_database_is_one_sentence_and_export_reads_the_st
     beside = store.with_name("a.sqlite-journal")
     beside.write_bytes(journal(store, pages=3))
     before = store.read_bytes()
-    found = salvage(store)
+    found = recover(store)
     assert (len(found.trials), store.read_bytes()) == (5, before)
     assert len(found.damaged) == 1
     assert "store.sqlite" not in found.damaged[0]
@@ -275,7 +275,7 @@ def test_the_journal_of_a_process_that_died_is_played_back_on_export(store: Path
     connection.close()
     before = died.read_bytes()
     assert before != store.read_bytes()
-    found = salvage(died)
+    found = recover(died)
     assert (len(found.trials), len(found.trajectories), found.damaged) == (5, 9, [])
     assert died.read_bytes() == before
     assert len(Store.existing(died).trials()) == 5
@@ -289,10 +289,10 @@ def test_a_store_in_wal_mode_becomes_one_file_again(store: Path, tmp_path: Path)
     for ending in ("", "-wal"):
         shutil.copy(f"{store}{ending}", f"{left}{ending}")
     connection.close()
-    assert (len(salvage(left).trials), salvage(left).damaged) == (5, [])
+    assert (len(recover(left).trials), recover(left).damaged) == (5, [])
     opened = Store.existing(left)
     assert len(opened.trials()) == 5
-    assert opened._connection.execute("PRAGMA journal_mode").fetchone()[0] == "delete"
+    assert opened._database.execute("PRAGMA journal_mode").fetchone()[0] == "delete"
     assert [path.name for path in tmp_path.glob("left*")] == ["left.sqlite"]
     left.with_name("left.sqlite-wal").write_bytes(b"\x37\x7f\x06\x82" + random.Random(1).randbytes(9000))
     assert len(Store.existing(left).trials()) == 5
@@ -343,7 +343,7 @@ def test_a_tree_without_end_is_one_sentence(store: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(schema, "STEPS", 10**6)
     tree_of_itself(store)
     said(store)
-    found = salvage(store)
+    found = recover(store)
     assert len(found.trials) <= 5
     assert len(found.trajectories) == 9
 
@@ -387,7 +387,7 @@ def test_any_database_is_read_or_refused(whole: Path, statements: list[str]) -> 
         except sqlite3.Error:
             continue
     connection.close()
-    for read in (read_everything, salvage):
+    for read in (read_everything, recover):
         with suppress(CtxvalError):
             read(path)
 

@@ -49,9 +49,9 @@ def test_a_note_comes_back_bit_for_bit_and_none_as_none(tmp_path: Path) -> None:
 
 def test_a_store_without_notes_is_migrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr("ctxval.storage.store.MIGRATIONS", MIGRATIONS[:1])
+        patch.setattr("ctxval.storage.database.MIGRATIONS", MIGRATIONS[:1])
         old = Store(tmp_path / "a.sqlite")
-        old._connection.execute(
+        old._database.execute(
             "INSERT INTO trials (number, origin, state, unit_point, parameters, attempts, opened_at) "
             "VALUES (0, 'iid', 'open', '[0.5, 0.5]', '{}', 1, '')"
         )
@@ -141,8 +141,8 @@ def test_an_impossible_path_is_an_access_error(tmp_path: Path) -> None:
 def test_a_full_disk_loses_nothing_that_was_stored(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
     store.open_trial(trial(), TRAJECTORY)
-    pages = store._connection.execute("PRAGMA page_count").fetchone()[0]
-    store._connection.execute(f"PRAGMA max_page_count = {pages}")
+    pages = store._database.execute("PRAGMA page_count").fetchone()[0]
+    store._database.execute(f"PRAGMA max_page_count = {pages}")
     big = Trajectory(np.arange(5001.0), np.random.default_rng(1).normal(size=(5001, 4)), np.zeros((5000, 1)))
     with pytest.raises(StoreAccessError, match="full"):
         store.open_trial(trial(1), big)

@@ -15,7 +15,7 @@ _OWNED = "lock"
 """The file that is locked as long as the process lives that made the folder."""
 
 
-class Scratch:
+class TemporaryFolder:
     """A new folder, of this process alone to remove.
 
     Attributes:
@@ -37,9 +37,9 @@ class Scratch:
 
 
 @contextmanager
-def scratch() -> Iterator[Path]:
+def temporary_folder() -> Iterator[Path]:
     """Give a new folder, which is removed in the end."""
-    folder = Scratch()
+    folder = TemporaryFolder()
     try:
         yield folder.path
     finally:

@@ -19,7 +19,7 @@ from ctxval.cli.base import (
     worst_of,
 )
 from ctxval.errors import StoreAccessError
-from ctxval.storage.recovery import export, salvage
+from ctxval.storage.recovery import export, recover
 from ctxval.storage.store import Store
 
 _SENTENCES = 20
@@ -67,7 +67,7 @@ def export_store(
     as_json: AsJson = False,
 ) -> Any:
     """Write what is readable of a store as CSV and JSON."""
-    found = salvage(store)
+    found = recover(store)
     if found.damaged and not found.trials and not found.trajectories:
         raise StoreAccessError(f"nothing can be read in {store}: it is no store, or all of it is damaged.")
     target = store.with_suffix(".export") if folder is None else folder

@@ -15,7 +15,7 @@ from typing import Any, get_args
 from urllib.parse import quote
 
 from ctxval._util.describe import describe
-from ctxval._util.temporary import scratch
+from ctxval._util.temporary import temporary_folder
 from ctxval._util.texts import guarded, shortened, visible
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
@@ -42,7 +42,7 @@ _UNREADABLE = (sqlite3.Error, CtxvalError, ValueError, TypeError, OverflowError,
 
 
 @dataclass(eq=False)
-class Salvage:
+class Recovered:
     """What was readable.
 
     Attributes:
@@ -58,7 +58,7 @@ class Salvage:
     damaged: list[str] = field(default_factory=list)
 
 
-def salvage(path: Path) -> Salvage:
+def recover(path: Path) -> Recovered:
     """Read what is readable of a store; the file is not changed where it is damaged, or has a journal.
 
     Raises:
@@ -67,7 +67,7 @@ def salvage(path: Path) -> Salvage:
     schema.require_file(path)
     if not path.is_file():
         raise StoreAccessError(f"there is no store at {path}.")
-    found = Salvage()
+    found = Recovered()
     with _played_back(path, found) as readable:
         try:
             uri = f"file:{quote(str(readable.absolute()))}?mode=ro&immutable=1"
@@ -82,7 +82,7 @@ def salvage(path: Path) -> Salvage:
 
 
 @contextmanager
-def _played_back(path: Path, found: Salvage) -> Iterator[Path]:
+def _played_back(path: Path, found: Recovered) -> Iterator[Path]:
     """Give the file to read: the store, or a copy into which the journal of a process that died was played back."""
     journals = _left_journals(path)
     if not journals:
@@ -92,7 +92,7 @@ def _played_back(path: Path, found: Salvage) -> Iterator[Path]:
             found.damaged.append(str(error))
         yield path
         return
-    with scratch() as folder:
+    with temporary_folder() as folder:
         copy = folder / "store.sqlite"
         try:
             # In place it might destroy what is readable, should the journal be another database's.
@@ -116,7 +116,7 @@ def _left_journals(path: Path) -> dict[Path, str]:
     return {path: ""} | {journal: str(journal).removeprefix(real) for journal in journals}
 
 
-def _read(connection: sqlite3.Connection, size: int, found: Salvage) -> None:
+def _read(connection: sqlite3.Connection, size: int, found: Recovered) -> None:
     try:
         # Or SQLite refuses a file that is shorter than it says.
         connection.execute("PRAGMA writable_schema = ON")
@@ -145,7 +145,7 @@ class _Reader:
     tables: dict[str, set[str]]
     size: int
     unchecked: bool
-    found: Salvage
+    found: Recovered
 
     def pairs(self, table: str) -> Iterator[tuple[str, Any]]:
         for key, value in self.rows(table, ["key", "value"]):
@@ -230,7 +230,7 @@ def _rows(places: list[int]) -> str:
     return f"{len(places)} rows from {places[0]} to {places[-1]}"
 
 
-def export(found: Salvage, folder: Path) -> list[Path]:
+def export(found: Recovered, folder: Path) -> list[Path]:
     """Write trials.csv, trials.json and a CSV file of each trajectory.
 
     Raises:
@@ -251,7 +251,7 @@ def export(found: Salvage, folder: Path) -> list[Path]:
     return paths
 
 
-def _write_table(path: Path, found: Salvage) -> None:
+def _write_table(path: Path, found: Recovered) -> None:
     rows = [_flat(trial) for trial in found.trials.values()]
     header = list(dict.fromkeys(name for row in rows for name in row))
     with path.open("w", newline="", encoding="utf-8") as file:

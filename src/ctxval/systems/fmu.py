@@ -17,7 +17,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import require_regular_file
-from ctxval._util.temporary import Scratch
+from ctxval._util.temporary import TemporaryFolder
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
@@ -226,7 +226,7 @@ class _Process:
                 pipe.close()
 
 
-def _clean(idle: dict[int, list[_Process]], unpacked: Scratch, owner: int) -> None:
+def _clean(idle: dict[int, list[_Process]], unpacked: TemporaryFolder, owner: int) -> None:
     """End this process's own processes, and remove the files where it was this one that unpacked them."""
     for process in idle.pop(os.getpid(), []):
         process.end()
@@ -234,7 +234,7 @@ def _clean(idle: dict[int, list[_Process]], unpacked: Scratch, owner: int) -> No
         unpacked.remove()
 
 
-def _unpacked(path: Path) -> tuple[Any, Scratch]:
+def _unpacked(path: Path) -> tuple[Any, TemporaryFolder]:
     """Return the model description and a new folder with the FMU's content."""
     try:
         import fmpy
@@ -250,7 +250,7 @@ def _unpacked(path: Path) -> tuple[Any, Scratch]:
             f"{path} must be an FMU for co-simulation, FMI 2 or 3; it is of FMI {description.fmiVersion}"
             f"{'' if description.coSimulation else ' without co-simulation'}."
         )
-    folder = Scratch()
+    folder = TemporaryFolder()
     try:
         fmpy.extract(str(path), str(folder.path))
     except Exception as error:

@@ -14,7 +14,7 @@ from typing import IO
 
 import numpy as np
 
-from ctxval._util.temporary import scratch
+from ctxval._util.temporary import temporary_folder
 from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.task import Task
@@ -102,7 +102,7 @@ class Subprocess:
             self.keep.mkdir(parents=True, exist_ok=True)
             yield Path(tempfile.mkdtemp(prefix="execution-", dir=self.keep)).resolve()
             return
-        with scratch() as folder:
+        with temporary_folder() as folder:
             yield folder
 
 

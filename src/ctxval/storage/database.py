@@ -1,0 +1,187 @@
+"""The SQLite file under a store: opening it, one transaction for each change, locks, and errors in one sentence."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ctxval._util.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
+from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
+from ctxval.storage import rows, schema
+from ctxval.storage.disks import make_folder, on_network, warn_of_network
+from ctxval.storage.migrations import MIGRATIONS
+
+_APPLICATION = 0x63747876
+"""SQLite's application_id of our files, the letters "ctxv": how a file says that it is one of ours."""
+
+_WAIT = 0.02
+"""Seconds between two attempts to become the sole writer."""
+
+
+class Database:
+    """A file of SQLite with the tables of a store, of the newest version.
+
+    Attributes:
+        path: the file; None keeps the tables in memory.
+        name: what the store is called in messages.
+
+    Raises:
+        StoreAccessError: the file cannot be opened or written.
+        ForeignStoreError: the file is no store, or one of a newer version.
+    """
+
+    def __init__(self, path: str | Path | None = None) -> None:
+        # Absolute, as what is executed may change the folder of the process.
+        self.path = None if path is None else Path(path).absolute()
+        self.name = "the store in memory" if path is None else str(path)
+        self._lock: FileLock | None = None
+        self._locked = False
+        with self.translated_errors():
+            if self.path is not None:
+                make_folder(self.path.parent)
+                warn_of_network(self.path)
+                schema.require_files(self.path)
+            self._connection = sqlite3.connect(
+                self.path or ":memory:", isolation_level=None, timeout=10.0, factory=schema.Guarded
+            )
+            try:
+                self._prepare()
+            except BaseException:
+                self._connection.close()
+                raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._connection.close()
+        if self._lock is not None:
+            self._lock.close()
+
+    def execute(self, statement: str, values: tuple[Any, ...] = ()) -> sqlite3.Cursor:
+        """Execute one statement; inside :meth:`transaction` or :meth:`translated_errors`."""
+        return self._connection.execute(statement, values)
+
+    @contextmanager
+    def rows(self, statement: str) -> Iterator[sqlite3.Cursor]:
+        """Read rows one by one, because a damaged file may have no end of them."""
+        with self.translated_errors(), closing(self._connection.execute(statement)) as cursor:
+            yield cursor
+
+    @contextmanager
+    def sole_writer(self, wait: float = 0.0) -> Iterator[None]:
+        """Keep other processes from running this store; the lock goes with the process, however it ends.
+
+        Args:
+            wait: seconds to wait for another process that is about to end.
+
+        Raises:
+            StoreAccessError: another process is running it.
+        """
+        if self.path is None or self._locked:
+            yield
+            return
+        lock = self._acquired(self.path, wait)
+        self._locked = True
+        try:
+            yield
+        finally:
+            self._locked = False
+            lock.release()
+
+    def _acquired(self, path: Path, wait: float) -> FileLock:
+        until = time.monotonic() + wait
+        try:
+            lock = self._lock = self._lock or FileLock(_lockable(path))
+            while True:
+                try:
+                    lock.acquire()
+                    return lock
+                except LockedError:
+                    if time.monotonic() >= until:
+                        raise
+                time.sleep(_WAIT)
+        except LockedError as error:
+            raise StoreAccessError(f"{self.name} is being run by another process.") from error
+        except OSError as error:
+            raise StoreAccessError(f"{self.name} cannot be locked: {error.strerror or error}.") from error
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """Make all that is executed inside one transaction, on the disk at its end."""
+        with self.translated_errors():
+            self._connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+            except BaseException:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+                raise
+            self._connection.execute("COMMIT")
+
+    @contextmanager
+    def translated_errors(self) -> Iterator[None]:
+        """Turn errors of SQLite and of the file into one sentence that names the store."""
+        try:
+            yield
+        except sqlite3.IntegrityError as error:
+            raise StoreAccessError(f"{self.name} was written by another process meanwhile: {error}.") from error
+        except sqlite3.OperationalError as error:
+            raise StoreAccessError(f"{self.name} cannot be used as a store: {error}.") from error
+        except sqlite3.DatabaseError as error:
+            hint = "; `ctxval export` saves what is readable" if "malformed" in str(error) else ""
+            raise ForeignStoreError(f"{self.name} cannot be read as a store: {error}{hint}.") from error
+        except (OSError, ValueError, OverflowError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise StoreAccessError(f"{self.name} cannot be used as a store: {error}.") from error
+
+    def damaged(self, what: str) -> ForeignStoreError:
+        """Return the error of a store in which something cannot be read."""
+        return ForeignStoreError(f"{self.name} is damaged: {what}; `ctxval export` saves what is readable.")
+
+    # Opening
+
+    def _prepare(self) -> None:
+        with schema.snapshot(self._connection):
+            version = schema.version(self._connection, self.name, _APPLICATION, [sql for _, sql in MIGRATIONS])
+            page = self._connection.execute("PRAGMA page_size").fetchone()[0]
+            if self.path is not None and self.path.stat().st_size % page:
+                raise self.damaged("its end is missing")
+        if self._connection.execute("PRAGMA journal_mode").fetchone()[0] == "wal":
+            # A store is one file.
+            self._connection.execute("PRAGMA journal_mode = DELETE")
+        # FULL does not sync the folder after a journal is removed: a power cut may bring the journal back, and SQLite
+        # then takes back the last transaction.
+        self._connection.execute("PRAGMA synchronous = EXTRA")
+        for number in range(version, len(MIGRATIONS)):
+            self._migrate(number)
+
+    def _migrate(self, number: int) -> None:
+        title, script = MIGRATIONS[number]
+        with self.transaction():
+            if self._connection.execute("PRAGMA user_version").fetchone()[0] > number:
+                return  # another process was faster
+            if number == 0:
+                self._connection.execute(f"PRAGMA application_id = {_APPLICATION}")
+            for statement in script.split(";"):
+                self._connection.execute(statement)
+            if number + 1 == rows.CHECKED:
+                rows.write_checksums(self._connection)
+            self._connection.execute("INSERT INTO migrations VALUES (?, ?, ?)", (number + 1, title, now()))
+            self._connection.execute(f"PRAGMA user_version = {number + 1}")
+
+
+def _lockable(path: Path) -> Path:
+    """Return what is locked for a store: the file itself by its real name, or a file beside it where that cannot be."""
+    real = path.resolve()
+    itself = LOCKS_FILE_ITSELF and not on_network(real)
+    return real if itself else real.with_name(f"{real.name}.lock")
+
+
+def now() -> str:
+    """Return the time in UTC, as stores have it."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
