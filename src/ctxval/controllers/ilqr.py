@@ -18,10 +18,21 @@ from ctxval.core.task import Task
 from ctxval.errors import DesignError, InputError
 
 _STEP_LENGTHS = 0.5 ** np.arange(12)
+"""Step lengths of the line search, the longest first."""
 _SUFFICIENT_DECREASE = 1e-4
-_DAMPING_MIN, _DAMPING_MAX = 1e-6, 1e10
-_NEWTON_STEPS, _NEWTON_DECREASE, _NEWTON_SETTLED = 50, 0.1, 1e-26
-_ROUNDING = 1e12  # a cost that falls by less leaves the states with a relative error below 1e-10
+"""Share of the expected decrease of the cost that a step must reach."""
+_DAMPING_MIN = 1e-6
+"""Smallest damping that is not zero."""
+_DAMPING_MAX = 1e10
+"""Damping above which a task is given up: no step improves it."""
+_NEWTON_STEPS = 50
+"""Projected Newton steps at most, for inputs with limits."""
+_NEWTON_DECREASE = 0.1
+"""Share of its linear decrease that a projected Newton step must reach."""
+_NEWTON_SETTLED = 1e-26
+"""Share of the largest decrease so far at which projected Newton steps have converged."""
+_ROUNDING = 1e12
+"""The cost over the decrease that is rounding: less leaves the states with a relative error below 1e-10."""
 
 
 @dataclass(frozen=True, eq=False)

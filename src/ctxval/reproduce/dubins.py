@@ -13,7 +13,10 @@ from ctxval.reproduce.study import BLACK, TECHNIQUES, Claim, Columns, Scale, new
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_RANDOM, _ACTIVE = 500, 100
+_RANDOM = 500
+"""Executions of the passive searches."""
+_ACTIVE = 100
+"""Executions of the active searches."""
 
 
 class DubinsMedians:

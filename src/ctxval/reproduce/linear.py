@@ -24,7 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PERCENT = 5.0
-_ACTIVE, _RANDOM = 100, 20_000
+_RANDOM = 20_000
+"""Executions of the passive searches."""
+_ACTIVE = 100
+"""Executions of the active searches."""
 _STATES = tuple(range(1, 11))
 
 

@@ -30,8 +30,10 @@ _PROBED = 10_000
 _SMALLEST = 16
 """Bytes that a row takes at least."""
 
-_LOOKS, _BETWEEN = 20, 0.05
-"""How often, and after how many seconds, it is looked whether a journal has gone."""
+_JOURNAL_CHECKS = 20
+"""How often it is checked whether another process has removed its journal."""
+_CHECK_INTERVAL = 0.05
+"""Seconds between two of these checks."""
 
 _DEPTH = 100
 """Levels of what is written as JSON: more than is ever read."""
@@ -107,11 +109,11 @@ def _played_back(path: Path, found: Recovered) -> Iterator[Path]:
 
 def _left_journals(path: Path) -> dict[Path, str]:
     """Return the store and the journals beside it, with their endings; empty where there is none for long."""
-    for _ in range(_LOOKS):
+    for _ in range(_JOURNAL_CHECKS):
         journals = schema.beside(path)
         if not journals:
             return {}
-        time.sleep(_BETWEEN)  # it may be of a process that is writing
+        time.sleep(_CHECK_INTERVAL)  # it may be of a process that is writing
     real = str(path.resolve())
     return {path: ""} | {journal: str(journal).removeprefix(real) for journal in journals}
 
