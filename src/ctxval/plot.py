@@ -1,18 +1,24 @@
-"""Pictures of a campaign. Reads what is known and never executes anything."""
+"""Pictures of a campaign. Reads what is known and never executes anything.
+
+A function that draws one picture takes ``ax`` and returns the matplotlib axes that it drew into. By default these are
+new axes of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show them. A function that draws several
+panels returns a figure.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.campaign.campaign import Campaign
+from ctxval._util.representation import record
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.gp.surrogate import Surrogate
 
@@ -26,6 +32,32 @@ _RESOLUTION = 401
 _NORMAL_95 = 1.96
 
 
+class Results(Protocol):
+    """What a picture reads: a :class:`ctxval.Campaign`, or anything else that has the same results."""
+
+    @property
+    def validation(self) -> Validation:
+        """The map p -> d(p), of which only the tasks are read."""
+
+    @property
+    def trials(self) -> Sequence[Trial]:
+        """All trials in the order of asking."""
+
+    @property
+    def completed(self) -> Sequence[Trial]:
+        """The trials with a distance."""
+
+    @property
+    def worst(self) -> Trial | None:
+        """The completed trial with the largest distance."""
+
+    def surrogate(self) -> Surrogate:
+        """Return the GP of the distance."""
+
+    def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
+        """Return the trajectories of the model and of the system in a trial."""
+
+
 @dataclass(frozen=True, eq=False)
 class Curve:
     """A known distance over a one-dimensional task space: points ``(N,)`` in its units and values ``(N,)``."""
@@ -33,8 +65,86 @@ class Curve:
     points: Array
     values: Array
 
+    def __repr__(self) -> str:
+        return record(self)
 
-def surrogate(campaign: Campaign, *, truth: Curve | None = None, units: str = "") -> Figure:
+
+def overview(campaign: Results, *, units: str = "", ax: Axes | None = None) -> Axes:
+    """Draw what says most about a campaign in one picture.
+
+    That is the surrogate if there is one task parameter and two distances are known, and :func:`convergence` otherwise.
+
+    Args:
+        campaign: with at least one distance.
+        units: the distance's.
+        ax: drawn into; new ones by default.
+
+    Raises:
+        InputError: no distance is known.
+    """
+    if campaign.validation.space.dimension == 1 and len(campaign.completed) >= 2:
+        return surrogate_slice(campaign, units=units, ax=ax)
+    return convergence(campaign, units=units, ax=ax)
+
+
+def convergence(campaign: Results, *, units: str = "", ax: Axes | None = None) -> Axes:
+    """Draw the distance of each trial, the largest one so far, and which trials have none.
+
+    Args:
+        campaign: with at least one distance.
+        units: the distance's.
+        ax: drawn into; new ones by default.
+
+    Raises:
+        InputError: no distance is known.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    _worst(campaign)
+    axes = _axes(ax)
+    numbers, distances = [trial.number for trial in campaign.completed], list(map(_known, campaign.completed))
+    last = len(campaign.trials) - 1
+    so_far = np.maximum.accumulate(distances)
+    axes.step([*numbers, last], [*so_far, so_far[-1]], where="post", color=_BLUE, linewidth=1.8, label="largest so far")
+    _draw_samples(axes, campaign, lambda trial: trial.number)
+    without = [trial.number for trial in campaign.trials if trial.state in ("failed", "unmeasured")]
+    if without:
+        bottom = axes.get_xaxis_transform()
+        axes.plot(without, [0.03] * len(without), "x", color=_ORANGE, transform=bottom, label="no distance is known")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("trial")
+    axes.set_ylabel(_distance_label(units))
+    axes.legend(loc="best", fontsize=8, framealpha=0.9)
+    return axes
+
+
+def surrogate_slice(
+    campaign: Results, axis: int = 0, *, truth: Curve | None = None, units: str = "", ax: Axes | None = None
+) -> Axes:
+    """Draw the GP along one task parameter, through the worst task executed, with its 95 % band.
+
+    Args:
+        campaign: with at least two distances.
+        axis: which scalar parameter, counted from 0.
+        truth: the true distance, drawn under the GP of a one-dimensional task space.
+        units: the distance's.
+        ax: drawn into; new ones by default.
+
+    Raises:
+        InputError: fewer than two distances are known, or there is no such parameter.
+    """
+    space = campaign.validation.space
+    if not 0 <= axis < space.dimension:
+        raise InputError(f"axis must be from 0 to {space.dimension - 1}, one of {', '.join(space.names)}, got {axis}.")
+    fitted, worst = campaign.surrogate(), _worst(campaign)
+    axes = _axes(ax)
+    _draw_slice(axes, campaign, fitted, worst, axis, truth)
+    axes.set_ylabel(_distance_label(units))
+    axes.legend(loc="best", fontsize=8, framealpha=0.9)
+    return axes
+
+
+def surrogate(campaign: Results, *, truth: Curve | None = None, units: str = "") -> Figure:
     """Draw the GP over the task space with its 95 % band, the samples and the maximum (the paper's converged GP).
 
     One dimension: the whole function. More: a slice along each axis through the worst task.
@@ -55,17 +165,14 @@ def surrogate(campaign: Campaign, *, truth: Curve | None = None, units: str = ""
     figure = _figure(max(6.4, 3.2 * columns), max(4.0, 2.6 * rows))
     for axis in range(space.dimension):
         axes = figure.add_subplot(rows, columns, axis + 1)
-        _draw_slice(axes, campaign, fitted, worst, axis)
-        if truth is not None and space.dimension == 1:
-            axes.plot(truth.points, truth.values, color=_ORANGE, linestyle="--", linewidth=1.6, label="true distance")
-        axes.set_xlabel(space.labels[axis])
+        _draw_slice(axes, campaign, fitted, worst, axis, truth)
         if axis % columns == 0:
-            axes.set_ylabel(f"distance [{units}]" if units else "distance")
+            axes.set_ylabel(_distance_label(units))
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
     return figure
 
 
-def _draw_slice(axes: Axes, campaign: Campaign, fitted: Surrogate, worst: Trial, axis: int) -> None:
+def _draw_slice(axes: Axes, campaign: Results, fitted: Surrogate, worst: Trial, axis: int, truth: Curve | None) -> None:
     space = campaign.validation.space
     unit = np.tile(worst.unit_point, (_RESOLUTION, 1))
     unit[:, axis] = np.linspace(0, 1, _RESOLUTION)
@@ -75,15 +182,18 @@ def _draw_slice(axes: Axes, campaign: Campaign, fitted: Surrogate, worst: Trial,
     axes.fill_between(x, mean - band, mean + band, color=_GREY, alpha=0.6, linewidth=0, label="95 % band of the GP")
     axes.plot(x, mean, color=_BLUE, linewidth=1.8, label="GP mean")
     if space.dimension == 1:
-        _draw_samples(axes, campaign, axis)
+        _draw_samples(axes, campaign, lambda trial: space.from_unit(trial.unit_point)[axis])
     at = space.from_unit(worst.unit_point)[axis]
     axes.plot(
         [at], [_known(worst)], "*", color=_ORANGE, markeredgecolor=_BLACK, markersize=14, label="worst task executed"
     )
+    if truth is not None and space.dimension == 1:
+        axes.plot(truth.points, truth.values, color=_ORANGE, linestyle="--", linewidth=1.6, label="true distance")
+    axes.set_xlabel(space.labels[axis])
 
 
-def _draw_samples(axes: Axes, campaign: Campaign, axis: int) -> None:
-    space = campaign.validation.space
+def _draw_samples(axes: Axes, campaign: Results, place: Callable[[Trial], float]) -> None:
+    """Draw the known distances at the places of their trials, with a marker for each reason of a trial."""
     styles = (
         ("initial samples", ("iid", "initial", "manual"), "white"),
         ("covering samples", ("covering",), _GREY),
@@ -92,12 +202,11 @@ def _draw_samples(axes: Axes, campaign: Campaign, axis: int) -> None:
     for label, origins, face in styles:
         trials = [trial for trial in campaign.completed if trial.origin in origins]
         if trials:
-            x = [space.from_unit(trial.unit_point)[axis] for trial in trials]
-            y = [_known(trial) for trial in trials]
+            x, y = [place(trial) for trial in trials], [_known(trial) for trial in trials]
             axes.plot(x, y, "o", markersize=5, markerfacecolor=face, markeredgecolor=_BLACK, label=label)
 
 
-def worst_trajectories(campaign: Campaign, *, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Figure:
+def worst_trajectories(campaign: Results, *, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Figure:
     """Draw the trajectories of M and of S at the worst task executed.
 
     Args:
@@ -175,7 +284,20 @@ def _figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _worst(campaign: Campaign) -> Trial:
+def _axes(ax: Axes | None) -> Axes:
+    """Return the axes to draw into: new ones of pyplot if none are given."""
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot
+
+    return pyplot.subplots(layout="constrained")[1]
+
+
+def _distance_label(units: str) -> str:
+    return f"distance [{units}]" if units else "distance"
+
+
+def _worst(campaign: Results) -> Trial:
     if campaign.worst is None:
         raise InputError("there is nothing to draw: no distance is known yet.")
     return campaign.worst

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.representation import call
 from ctxval.core.controller import Controller, Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model, linearize
@@ -190,6 +191,9 @@ class FaultyRig:
         if fault == "wrong shape":
             return Trajectory(whole.times, whole.states[:, :1], whole.inputs)
         return whole
+
+    def __repr__(self) -> str:
+        return call(self, self.system, faults=self.faults, delay=self.delay)
 
 
 class _WithoutJacobian:

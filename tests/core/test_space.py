@@ -120,8 +120,10 @@ def test_parameters_are_read_by_name_in_one_task_and_in_a_batch(space: TaskSpace
 
 
 def test_parameters_show_their_values(space: TaskSpace) -> None:
-    assert repr(space.parameters([1, 2, 3, 4])) == "Parameters({'goal': 1.0, 'offset': [2.0, 3.0], 'mass': 4.0})"
-    assert repr(space.parameters(np.zeros((2, 4)))) == "Parameters(batch)"
+    assert repr(space.parameters([1, 2, 3, 4])) == "Parameters(goal=1 rad, offset=[2, 3] m, mass=4)"
+    assert repr(space.parameters(np.zeros((2, 4)))) == (
+        "Parameters(goal=[0, 0] rad, offset=(2, 2) all 0 m, mass=[0, 0], batch=(2,))"
+    )
 
 
 def test_an_unknown_parameter_is_refused_with_the_nearest_name(space: TaskSpace) -> None:

@@ -63,6 +63,8 @@ class _Description:
         if depth == 0:
             return type(value).__qualname__
         if isinstance(value, np.ndarray):
+            if any(is_own(type(item)) for item in (value.flat if value.dtype.hasobject else ())):
+                return self.of(value.ravel().tolist(), depth)  # our own objects show themselves rounded
             return _describe_array(value)
         if isinstance(value, Mapping):
             return {str(key): self.of(item, depth - 1) for key, item in value.items()}

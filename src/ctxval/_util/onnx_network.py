@@ -10,6 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import read_bytes
+from ctxval._util.representation import call
 from ctxval.errors import InputError, ModelError, ShapeError
 
 _TYPES: dict[str, type[np.float32] | type[np.float64]] = {"tensor(float)": np.float32, "tensor(double)": np.float64}
@@ -97,6 +98,9 @@ class OnnxNetwork:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return OnnxNetwork, (self._source,)
+
+    def __repr__(self) -> str:
+        return call(self, inputs=dict(zip(self.names, self.widths, strict=True)), outputs=self.width)
 
 
 def _contents(path: Path) -> list[bytes]:

@@ -7,11 +7,13 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ctxval._util.interrupts import Interrupts, kept_alive
 from ctxval._util.texts import text_of
+from ctxval.campaign import display
 from ctxval.campaign.ledger import Ledger, OpenTrial
 from ctxval.campaign.workers import Crew, Ended, crew
 from ctxval.certificates import RESOLUTION
@@ -21,6 +23,11 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError, ExecutionError, InputError
 from ctxval.gp.surrogate import Surrogate, fit_surrogate
+from ctxval.plot import overview
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from pandas import DataFrame
 
 __all__ = ["Campaign", "OpenTrial"]
 
@@ -292,6 +299,38 @@ class Campaign(Ledger):
             ended = self._measure(opened, trajectory, time.perf_counter() - started)
         if on_trial is not None:
             on_trial(ended)
+
+    # What a person sees
+
+    def __repr__(self) -> str:
+        return display.as_text(self)
+
+    def _repr_html_(self) -> str:
+        return display.as_html(self)
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the trials as a table of pandas, one row for each.
+
+        The columns are number, origin, state, one for each task parameter (``name[0], name[1], ...`` for a vector),
+        distance, seconds, attempts and failure. A parameter that is called like another column, such as ``distance``,
+        is in the column ``parameters.distance``. What is not known is missing.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        return display.to_dataframe(self.trials, self.validation.space)
+
+    def plot(self, *, units: str = "", ax: Axes | None = None) -> Axes:
+        """Draw the surrogate over one task parameter, or else the distances in their order; return the axes.
+
+        Args:
+            units: the distance's.
+            ax: matplotlib axes to draw into; new ones of ``matplotlib.pyplot`` by default.
+
+        Raises:
+            InputError: no distance is known.
+        """
+        return overview(self, units=units, ax=ax)
 
 
 @dataclass(frozen=True)

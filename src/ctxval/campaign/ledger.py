@@ -12,6 +12,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.describe import differences
+from ctxval._util.representation import call, lines
 from ctxval._util.texts import text_of
 from ctxval.campaign.identity import description_of, identify, with_distance
 from ctxval.campaign.independent_draws import IndependentDraws
@@ -52,6 +53,10 @@ class OpenTrial:
     def number(self) -> int:
         """The trial's number."""
         return self.trial.number
+
+    def __repr__(self) -> str:
+        parts = repr(self.plan).splitlines()[1:]
+        return lines(call(self, self.number, origin=self.trial.origin), *(part.strip() for part in parts))
 
 
 class Ledger:

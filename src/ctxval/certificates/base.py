@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.representation import Shown, call, line, lines, record, table
 from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
 from ctxval.version import VERSION
@@ -33,6 +34,9 @@ class MadeGood:
     trial: int
     by: int
     because: str | None
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +162,9 @@ class Sample:
             found.append(f"{which} failed, and trial {by} executed the same task with success; {why}")
         return tuple(found)
 
+    def __repr__(self) -> str:
+        return call(self, len(self), best=self.best, failed=self.failed, points=self.points)
+
 
 _LISTED = 5
 """Numbers of trials that a message has at most."""
@@ -275,6 +282,27 @@ class Certificate:
     def to_json(self) -> dict[str, Any]:
         """Return everything, ready for JSON."""
         return asdict(self)
+
+    def __repr__(self) -> str:
+        bound, volume = Shown(with_error(self.upper_bound, self.error)), Shown(at_most(self.volume, 3))
+        head = call(self, self.kind, upper_bound=bound, confidence=self.confidence, volume=volume, trials=self.trials)
+        withdrawn = [] if self.doubt is None else [f"withdrawn: {line(self.doubt)}"]
+        return lines(head, *withdrawn, line(self.statement), f"assumptions: {len(self.assumptions)}")
+
+    def _repr_html_(self) -> str:
+        return table(
+            f"Certificate: {self.kind}",
+            [
+                ("withdrawn", self.doubt),
+                ("statement", self.statement),
+                ("upper bound", with_error(self.upper_bound, self.error)),
+                ("confidence", Shown(f"{self.confidence:.6g}")),
+                ("volume left out", at_most(self.volume, 3)),
+                ("trials", self.trials),
+                *(("assumes", assumption) for assumption in self.assumptions),
+                ("version", self.version),
+            ],
+        )
 
 
 ERRORS = 2.0

@@ -20,6 +20,7 @@ from scipy.linalg import cho_solve, solve_triangular
 from scipy.special import ndtri, stdtr
 
 from ctxval._util.arrays import Array, Mask
+from ctxval._util.representation import record
 from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task
 from ctxval.gp.hyperposterior import Conditioned
 
@@ -51,6 +52,9 @@ class Diagnosis:
     def to_json(self) -> dict[str, Any]:
         """Return the numbers."""
         return {"surprise": self.surprise, "trial": self.trial, "left_out": self.left_out, "farthest": self.farthest}
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
 def diagnose(

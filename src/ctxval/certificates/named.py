@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from ctxval._util.representation import record
 from ctxval.certificates.base import Certificate, Sample
 from ctxval.certificates.convergence import TheoremConstants, certify_convergence
 from ctxval.certificates.covering import RESOLUTION
@@ -50,6 +51,9 @@ class Options:
     search: str | None = None
     resolution: float = RESOLUTION
     remarks: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
 def certify(sample: Sample, kind: str, confidence: float, options: Options | None = None) -> Certificate:

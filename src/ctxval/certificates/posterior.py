@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.representation import call
 from ctxval.certificates.base import (
     ERRORS,
     ONE_CAMPAIGN,
@@ -118,6 +119,9 @@ class Maxima:
     def probability(self, threshold: float) -> float:
         """Return Pr(d* <= threshold), rounded down to what so many draws can tell."""
         return float((self.draws <= threshold).sum() / (len(self.draws) + 1))
+
+    def __repr__(self) -> str:
+        return call(self, len(self.draws), draws=self.draws, points=self.points, hyperparameters=len(self.conditioned))
 
 
 def draw_maxima(

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ctxval._util.representation import call, line, lines, shown
 from ctxval.certificates import (
     RESOLUTION,
     Certificate,
@@ -63,6 +64,11 @@ class Verdict:
 
     def __str__(self) -> str:
         return f"{self.answer}: {self.reason}"
+
+    def __repr__(self) -> str:
+        found = {"witness": self.witness, "certificate": self.certificate, "expected": self.expected}
+        rows = [f"{name}: {shown(part)}" for name, part in found.items() if part is not None]
+        return lines(call(self, self.answer, threshold=self.threshold), f"reason: {line(self.reason)}", *rows)
 
 
 def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:

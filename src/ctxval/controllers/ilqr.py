@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
+from ctxval._util.representation import call, record
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
 from ctxval.core.model import Model, linearize
@@ -50,6 +51,9 @@ class ILQRSolution:
     cost: Array
     iterations: Array
     converged: Array
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
 class ILQR:
@@ -115,6 +119,11 @@ class ILQR:
             while len(rows := descent.active_rows()):
                 descent.advance(rows)
         return descent.solution(task.batch_shape)
+
+    def __repr__(self) -> str:
+        return call(
+            self, **self.cost.weights(), iterations=self.iterations, tolerance=self.tolerance, limits=self.limits
+        )
 
 
 class _Descent:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike
+from ctxval._util.representation import call
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
 from ctxval.core.model import Model, linearize
@@ -57,6 +58,9 @@ class LQR:
         """Return what identifies this synthesizer in a store."""
         return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
 
+    def __repr__(self) -> str:
+        return call(self, **self.cost.weights(), limits=self.limits)
+
 
 class StationaryLQR:
     """The infinite-horizon linear-quadratic regulator: one gain, from the algebraic Riccati equation.
@@ -104,6 +108,9 @@ class StationaryLQR:
     def describe(self) -> dict[str, Any]:
         """Return what identifies this synthesizer in a store."""
         return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
+
+    def __repr__(self) -> str:
+        return call(self, **self.cost.weights(), limits=self.limits)
 
 
 def _require_inputs(cost: QuadraticCost, B: Array) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
+from ctxval._util.representation import call, record
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import Limits, LimitsLike
 from ctxval.core.model import Model, linearize
@@ -85,6 +86,10 @@ class MPC:
             raise ShapeError(f"MPC designs for one task at a time, got a batch of shape {task.batch_shape}.")
         return RecedingHorizon(self, task, model)
 
+    def __repr__(self) -> str:
+        bounds = {"limits": self.limits, "state_limits": self.state_limits, "violation_cost": self.violation_cost}
+        return call(self, **self.cost.weights(), steps=self.steps, iterations=self.iterations, **bounds)
+
 
 @dataclass(frozen=True, eq=False)
 class RecedingHorizon:
@@ -114,6 +119,9 @@ class RecedingHorizon:
         problem = _Problem(self.settings, self.model, as_floats("the state", x), self.task.reference[rows])
         with np.errstate(all="ignore"):
             return problem.solve(t)
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
 class _Problem:

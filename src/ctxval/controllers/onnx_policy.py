@@ -11,6 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
+from ctxval._util.representation import call, record
 from ctxval.core.controller import Limits, LimitsLike, describe_limits, given_limits
 from ctxval.core.model import Model
 from ctxval.core.task import Task
@@ -66,6 +67,9 @@ class OnnxPolicy:
         fields = {name: getattr(self, name) for name in ("network", "observe", "scale")}
         return {**fields, "limits": describe_limits(self.limits)}
 
+    def __repr__(self) -> str:
+        return call(self, self.network, observe=self.observe, scale=self.scale, limits=self.limits)
+
 
 @dataclass(frozen=True, eq=False)
 class BoundOnnxPolicy:
@@ -84,3 +88,6 @@ class BoundOnnxPolicy:
         observations: Any = x if observe is None else observe(t, x, self.task)
         u = self.settings.network(np.asarray(observations, dtype=np.float64)) * self.settings.scale
         return u if limits is None else Limits.of(limits, u.shape[-1]).clip(u)
+
+    def __repr__(self) -> str:
+        return record(self)

@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_floats
+from ctxval._util.representation import call, record
 from ctxval.core.model import Model
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
@@ -100,6 +101,9 @@ class Limits:
         """Return inputs ``(..., m)`` within the limits; NaN stays NaN."""
         return np.asarray(np.clip(u, self.low, self.high))
 
+    def __repr__(self) -> str:
+        return record(self)
+
 
 LimitsLike = float | Limits | Mapping[str, ArrayLike] | ArrayLike
 """One number, ``Limits(low=, high=)``, a mapping of low and high, or rows ``(m, 2)``; see :meth:`Limits.of`."""
@@ -190,6 +194,9 @@ class AffineFeedback:
         gains = self.gains[index] if self.gains.ndim > 3 else self.gains
         return AffineFeedback(gains, self.inputs[index], self.states[index], self.limits)
 
+    def __repr__(self) -> str:
+        return call(self, gains=self.gains, inputs=self.inputs, limits=self.limits)
+
 
 class Policy:
     """The same policy for every task: ``policy(t, x, task) -> u``, as a synthesizer.
@@ -223,6 +230,9 @@ class Policy:
         """Return what identifies this synthesizer in a store."""
         return {"policy": self.policy, **({} if self.limits is None else {"limits": describe_limits(self.limits)})}
 
+    def __repr__(self) -> str:
+        return call(self, self.policy, vectorized=self.batched, limits=self.limits)
+
 
 @dataclass(frozen=True, eq=False)
 class _BoundPolicy:
@@ -235,3 +245,6 @@ class _BoundPolicy:
     def __call__(self, t: int, x: Array) -> Array:
         u = np.asarray(self.policy(t, x, self.task), dtype=np.float64)
         return u if self.limits is None else Limits.of(self.limits, u.shape[-1]).clip(u)
+
+    def __repr__(self) -> str:
+        return record(self)

@@ -17,6 +17,7 @@ import numpy as np
 from ctxval._util.arrays import Array, as_finite, as_floats
 from ctxval._util.files import read_bytes, read_json
 from ctxval._util.npz import Archive
+from ctxval._util.representation import record
 from ctxval.core.controller import AffineFeedback, Limits
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
@@ -50,6 +51,9 @@ class ControllerFile:
     dt: float
     states: dict[str, str]
     inputs: dict[str, str]
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
 def write_controller(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from ctxval._util.representation import call, lines
 from ctxval.core.truth import Truth
 from ctxval.core.validation import Validation
 
@@ -42,6 +43,11 @@ class Experiment:
             _named(self.states, getattr(system, "states", None), "x", states),
             _named(self.inputs, getattr(system, "inputs", None), "u", inputs),
         )
+
+    def __repr__(self) -> str:
+        known = {"threshold": self.threshold, "units": self.units or None, "truth": self.truth}
+        head = call(self, self.name, self.validation.space, budget=self.budget, **known)
+        return lines(head, *(part.strip() for part in repr(self.validation).splitlines()[1:]))
 
 
 def _named(labels: tuple[str, ...], own: object, letter: str, count: int) -> dict[str, str]:

@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.representation import call
 from ctxval.errors import InputError, ModelError
 
 Step = Callable[[Array, Array], Array]
@@ -48,6 +49,9 @@ class Function:
         inputs = np.broadcast_to(u, (*batch, u.shape[-1])).reshape(-1, u.shape[-1])
         rows = [np.asarray(self.function(xi, ui), dtype=np.float64) for xi, ui in zip(states, inputs, strict=True)]
         return np.stack(rows).reshape(*batch, -1)
+
+    def __repr__(self) -> str:
+        return call(self, self.function, vectorized=self.vectorized)
 
 
 def as_model(model: Model | Step) -> Model:

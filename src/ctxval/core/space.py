@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats, require_shape
+from ctxval._util.representation import call, named
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 
 Point = float | list[float]
@@ -38,9 +39,10 @@ class Parameters:
         return self.points[..., columns]
 
     def __repr__(self) -> str:
-        return (
-            f"Parameters({self._space.describe_point(self.points)})" if self.points.ndim == 1 else "Parameters(batch)"
-        )
+        if self.points.ndim == 1:
+            return call(self, named(self._space.describe_point(self.points), self._space.units))
+        by_name = {name: self[name] for name in self._space.units}
+        return call(self, named(by_name, self._space.units), batch=self.points.shape[:-1])
 
 
 class TaskSpace:
@@ -99,10 +101,8 @@ class TaskSpace:
         return tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, units, strict=True))
 
     def __repr__(self) -> str:
-        inside = ", ".join(
-            f"{name}=({low:g}, {high:g})" for name, low, high in zip(self.names, self.low, self.high, strict=True)
-        )
-        return f"TaskSpace({inside})"
+        bounds = {name: (self.low[at], self.high[at]) for name, at in self._columns.items()}
+        return call(self, named({name: (*ends, *filter(None, [self._units[name]])) for name, ends in bounds.items()}))
 
     def describe(self) -> dict[str, list[float | str]]:
         """Return ``{scalar name: [low, high]}``, and the unit if it has one: what identifies this space in a store."""

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, as_floats
+from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
 
 
@@ -85,10 +86,12 @@ class Task:
         }
 
     def __repr__(self) -> str:
-        return (
-            f"Task(batch={self.batch_shape}, states={self.initial_state.shape[-1]}, "
-            f"horizon={self.horizon}, dt={self.dt:g})"
-        )
+        if self.batch_shape:
+            sizes = {"batch": self.batch_shape, "states": self.initial_state.shape[-1]}
+            return call(self, **sizes, horizon=self.horizon, dt=self.dt)
+        constant = bool((self.reference == self.goal).all())
+        aim = {"goal": self.goal} if constant else {"reference": self.reference}
+        return call(self, initial_state=self.initial_state, **aim, horizon=self.horizon, dt=self.dt)
 
 
 def _components(name: str, value: Any) -> Array:

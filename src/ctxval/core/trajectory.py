@@ -15,6 +15,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask, as_floats
 from ctxval._util.files import MOST_BYTES, csv_rows, read_bytes
 from ctxval._util.npz import Archive
+from ctxval._util.representation import Shown, call, counted, number
 from ctxval._util.texts import guarded, unguarded, visible
 from ctxval.errors import InputError, ShapeError
 
@@ -56,6 +57,9 @@ class Transitions:
             np.concatenate([part.u for part in parts]),
             np.concatenate([part.x_next for part in parts]),
         )
+
+    def __repr__(self) -> str:
+        return call(self, len(self), x=self.x, u=self.u, x_next=self.x_next)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,6 +237,10 @@ class Trajectory:
         slack = 1e-6 * (wanted[1] - wanted[0])
         held = np.clip(np.searchsorted(own, wanted[:-1] + slack, side="right") - 1, 0, self.horizon - 1)
         return Trajectory(wanted, states, self.inputs[held], self.ended)
+
+    def __repr__(self) -> str:
+        length = Shown(f"{counted(self.horizon, 'step')} in {number(self.times[-1] - self.times[0])} s")
+        return call(self, length, self.ended, states=self.states, inputs=self.inputs)
 
 
 _TIMES = 0.01

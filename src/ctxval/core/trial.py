@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ctxval._util.arrays import Array
+from ctxval._util.representation import call, line, lines, record, table
 from ctxval.core.space import Point
 
 Origin = Literal["iid", "initial", "acquisition", "covering", "manual"]
@@ -52,6 +53,27 @@ class Trial:
     note: dict[str, Any] | None = None
     because: str | None = None
 
+    def __repr__(self) -> str:
+        ended = {"distance": self.distance, "seconds": self.seconds, "attempts": self.attempts}
+        head = call(self, self.number, origin=self.origin, state=self.state, **ended, parameters=self.parameters)
+        texts = {"failure": self.failure, "because": self.because}
+        return lines(head, *(f"{name}: {line(text)}" for name, text in texts.items() if text is not None))
+
+    def _repr_html_(self) -> str:
+        return table(
+            f"Trial {self.number}",
+            [
+                ("origin", self.origin),
+                ("state", self.state),
+                ("distance", self.distance),
+                ("failure", self.failure),
+                ("seconds", self.seconds),
+                ("attempts", self.attempts),
+                ("because", self.because),
+                *self.parameters.items(),
+            ],
+        )
+
 
 @dataclass(frozen=True)
 class Change:
@@ -68,3 +90,6 @@ class Change:
     why: str
     content: dict[str, Any]
     at: str = ""
+
+    def __repr__(self) -> str:
+        return record(self)

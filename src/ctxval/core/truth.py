@@ -19,6 +19,7 @@ from scipy.optimize import Bounds, differential_evolution, minimize
 
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, rounded
+from ctxval._util.representation import call, line, lines
 from ctxval.core.space import Parameters
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
@@ -37,6 +38,11 @@ class Truth:
     distance: float
     parameters: Parameters
     method: str
+
+    def __repr__(self) -> str:
+        return lines(
+            call(self, distance=self.distance), f"parameters: {self.parameters}", f"method: {line(self.method)}"
+        )
 
 
 def grid_truth(validation: Validation, per_axis: int = 2001, refinements: int = 6) -> Truth:

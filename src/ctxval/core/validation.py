@@ -11,6 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats, require_shape
 from ctxval._util.describe import describe
 from ctxval._util.interrupts import raised_by_signal
+from ctxval._util.representation import call, lines, shown
 from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, Synthesizer
 from ctxval.core.distance import Distance
@@ -53,6 +54,10 @@ class Plan:
     controller: Controller
     model_trajectory: Trajectory
 
+    def __repr__(self) -> str:
+        fields = ("parameters", "task", "controller", "model_trajectory")
+        return lines(type(self).__name__, *(f"{name}: {shown(getattr(self, name))}" for name in fields))
+
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
@@ -67,6 +72,15 @@ class Outcome:
     plan: Plan
     system_trajectory: Trajectory
     distance: float
+
+    def __repr__(self) -> str:
+        known = {
+            "parameters": self.plan.parameters,
+            "task": self.plan.task,
+            "model_trajectory": self.plan.model_trajectory,
+            "system_trajectory": self.system_trajectory,
+        }
+        return lines(call(self, distance=self.distance), *(f"{name}: {shown(part)}" for name, part in known.items()))
 
 
 class Validation:
@@ -315,6 +329,15 @@ class Validation:
     def _refuse_distance(self, value: Array, point: Array) -> NoReturn:
         where = self.space.describe_point(point)
         raise DistanceError(f"the distance must be one finite number >= 0, got {value} for the task {where}.")
+
+    def __repr__(self) -> str:
+        return lines(
+            call(self, self.space),
+            f"system: {shown(self.system)}",
+            f"model: {shown(self.model)}",
+            f"synthesizer: {shown(self.synthesizer)}",
+            f"distance: {shown(self.distance)}, task: {shown(self.task)}",
+        )
 
 
 def _require_task(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> None:

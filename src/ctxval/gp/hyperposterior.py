@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
 from ctxval._util.arrays import Array, ArrayLike, Rows
+from ctxval._util.representation import call, record
 from ctxval.errors import InputError
 from ctxval.gp.kernels import Matern
 
@@ -134,6 +135,9 @@ class Hyperparameters:
     def _theta(self) -> Array:
         return np.concatenate([[0.0], self.log_scales])
 
+    def __repr__(self) -> str:
+        return record(self)
+
 
 @dataclass(frozen=True, eq=False)
 class Conditioned:
@@ -158,6 +162,9 @@ class Conditioned:
     mean_variance: float
     scale2: float
     log_likelihood: float
+
+    def __repr__(self) -> str:
+        return call(self, self.hyperparameters, values=self.y, mean=self.mean, scale2=self.scale2)
 
 
 def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: Warp | None = None) -> Conditioned:

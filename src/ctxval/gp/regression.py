@@ -12,6 +12,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array
+from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
 from ctxval.gp.kernels import Kernel
 
@@ -90,6 +91,9 @@ class GaussianProcess:
     def log_marginal_likelihood(self) -> float:
         """Return log p(y | X, theta)."""
         return _log_likelihood(self.L, self.alpha, self.y - self.mean(self.X))
+
+    def __repr__(self) -> str:
+        return call(self, self.kernel, points=len(self.X), dimension=self.X.shape[1], noise=self.noise)
 
 
 def _mean_gradient(mean: Mean, X: Array) -> Array:

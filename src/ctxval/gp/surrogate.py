@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
+from ctxval._util.representation import record
 from ctxval.errors import InputError
 from ctxval.gp import regression as gp
 from ctxval.gp.hyperposterior import Warp
@@ -44,6 +45,9 @@ class Surrogate:
         """Return posterior mean and standard deviation at unit-cube points ``(m, d)``, shapes ``(m,)``."""
         mean, variance = self.process.predict(points)
         return self.shift + self.scale * mean, self.scale * np.sqrt(variance)
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
 def fit_surrogate(
@@ -127,6 +131,9 @@ class Learned:
         known = np.isfinite(values)
         process = gp.condition(_KERNEL, self.theta, points[known], self.standardised(values[known]))
         return _with_believed(process, points[~known])
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
 def learn(points: Array, values: Array) -> Learned:

@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.representation import call
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.gp import kernels
@@ -143,6 +144,9 @@ class Residual:
         kept = ~np.isin(of, list(sources))
         return replace(self, centres=centres[kept], outputs=outputs[kept], sources=of[kept], spare=None)
 
+    def __repr__(self) -> str:
+        return call(self, centres=self.centres, outputs=self.outputs, noise=self.noise)
+
 
 def _parts(theta: Array) -> tuple[float, Array, float, float]:
     """Return Matern variance, length-scales, and the linear kernel's constant and slope variances."""
@@ -268,6 +272,9 @@ class CorrectedModel:
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         return self.model.step(x, u) + self.residual(x, u)
+
+    def __repr__(self) -> str:
+        return call(self, self.model, self.residual)
 
 
 def learn_corrected(model: Model, transitions: Transitions, sources: Rows, centres: int) -> CorrectedModel | None:

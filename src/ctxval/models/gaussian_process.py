@@ -10,6 +10,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.representation import call, record
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.gp.regression import log_likelihood_of_outputs
@@ -42,6 +43,9 @@ class SquaredExponential:
         exponent -= 0.5 * (b**2).sum(axis=1)
         np.minimum(exponent, 0.0, out=exponent)  # rounding may leave a point at a distance from itself
         return np.asarray(self.variance * np.exp(exponent, out=exponent))
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
 class GaussianProcessModel:
@@ -157,6 +161,12 @@ class GaussianProcessModel:
             "length_scales": self.covariance.length_scales,
             "step_at_mean": self.step(*self.scaling.mean_pair),
         }
+
+    def __repr__(self) -> str:
+        states = self.weights.shape[1]
+        sizes = {"states": states, "inputs": self.centres.shape[1] - states, "points": len(self.centres)}
+        learned = None if self.data is None else len(self.data)
+        return call(self, self.covariance, **sizes, transitions=learned)
 
 
 def _most_likely(Z: Array, Y: Array, iterations: int) -> tuple[SquaredExponential, float]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.representation import call
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
@@ -72,6 +73,10 @@ class Linear:
     def describe(self) -> dict[str, Any]:
         """Return what identifies this model in a store."""
         return {"A": self.A.tolist(), "B": self.B.tolist(), "c": self.c.tolist()}
+
+    def __repr__(self) -> str:
+        learned = None if self.data is None else len(self.data)
+        return call(self, states=len(self.A), inputs=self.B.shape[1], transitions=learned)
 
 
 def _require_identifiable(regressors: Array, n: int, m: int) -> None:

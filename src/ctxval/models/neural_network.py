@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.representation import call
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.scaling import IncrementScaling
@@ -117,6 +118,11 @@ class FeedforwardReLU:
             "norms": [np.linalg.norm(weight) for weight in self.weights],
             "step_at_mean": self.step(*self.scaling.mean_pair),
         }
+
+    def __repr__(self) -> str:
+        states, hidden = len(self.scaling.shift_out), tuple(bias.size for bias in self.biases[:-1])
+        sizes = {"states": states, "inputs": len(self.scaling.shift_in) - states, "hidden": hidden}
+        return call(self, **sizes, transitions=None if self.data is None else len(self.data))
 
 
 def _trained(data: Transitions, scaling: IncrementScaling, hidden: tuple[int, ...], seed: int, iterations: int) -> Any:

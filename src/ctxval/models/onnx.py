@@ -9,6 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
+from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
 
 
@@ -74,6 +75,9 @@ class Onnx:
         if len(self.network.widths) == 2:
             return x, u
         return (np.concatenate(_paired(x, u), axis=-1),)
+
+    def __repr__(self) -> str:
+        return call(self, self.network, increments=self.increments)
 
 
 def _paired(x: Array, u: Array) -> tuple[Array, Array]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.representation import record
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 
@@ -61,6 +62,9 @@ class IncrementScaling:
         whole = self.scale_out[:, None] * gradient / self.scale_in
         whole[..., :n] += np.eye(n)
         return whole[..., :n], whole[..., n:]
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
 def standardised_pairs(x: Array, u: Array, shift: Array, scale: Array) -> Array:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.representation import call, name_of
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
@@ -80,3 +81,8 @@ class ScikitLearn:
             "increments": self.increments,
             "predictions": np.asarray(self.regressor.predict(probes), dtype=np.float64),
         }
+
+    def __repr__(self) -> str:
+        learned = None if self.data is None else len(self.data)
+        regressor = name_of(type(self.regressor))
+        return call(self, regressor, features=self.features, increments=self.increments, transitions=learned)

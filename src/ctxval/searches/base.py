@@ -10,6 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Rows, as_floats
+from ctxval._util.representation import call, options, record
 from ctxval.errors import InputError, ShapeError
 
 Note = dict[str, Any]
@@ -34,6 +35,9 @@ class Prediction:
     left_out: Callable[[Rows], Array]
     budget: int
     otherwise: Callable[[], Prediction | None] | None = None
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
 @runtime_checkable
@@ -170,6 +174,13 @@ class SequentialSearch(ABC):
     def notes(self) -> tuple[Note | None, ...]:
         """What was thought when each was chosen; None where nothing was, or the point was told by hand."""
         return tuple(self._notes)
+
+    def __repr__(self) -> str:
+        if not hasattr(self, "_points"):
+            return call(self, **options(self))
+        known = self.values[np.isfinite(self.values)]
+        largest = float(known.max()) if known.size else None
+        return call(self, **options(self), dimension=self.dimension, points=len(self._points), largest=largest)
 
 
 def best_first(points: Array, values: Array) -> Array:

@@ -9,9 +9,10 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Literal
 
+from ctxval._util.representation import Shown, call
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Change, Trial
-from ctxval.errors import ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
+from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
 from ctxval.storage import rows, schema
 from ctxval.storage.database import Database, now
 from ctxval.storage.rows import (
@@ -324,3 +325,11 @@ class Store:
             "INSERT INTO trajectories (trial, side, npz, checksum) VALUES (?, ?, ?, ?)",
             (number, side, npz, checksum_of((number, side, npz))),
         )
+
+    def __repr__(self) -> str:
+        place = Shown("in memory") if self.path is None else self.path
+        try:
+            trials, waiting, _ = self.signature()
+        except CtxvalError:
+            return call(self, place, Shown("cannot be read"))
+        return call(self, place, trials=trials, open=waiting)

@@ -17,6 +17,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import require_regular_file
+from ctxval._util.representation import call, options
 from ctxval._util.temporary import TemporaryFolder
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
@@ -155,6 +156,9 @@ class FMU:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._open()
+
+    def __repr__(self) -> str:
+        return call(self, self.path.name, **{key: value for key, value in options(self).items() if key != "path"})
 
 
 class _CrashError(ExecutionError):

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ctxval._util.arrays import as_floats
+from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -49,3 +50,6 @@ class Function:
                 f"the system's function must return a Trajectory, or states (H + 1, n) and inputs (H, m) with "
                 f"H = {task.horizon}: {error}"
             ) from error
+
+    def __repr__(self) -> str:
+        return call(self, self.function, batched=self.batched)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, as_floats
+from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -155,6 +156,9 @@ class Gymnasium:
     def __getstate__(self) -> dict[str, Any]:
         # Environments do not go to other processes; they are made there again.
         return {**vars(self), "_idle": []}
+
+    def __repr__(self) -> str:
+        return call(self, self.environment, **self.options, inputs=self.inputs, dt=self.dt, seed=self.seed)
 
 
 def _is_relative_file(value: object) -> bool:

@@ -7,6 +7,7 @@ from typing import NoReturn
 
 import numpy as np
 
+from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.errors import ExecutionError, InputError
@@ -46,3 +47,6 @@ class Manual:
             "a manual system is executed by people: take tasks with campaign.ask() and report what happened with "
             "campaign.tell(), instead of campaign.run()."
         )
+
+    def __repr__(self) -> str:
+        return call(self, states=self.states, inputs=self.inputs, dt=self.dt)

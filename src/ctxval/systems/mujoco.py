@@ -11,6 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
 from ctxval._util.files import read_bytes
+from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
@@ -140,6 +141,10 @@ class MuJoCo:
         sites, axes = self._coordinates
         positions = simulations.site_positions[:, sites, axes]
         return np.concatenate([simulations.qpos, simulations.qvel, positions.reshape(len(positions), -1)], axis=1)
+
+    def __repr__(self) -> str:
+        sizes = {name: int(getattr(self._model, name)) for name in ("nq", "nv", "nu")}
+        return call(self, **sizes, dt=self.dt, substeps=self.substeps, sites=self.sites or None, threads=self.threads)
 
 
 class _Execution:

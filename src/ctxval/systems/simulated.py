@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.model import Function, Model, Step
 from ctxval.core.rollout import rollout
@@ -25,3 +26,6 @@ class Simulated:
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Run the closed loop from the task's initial state over its horizon."""
         return rollout(self.model.step, controller, task)
+
+    def __repr__(self) -> str:
+        return call(self, self.model)

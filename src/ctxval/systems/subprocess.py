@@ -14,6 +14,7 @@ from typing import IO
 
 import numpy as np
 
+from ctxval._util.representation import call
 from ctxval._util.temporary import temporary_folder
 from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
@@ -104,6 +105,10 @@ class Subprocess:
             return
         with temporary_folder() as folder:
             yield folder
+
+    def __repr__(self) -> str:
+        names = {"states": self.states, "inputs": self.inputs}
+        return call(self, shlex.join(self.command), timeout=self.timeout, **names, keep=self.keep)
 
 
 def _located(command: Sequence[str], folder: Path) -> list[str]:

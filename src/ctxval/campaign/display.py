@@ -1,0 +1,86 @@
+"""What a person sees of a campaign: a few lines, a table in a notebook, a table of pandas."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from ctxval._util.representation import Shown, call, counted, lines, named, number, shown, table
+from ctxval.core.space import TaskSpace
+from ctxval.core.trial import Trial
+from ctxval.errors import InputError
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from ctxval.campaign.campaign import Campaign
+
+_BEFORE, _AFTER = ("number", "origin", "state"), ("distance", "seconds", "attempts", "failure")
+
+
+def as_text(campaign: Campaign) -> str:
+    """Return a campaign in five lines: what is searched, by which search, how far it is, the worst task, the store."""
+    return lines(
+        call(campaign, campaign.validation.space, name=campaign.name or None, seed=campaign.seed),
+        f"search: {shown(campaign.search)}",
+        f"trials: {_trials(campaign)}",
+        f"worst: {_worst(campaign)}",
+        f"store: {shown(campaign.store)}",
+    )
+
+
+def as_html(campaign: Campaign) -> str:
+    """Return a campaign as an HTML table with the worst task, parameter by parameter."""
+    worst, units = campaign.worst, campaign.validation.space.units
+    parameters = {} if worst is None else worst.parameters
+    return table(
+        f"Campaign {campaign.name}",
+        [
+            ("search", shown(campaign.search)),
+            ("seed", campaign.seed),
+            ("trials", _trials(campaign)),
+            ("worst trial", "no distance is known" if worst is None else worst.number),
+            ("distance", None if worst is None else worst.distance),
+            *((name, f"{shown(value)} {units.get(name, '')}") for name, value in parameters.items()),
+            ("store", shown(campaign.store)),
+        ],
+    )
+
+
+def _trials(campaign: Campaign) -> Shown:
+    states = Counter(trial.state for trial in campaign.trials)
+    counts = [counted(campaign.executions, "execution"), *(f"{count} {state}" for state, count in states.items())]
+    return Shown(f"{len(campaign.trials)} ({', '.join(counts)})")
+
+
+def _worst(campaign: Campaign) -> str:
+    worst = campaign.worst
+    if worst is None or worst.distance is None:
+        return "no distance is known"
+    at = named(worst.parameters, campaign.validation.space.units)
+    return f"trial {worst.number} with distance {number(worst.distance)} at {at}"
+
+
+def to_dataframe(trials: Sequence[Trial], space: TaskSpace) -> DataFrame:
+    """Return one row for each trial: number, origin, state, the task parameters, distance, seconds, attempts, failure.
+
+    A vector parameter has one column for each component, ``name[0], name[1], ...``. A parameter that is called like
+    another column, such as ``distance``, is in the column ``parameters.distance``. What is not known is missing.
+
+    Raises:
+        InputError: pandas is not installed.
+    """
+    try:
+        from pandas import DataFrame
+    except ImportError as error:
+        raise InputError("a table of trials needs pandas, which is not installed: pip install pandas.") from error
+    columns: dict[str, list[Any]] = {name: [getattr(trial, name) for trial in trials] for name in _BEFORE}
+    points = [space.from_unit(trial.unit_point).tolist() for trial in trials]
+    for axis, name in enumerate(space.names):
+        own = f"parameters.{name}" if name in (*_BEFORE, *_AFTER) else name
+        columns[own] = [point[axis] for point in points]
+    columns |= {name: [getattr(trial, name) for trial in trials] for name in _AFTER}
+    frame = DataFrame(columns)
+    numbers = dict.fromkeys(("distance", "seconds", *list(columns)[len(_BEFORE) : -len(_AFTER)]), "float64")
+    return frame.astype({"number": "int64", "attempts": "int64", **numbers})
