@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from conftest import make_validation
-from ctxval import Campaign, TaskSpace, Validation, controllers, distances, models, plot, systems
+from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, plot, systems, testing
 from ctxval.errors import InputError
 
 
@@ -44,17 +46,7 @@ def test_the_trajectories_are_those_of_the_worst_task(campaign: Campaign) -> Non
 
 
 def test_more_dimensions_are_shown_as_slices() -> None:
-    from ctxval import Task
-
-    plane = Validation(
-        space=TaskSpace(x=(-1, 1, "m"), y=(-1, 1, "m")),
-        task=lambda p: Task([p.x, p.y], horizon=5, dt=0.1),
-        system=systems.Simulated(models.Linear(0.9 * np.eye(2), np.eye(2))),
-        model=models.Linear(0.8 * np.eye(2), np.eye(2)),
-        synthesizer=controllers.LQR([1, 1], [1, 1]),
-        distance=distances.FinalState(norm=1),
-    )
-    figure = plot.surrogate(Campaign(plane).run(8))
+    figure = plot.surrogate(Campaign(make_plane()).run(8))
     assert [axes.get_xlabel() for axes in figure.axes] == ["x [m]", "y [m]"]
 
 
@@ -71,3 +63,64 @@ def test_a_picture_that_cannot_be_written_or_drawn_is_an_input_error(campaign: C
         plot.save(plot.surrogate(campaign), tmp_path / "a.nonsense")
     with pytest.raises(InputError, match="nothing to draw"):
         plot.worst_trajectories(Campaign(make_validation()))
+
+
+def make_plane() -> Validation:
+    return Validation(
+        space=TaskSpace(x=(-1, 1, "m"), y=(-1, 1, "m")),
+        task=lambda p: Task([p.x, p.y], horizon=5, dt=0.1),
+        system=testing.FaultyRig(systems.Simulated(models.Linear(0.9 * np.eye(2), np.eye(2))), {2: "raise"}),
+        model=models.Linear(0.8 * np.eye(2), np.eye(2)),
+        synthesizer=controllers.LQR([1, 1], [1, 1]),
+        distance=distances.FinalState(norm=1),
+    )
+
+
+@pytest.fixture
+def ax() -> Axes:
+    return Figure().add_subplot()
+
+
+def test_one_slice_of_the_surrogate_is_drawn_into_given_axes(campaign: Campaign, ax: Axes) -> None:
+    assert plot.surrogate_slice(campaign, units="rad", ax=ax) is ax
+    assert ax.get_xlabel() == "goal [rad]"
+    assert ax.get_ylabel() == "distance [rad]"
+    whole = plot.surrogate(campaign).axes[0]
+    means = [next(line for line in axes.lines if line.get_label() == "GP mean").get_ydata() for axes in (ax, whole)]
+    np.testing.assert_array_equal(*means)
+    with pytest.raises(InputError, match="axis must be from 0 to 0, one of goal, got 1"):
+        plot.surrogate_slice(campaign, 1, ax=ax)
+
+
+def test_the_convergence_shows_each_distance_the_largest_so_far_and_what_failed(ax: Axes) -> None:
+    campaign = Campaign(make_plane(), seed=1).run(7)
+    assert plot.convergence(campaign, units="m", ax=ax) is ax
+    lines = {line.get_label(): line for line in ax.lines}
+    so_far = lines["largest so far"].get_ydata()
+    assert (np.diff(so_far) >= 0).all()
+    assert campaign.worst is not None
+    assert so_far[-1] == campaign.worst.distance
+    assert list(lines["no distance is known"].get_xdata()) == [2]
+    drawn = [*lines["initial samples"].get_xdata(), *lines["acquired samples"].get_xdata()]
+    assert drawn == [trial.number for trial in campaign.completed]
+    assert ax.get_ylabel() == "distance [m]"
+
+
+def test_a_campaign_draws_its_surrogate_or_its_convergence(campaign: Campaign, ax: Axes) -> None:
+    assert campaign.plot(ax=ax, units="rad") is ax
+    assert ax.get_xlabel() == "goal [rad]"
+    other = Figure().add_subplot()
+    assert Campaign(make_plane(), seed=1).run(2).plot(ax=other) is other
+    assert other.get_xlabel() == "trial"
+    with pytest.raises(InputError, match="nothing to draw"):
+        Campaign(make_validation()).plot(ax=ax)
+
+
+def test_new_axes_are_those_of_pyplot(campaign: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    from matplotlib import pyplot
+
+    axes = campaign.plot()
+    assert pyplot.get_fignums()
+    assert axes is pyplot.gca()
+    pyplot.close(axes.figure)

@@ -136,7 +136,8 @@ def number(value: Any) -> str:
         whole = int(value)
         return str(whole) if whole.bit_length() <= 64 else f"{'-' * (whole < 0)}2**{whole.bit_length() - 1}..."
     try:
-        return f"{value:.4g}"
+        text = f"{value:.4g}"
+        return "0" if text == "-0" else text
     except (TypeError, ValueError):
         return cut(str(value), _VALUE)
 
@@ -146,7 +147,7 @@ def array(values: Array) -> Shown:
     if values.ndim == 0:
         return Shown(shown(values.item()))
     if values.ndim == 1 and values.size <= _ITEMS and values.dtype.kind in "biuf":
-        return Shown(f"[{', '.join(map(number, values.tolist()))}]")
+        return Shown(f"[{', '.join(map(shown, values.tolist()))}]")
     return Shown(f"{values.shape}{within(values)}")
 
 
@@ -219,7 +220,10 @@ def _rest(count: int) -> list[str]:
 
 
 def _object(value: Any) -> str:
-    """Return what an object says of itself in one line; the name of its class if that is nothing readable."""
+    """Return what an object says of itself in one line; the name of its class if that is nothing readable.
+
+    Of our own objects that is their first line.
+    """
     kind: Any = type(value)
     name = name_of(kind)
     if kind.__repr__ is object.__repr__:
@@ -228,7 +232,10 @@ def _object(value: Any) -> str:
         text = plain(repr(value))
     except Exception:
         return name
-    return name if _UNREADABLE.search(text) else cut(line(text, 4 * _VALUE), 2 * _VALUE)
+    if _UNREADABLE.search(text):
+        return name
+    own = str(kind.__module__).partition(".")[0] == __name__.partition(".")[0]
+    return cut(line(text.partition("\n")[0] if own else text, 4 * _VALUE), 2 * _VALUE)
 
 
 # HTML

@@ -1,0 +1,590 @@
+"""What a person sees at a prompt and in a notebook: short, informative, and safe whatever the content."""
+
+from __future__ import annotations
+
+import functools
+import html.parser
+import importlib
+import inspect
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ctxval
+from conftest import make_validation
+from ctxval import (
+    Campaign,
+    Experiment,
+    Store,
+    Task,
+    TaskSpace,
+    Trajectory,
+    Transitions,
+    Trial,
+    Truth,
+    Verdict,
+    certificates,
+    controllers,
+    distances,
+    models,
+    plot,
+    searches,
+    systems,
+    testing,
+)
+from ctxval._util import representation
+from ctxval._util.describe import describe
+from ctxval._util.representation import LINES, LONGEST, shown
+from ctxval.certificates import Certificate, Sample
+from ctxval.core.trial import Change
+from ctxval.errors import InputError
+
+PACKAGES = ("", ".searches", ".systems", ".models", ".controllers", ".distances", ".certificates", ".testing")
+
+DATA = Transitions(np.linspace(-1, 1, 80).reshape(40, 2) ** 3, np.linspace(-5, 5, 40)[:, None] ** 2, np.zeros((40, 2)))
+LINEAR = models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]], data=DATA)
+TASK = Task([1.0, 0.0], goal=[0.5, 0.0], horizon=25, dt=0.02)
+BATCH = Task([np.zeros(3), 0.0], horizon=25, dt=0.02)
+SPACE = TaskSpace(goal=(-3.0, np.pi, "rad"), offset=([0, 0], [1, 2], "m"), mass=(1, 2))
+TRAJECTORY = Trajectory(TASK.times, np.linspace(-1, 2, 52).reshape(26, 2), np.zeros((25, 1)))
+FAILED = Trial(3, "initial", "failed", np.array([0.5]), {"goal": 0.25}, 2, True, failure="the motor cut out")
+CERTIFICATE = Certificate("audit", "99 % of the tasks have at most 0.30004.", 0.30004, 0.95, 0.01, 300, ("a", "b"))
+
+
+def policy(t: int, x: Any, task: Task) -> Any:
+    return -x[..., :1]
+
+
+def no_execution(controller: Any, task: Task) -> Any:
+    raise RuntimeError("there is no robot here")
+
+
+@functools.cache
+def campaign() -> Campaign:
+    return Campaign(make_validation(), seed=1, name="pendulum").run(7)
+
+
+@functools.cache
+def sample() -> Sample:
+    return Sample.of(campaign().trials)
+
+
+def network() -> bytes:
+    """Return ``xu -> xu W`` as ONNX, from three numbers to two."""
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    double, helper = onnx.TensorProto.DOUBLE, onnx.helper
+    graph = helper.make_graph(
+        [helper.make_node("MatMul", ["xu", "W"], ["y"])],
+        "network",
+        [helper.make_tensor_value_info("xu", double, ["N", 3])],
+        [helper.make_tensor_value_info("y", double, ["N", 2])],
+        [onnx.numpy_helper.from_array(np.ones((3, 2)), "W")],
+    )
+    content: bytes = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8
+    ).SerializeToString()
+    return content
+
+
+def fmu() -> systems.FMU:
+    """Return an FMU of which only the settings are there."""
+    made = object.__new__(systems.FMU)
+    made.path, made.states, made.inputs = Path("/somewhere/cart.fmu"), ["position", "speed"], ["force"]
+    made.start, made.parameters, made.step = {"position": "x0"}, {"mass": 2.0}, 0.01
+    return made
+
+
+def gymnasium() -> systems.Gymnasium:
+    pytest.importorskip("gymnasium")
+    pytest.importorskip("mujoco")
+    return systems.Gymnasium("InvertedPendulum-v5", max_episode_steps=-1)
+
+
+def mujoco() -> systems.MuJoCo:
+    pytest.importorskip("mujoco")
+    body = '<body><joint name="hinge" axis="0 1 0"/><geom size="0.1"/></body>'
+    motor = '<actuator><motor joint="hinge"/></actuator>'
+    return systems.MuJoCo(f"<mujoco><worldbody>{body}</worldbody>{motor}</mujoco>", substeps=5)
+
+
+def mpc() -> controllers.MPC:
+    pytest.importorskip("casadi")
+    return controllers.MPC([1, 1], [1], steps=10, limits=5.0)
+
+
+def scikit_learn() -> models.ScikitLearn:
+    linear_model = pytest.importorskip("sklearn.linear_model")
+    return models.ScikitLearn.fit(linear_model.LinearRegression(), DATA)
+
+
+def gaussian_process() -> models.GaussianProcessModel:
+    covariance = models.SquaredExponential(2.0, np.array([0.5, 1.5, 3.0]))
+    return models.GaussianProcessModel(covariance, np.zeros((4, 3)), np.zeros((4, 2)), models.IncrementScaling.of(DATA))
+
+
+def neural_network() -> models.FeedforwardReLU:
+    scaling = models.IncrementScaling.of(DATA)
+    return models.FeedforwardReLU([np.ones((3, 8)), np.ones((8, 2))], [np.ones(8), np.ones(2)], scaling)
+
+
+def diagnosis() -> certificates.Diagnosis:
+    return certificates.Diagnosis(0.5, 4, 1.1, 0.2, None)
+
+
+EXAMPLES: dict[str, Callable[[], object]] = {
+    "Campaign": campaign,
+    "Experiment": lambda: Experiment("pendulum", make_validation(), threshold=0.5, units="rad"),
+    "OpenTrial": lambda: Campaign(make_validation()).ask({"goal": 0.5}),
+    "Outcome": lambda: make_validation().outcome([0.5]),
+    "Parameters": lambda: SPACE.parameters([1, 2, 3, 4]),
+    "Plan": lambda: make_validation().plan([0.5]),
+    "Store": lambda: campaign().store,
+    "Task": lambda: TASK,
+    "TaskSpace": lambda: SPACE,
+    "Trajectory": lambda: TRAJECTORY,
+    "Transitions": lambda: DATA,
+    "Trial": lambda: FAILED,
+    "Truth": lambda: Truth(0.321, SPACE.parameters([1, 2, 3, 4]), "dense grid of 2,001 points, refined 6 times"),
+    "Validation": make_validation,
+    "Verdict": lambda: Verdict("falsified", 0.5, "trial 3 was executed.", FAILED, CERTIFICATE),
+    "searches.Annealing": searches.Annealing,
+    "searches.Auto": searches.Auto,
+    "searches.CMAES": searches.CMAES,
+    "searches.Climbs": searches.Climbs,
+    "searches.GPUCB": searches.GPUCB,
+    "searches.Prediction": lambda: searches.Prediction(lambda points: (points, points), lambda rows: rows, 150),
+    "searches.Random": searches.Random,
+    "searches.Repeated": lambda: searches.Repeated(searches.Random(), 3),
+    "searches.SamplingDiscarding": searches.SamplingDiscarding,
+    "searches.Scalar": searches.Scalar,
+    "systems.FMU": fmu,
+    "systems.Function": lambda: systems.Function(no_execution),
+    "systems.Gymnasium": gymnasium,
+    "systems.Manual": lambda: systems.Manual(states={"angle": "rad"}, inputs={"torque": "N m"}, dt=0.02),
+    "systems.MuJoCo": mujoco,
+    "systems.Simulated": lambda: systems.Simulated(LINEAR),
+    "systems.Subprocess": lambda: systems.Subprocess([sys.executable, "a b.py"], timeout=2.0),
+    "models.FeedforwardReLU": neural_network,
+    "models.Function": lambda: models.Function(lambda x, u: x),
+    "models.GaussianProcessModel": gaussian_process,
+    "models.IncrementScaling": lambda: models.IncrementScaling.of(DATA),
+    "models.Linear": lambda: LINEAR,
+    "models.Onnx": lambda: models.Onnx(network()),
+    "models.ScikitLearn": scikit_learn,
+    "models.SquaredExponential": lambda: models.SquaredExponential(2.0, np.arange(1.0, 9.0)),
+    "controllers.AffineFeedback": lambda: controllers.LQR([1, 1], [1], limits=2.0).design(TASK, LINEAR),
+    "controllers.BoundOnnxPolicy": lambda: controllers.OnnxPolicy(network()).design(TASK, LINEAR),
+    "controllers.ControllerFile": lambda: controllers.ControllerFile(
+        controllers.LQR([1, 1], [1]).design(TASK, LINEAR), 0.02, {"x0": "m", "x1": "m/s"}, {"u0": "N"}
+    ),
+    "controllers.ILQR": lambda: controllers.ILQR([1, 1], [1]),
+    "controllers.ILQRSolution": lambda: controllers.ILQR([1, 1], [1]).solve(BATCH, LINEAR),
+    "controllers.LQR": lambda: controllers.LQR([1, 0.1], [0.01], limits=controllers.Limits([-1], [2])),
+    "controllers.Limits": lambda: controllers.Limits(-np.inf, [1.0, 2.0]),
+    "controllers.MPC": mpc,
+    "controllers.OnnxPolicy": lambda: controllers.OnnxPolicy(network(), scale=5.0),
+    "controllers.Policy": lambda: controllers.Policy(policy, limits=2.0),
+    "controllers.RecedingHorizon": lambda: mpc().design(TASK, LINEAR),
+    "controllers.StationaryLQR": lambda: controllers.StationaryLQR([[2, 1], [1, 2]], [1]),
+    "distances.FinalState": distances.FinalState,
+    "distances.GoalError": distances.GoalError,
+    "distances.MeanDeviation": distances.MeanDeviation,
+    "distances.WholeTrajectory": distances.WholeTrajectory,
+    "certificates.Certificate": lambda: CERTIFICATE,
+    "certificates.Diagnosis": diagnosis,
+    "certificates.Forecast": lambda: certificates.Forecast(12, 0.75, 0.25),
+    "certificates.MadeGood": lambda: certificates.MadeGood(3, 7, "fuse replaced"),
+    "certificates.Maxima": lambda: certificates.draw_maxima(sample(), draws=12, paths=4),
+    "certificates.Options": certificates.Options,
+    "certificates.Sample": sample,
+    "certificates.TheoremConstants": lambda: certificates.TheoremConstants(1.0, 0.01, 1.0, 1.0, 1.0),
+    "testing.FaultyRig": lambda: testing.FaultyRig(systems.Simulated(LINEAR), {3: "raise"}),
+}
+
+INSIDE: dict[str, Callable[[], object]] = {
+    "a surrogate": lambda: campaign().surrogate(),
+    "a search that was told values": lambda: campaign().search,
+    "a bound policy": lambda: controllers.Policy(policy).design(TASK, LINEAR),
+    "a change of a store": lambda: Change("accepted", "same code", {"differences": ["model"], "trials": 3}),
+    "hyperparameters": lambda: certificates.draw_maxima(sample(), draws=12, paths=4).conditioned[0],
+    "a curve": lambda: plot.Curve(np.linspace(0, 1, 100), np.linspace(0, 1, 100)),
+    "an ONNX network": lambda: models.Onnx(network()).network,
+    "the weights of LQR": lambda: controllers.LQR([1, 1], [1]).cost,
+}
+
+
+def public_classes() -> Iterator[tuple[str, type]]:
+    """Yield the classes that users make or are given, without protocols, exceptions and abstract bases."""
+    for package in PACKAGES:
+        module = importlib.import_module(f"ctxval{package}")
+        for name in getattr(module, "__all__", [name for name in vars(module) if name[0] != "_"]):
+            found = getattr(module, name)
+            own = inspect.isclass(found) and (hasattr(module, "__all__") or found.__module__ == module.__name__)
+            if own and not (getattr(found, "_is_protocol", False) or inspect.isabstract(found)):
+                yield f"{package}.{name}".lstrip("."), found
+
+
+CLASSES = dict(public_classes())
+
+
+def require_readable(text: str) -> None:
+    """Check what holds for every object, whatever is in it."""
+    assert len(text.splitlines()) <= LINES
+    assert len(text) <= LONGEST
+    assert " at 0x" not in text
+    assert "array(" not in text
+    assert text.replace("\n", "").isprintable()
+
+
+def test_every_public_class_has_an_example() -> None:
+    assert sorted(CLASSES) == sorted(EXAMPLES)
+
+
+@pytest.mark.parametrize("name", sorted(EXAMPLES))
+def test_public_objects_show_themselves_in_a_few_lines(name: str) -> None:
+    found = EXAMPLES[name]()
+    assert type(found) is CLASSES[name]
+    assert repr(found).startswith(name.rpartition(".")[2])
+    require_readable(repr(found))
+
+
+@pytest.mark.parametrize("name", sorted(INSIDE))
+def test_what_is_inside_them_does_so_too(name: str) -> None:
+    found = INSIDE[name]()
+    assert repr(found).startswith(type(found).__name__)
+    require_readable(repr(found))
+
+
+EXACT = {
+    "Parameters": "Parameters(goal=1 rad, offset=[2, 3] m, mass=4)",
+    "Store": "Store(in memory, trials=7, open=0)",
+    "Task": "Task(initial_state=[1, 0], goal=[0.5, 0], horizon=25, dt=0.02)",
+    "TaskSpace": "TaskSpace(goal=(-3, 3.142, 'rad'), offset=([0, 0], [1, 2], 'm'), mass=(1, 2))",
+    "Trajectory": "Trajectory(25 steps in 0.5 s, 'complete', states=(26, 2) in [-1, 2], inputs=(25, 1) all 0)",
+    "Transitions": "Transitions(40, x=(40, 2) in [-1, 1], u=(40, 1) in [0.01644, 25], x_next=(40, 2) all 0)",
+    "Trial": "Trial(3, origin='initial', state='failed', attempts=2, parameters={'goal': 0.25})\n"
+    "  failure: the motor cut out",
+    "searches.Annealing": "Annealing(temperature=0.1, cooling=0.98, move=0.2, restart=0.05)",
+    "searches.Repeated": "Repeated(search=Random(), times=3)",
+    "systems.FMU": "FMU('cart.fmu', states=['position', 'speed'], inputs=['force'], start={'position': 'x0'}, "
+    "parameters={'mass': 2}, step=0.01)",
+    "systems.Simulated": "Simulated(Linear(states=2, inputs=1, transitions=40))",
+    "models.FeedforwardReLU": "FeedforwardReLU(states=2, inputs=1, hidden=(8,))",
+    "models.GaussianProcessModel": "GaussianProcessModel(SquaredExponential(variance=2, length_scales=[0.5, 1.5, 3]), "
+    "states=2, inputs=1, points=4)",
+    "controllers.AffineFeedback": "AffineFeedback(gains=(25, 1, 2) in [-1.595, 0], inputs=(25, 1) in [0, 0.4234], "
+    "limits=Limits(low=[-2], high=[2]))",
+    "controllers.LQR": "LQR(Q=diag(1, 0.1), R=diag(0.01), limits=Limits(low=[-1], high=[2]))",
+    "controllers.Policy": "Policy(policy, vectorized=True, limits=2)",
+    "certificates.Certificate": "Certificate('audit', upper_bound=0.3001, confidence=0.95, volume=0.01, trials=300)\n"
+    "  99 % of the tasks have at most 0.30004.\n"
+    "  assumptions: 2",
+    "Verdict": "Verdict('falsified', threshold=0.5)\n"
+    "  reason: trial 3 was executed.\n"
+    "  witness: Trial(3, origin='initial', state='failed', attempts=2, parameters={'goal': 0.25})\n"
+    "  certificate: Certificate('audit', upper_bound=0.3001, confidence=0.95, volume=0.01, trials=300)",
+}
+
+
+@pytest.mark.parametrize("name", sorted(EXACT))
+def test_what_is_shown_says_what_matters(name: str) -> None:
+    assert repr(EXAMPLES[name]()) == EXACT[name]
+
+
+def test_a_validation_shows_its_parts() -> None:
+    assert repr(make_validation()).splitlines() == [
+        "Validation(TaskSpace(goal=(-3, 3, 'rad')))",
+        "  system: Simulated(Function(rk4.<locals>.step, vectorized=True))",
+        "  model: Linear(states=2, inputs=1, transitions=400)",
+        "  synthesizer: LQR(Q=diag(1, 0.1), R=diag(0.01), Q_final=diag(10, 1))",
+        "  distance: FinalState(norm=1, components=None), task: make_validation.<locals>.<lambda>",
+    ]
+
+
+def test_a_campaign_shows_how_far_it_is() -> None:
+    worst = campaign().worst
+    assert worst is not None
+    head, search, trials, largest, store = repr(campaign()).splitlines()
+    assert head == "Campaign(TaskSpace(goal=(-3, 3, 'rad')), name='pendulum', seed=1)"
+    assert search.startswith("  search: GPUCB(beta=2, initial=5, kernel=Matern(")
+    assert trials == "  trials: 7 (7 executions, 7 completed)"
+    assert largest == f"  worst: trial {worst.number} with distance {worst.distance:.4g} at goal={_goal(worst):.4g} rad"
+    assert store == "  store: Store(in memory, trials=7, open=0)"
+
+
+def _goal(trial: Trial) -> float:
+    goal = trial.parameters["goal"]
+    assert isinstance(goal, float)
+    return goal
+
+
+def test_a_campaign_without_trials_says_so() -> None:
+    fresh = Campaign(make_validation())
+    assert repr(fresh).splitlines()[2:4] == ["  trials: 0 (0 executions)", "  worst: no distance is known"]
+    assert "no distance is known" in fresh._repr_html_()
+
+
+def test_a_search_shows_what_it_was_told() -> None:
+    search = searches.Random()
+    assert repr(search) == "Random()"
+    search.reset(2, 0)
+    assert repr(search) == "Random(dimension=2, points=0)"
+    search.tell([[0.1, 0.2], [0.3, 0.4]], [1.23456, np.nan])
+    assert repr(search) == "Random(dimension=2, points=2, largest=1.235)"
+
+
+def test_a_store_that_is_closed_says_that_it_cannot_be_read(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    assert repr(store).endswith("a.sqlite', trials=0, open=0)")
+    store.close()
+    assert repr(store).endswith("a.sqlite', cannot be read)")
+
+
+def test_arrays_that_are_not_finite_say_so() -> None:
+    broken = Trajectory(TASK.times, np.full((26, 2), np.nan), np.r_[np.nan, np.arange(24.0)][:, None], "fell over")
+    assert repr(broken) == (
+        "Trajectory(25 steps in 0.5 s, 'fell over', states=(26, 2), not finite, "
+        "inputs=(25, 1) in [0, 23], partly not finite)"
+    )
+
+
+# Hostile content
+
+HOSTILE = "<img src=x onerror=alert(1)>\x1b[31m\u202e\r\n\t'\"&" + "A" * 1_000_000
+
+
+class Endless:
+    def __repr__(self) -> str:
+        return "\x1b]0;" + "B" * 1_000_000
+
+
+class Broken:
+    def __repr__(self) -> str:
+        raise RuntimeError("no")
+
+
+class Addressed:
+    """Shown as Python shows it by default, with its address."""
+
+    def execute(self, controller: Any, task: Task) -> Trajectory:
+        raise NotImplementedError
+
+
+def hostile_certificate() -> Certificate:
+    return Certificate(HOSTILE, HOSTILE, 1.0, 0.95, 0.0, 3, (HOSTILE,) * 100, {HOSTILE: HOSTILE}, HOSTILE)
+
+
+def hostile_trial() -> Trial:
+    at = {HOSTILE: 0.5, **{f"p{i}": [0.1] * 1000 for i in range(1000)}}
+    texts: dict[str, Any] = {"failure": HOSTILE, "note": {HOSTILE: HOSTILE}, "because": HOSTILE}
+    return Trial(3, "initial", "failed", np.zeros(1), at, **texts)
+
+
+def hostile_validation() -> ctxval.Validation:
+    space = TaskSpace(**{HOSTILE: (0, 1, HOSTILE)}, wide=([0] * 1000, [1] * 1000, HOSTILE))
+    search = functools.partial(policy, task=None)
+    return ctxval.Validation(
+        space=space,
+        task=lambda p: TASK,
+        system=Addressed(),
+        model=LINEAR,
+        synthesizer=controllers.Policy(search),
+        distance=distances.FinalState(components=tuple(range(10_000))),
+    )
+
+
+ATTACKS: dict[str, Callable[[], object]] = {
+    "trial": hostile_trial,
+    "change": lambda: Change("accepted", HOSTILE, {HOSTILE: [HOSTILE] * 1000}),
+    "certificate": hostile_certificate,
+    "verdict": lambda: Verdict("falsified", 1.0, HOSTILE, hostile_trial(), hostile_certificate(), rests_on=HOSTILE),
+    "validation": hostile_validation,
+    "experiment": lambda: Experiment(HOSTILE, hostile_validation(), units=HOSTILE),
+    "campaign": lambda: Campaign(hostile_validation(), name=HOSTILE),
+    "many parameters": lambda: TaskSpace(**{f"parameter_{i}": (0, 1, "rad") for i in range(10_000)}),
+    "trajectory": lambda: Trajectory(TASK.times, np.zeros((26, 2)), np.zeros((25, 1)), HOSTILE),
+    "truth": lambda: Truth(1.0, SPACE.parameters([1, 2, 3, 4]), HOSTILE),
+    "made good": lambda: certificates.MadeGood(1, 2, HOSTILE),
+    "options": lambda: certificates.Options(remarks=(HOSTILE,) * 1000),
+    "diagnosis": lambda: certificates.Diagnosis(0.0, 1, 1.0, 1.0, HOSTILE),
+    "manual": lambda: systems.Manual(states={HOSTILE: HOSTILE}, inputs={}, dt=1.0),
+    "command": lambda: systems.Subprocess([sys.executable, HOSTILE], timeout=1.0),
+    "policy": lambda: controllers.Policy(Endless()),  # type: ignore[arg-type]
+    "model": lambda: models.Function(type(HOSTILE, (), {"__call__": policy})()),
+    "class": lambda: type(HOSTILE, (searches.Random,), {})(),
+}
+
+
+@pytest.mark.parametrize("name", sorted(ATTACKS))
+def test_hostile_content_is_shortened_and_made_visible(name: str) -> None:
+    require_readable(repr(ATTACKS[name]()))
+
+
+def test_values_of_other_people_are_shown_by_name_if_they_say_nothing_readable() -> None:
+    assert shown(Broken()) == "Broken"
+    assert shown(Addressed()) == "Addressed"
+    assert shown([np.arange(3), lambda: None]).endswith("<lambda>]")
+    assert shown(Endless()).startswith("\\x1b]0;BBB")
+    assert len(shown(Endless())) < 200
+
+
+def test_collections_are_shown_by_their_first_items() -> None:
+    endless: list[Any] = []
+    endless.append(endless)
+    assert shown(endless) == "[[[list of 1]]]"
+    assert shown(list(range(1000))) == "[0, 1, 2, 3, 4, 5, ... 994 more]"
+    assert shown({"a": (1.23456, None), "b": "c"}) == "{'a': (1.235, None), 'b': 'c'}"
+    assert shown((1,)) == "(1,)"
+    assert shown(b"abc") == "3 bytes"
+    assert shown(functools.partial(policy, 1)) == "partial(policy)"
+    assert shown(10**5000) == "2**16609..."
+    assert shown(np.float64(2.0)) == "2"
+    assert shown(np.array(["a"])) == "(1,)"
+    assert shown(np.array([True, False])) == "[True, False]"
+
+
+def test_what_identifies_an_object_in_a_store_does_not_depend_on_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [name for name in EXAMPLES if name not in ("Campaign", "Store", "OpenTrial")]
+    objects = {name: EXAMPLES[name]() for name in names}
+    objects["in an array"] = np.array([controllers.Limits(-1, 1.00001), {"a": LINEAR}], dtype=object)
+    before = {name: json.dumps(describe(found)) for name, found in objects.items()}
+
+    def refuse(self: object) -> str:
+        raise AssertionError("a description asked what an object shows")
+
+    for cls in CLASSES.values():
+        monkeypatch.setattr(cls, "__repr__", refuse)
+    assert {name: json.dumps(describe(found)) for name, found in objects.items()} == before
+    assert "1.00001" in before["in an array"]
+
+
+# HTML
+
+
+class _Reader(html.parser.HTMLParser):
+    """What a browser would find."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.attributes: set[str] = set()
+        self.texts: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.attributes |= {name for name, _ in attrs}
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+
+def test_a_trial_is_a_table_in_a_notebook() -> None:
+    texts = _Reader(FAILED._repr_html_()).texts
+    cells = dict(zip(texts[1::2], texts[2::2], strict=True))
+    assert texts[0] == "Trial 3"
+    assert cells == {
+        "origin": "initial",
+        "state": "failed",
+        "failure": "the motor cut out",
+        "attempts": "2",
+        "goal": "0.25",
+    }
+
+
+def test_a_certificate_is_a_table_with_its_bound_rounded_up_and_all_it_assumes() -> None:
+    texts = _Reader(CERTIFICATE._repr_html_()).texts
+    assert texts[:3] == ["Certificate: audit", "statement", CERTIFICATE.statement]
+    assert texts[3:7] == ["upper bound", "0.3001", "confidence", "0.95"]
+    assert [texts[i + 1] for i, text in enumerate(texts) if text == "assumes"] == ["a", "b"]
+
+
+def test_a_campaign_is_a_table_with_its_worst_task() -> None:
+    worst = campaign().worst
+    assert worst is not None
+    texts = _Reader(campaign()._repr_html_()).texts
+    cells = dict(zip(texts[1::2], texts[2::2], strict=True))
+    assert texts[0] == "Campaign pendulum"
+    assert cells["worst trial"] == str(worst.number)
+    assert cells["distance"] == f"{worst.distance:.4g}"
+    assert cells["goal"] == f"{_goal(worst):.4g} rad"
+
+
+@pytest.mark.parametrize("name", ["trial", "certificate", "campaign"])
+def test_hostile_content_is_escaped_in_a_notebook(name: str) -> None:
+    text = ATTACKS[name]()._repr_html_()  # type: ignore[attr-defined]
+    read = _Reader(text)
+    assert read.tags == {"table", "caption", "tbody", "tr", "th", "td"}
+    assert read.attributes == {"style", "scope"}
+    assert text.isprintable()
+    assert "&lt;img src=x onerror=alert(1)&gt;\\x1b[31m\\u202e" in text
+    assert len(text) < 100_000
+
+
+def test_a_table_sets_no_colours() -> None:
+    text = representation.table("a", [("b", 1)])
+    assert "#" not in text
+    assert "rgb" not in text
+    assert "background:transparent" in text
+    assert "color:inherit" in text
+
+
+# Tables of pandas
+
+
+def test_trials_become_a_table_of_pandas() -> None:
+    pytest.importorskip("pandas", reason="pandas is not installed")
+    plane = ctxval.Validation(
+        space=TaskSpace(goal=(-1.0, 1.0, "rad"), distance=([0, 0], [1, 1], "m")),
+        task=lambda p: Task([p.goal, 0.0], horizon=5, dt=0.1),
+        system=testing.FaultyRig(systems.Simulated(LINEAR), {1: "raise"}),
+        model=models.Linear(LINEAR.A, 0.9 * LINEAR.B),
+        synthesizer=controllers.LQR([1, 1], [1]),
+        distance=distances.FinalState(),
+    )
+    run = Campaign(plane, search=searches.Random()).run(3)
+    run.ask({"goal": 0.25, "distance": [0.5, 1.0]})
+    frame = run.to_dataframe()
+    assert list(frame.columns[:6]) == ["number", "origin", "state", "goal", "distance[0]", "distance[1]"]
+    assert list(frame.columns[6:]) == ["distance", "seconds", "attempts", "failure"]
+    assert list(frame["number"]) == [0, 1, 2, 3]
+    assert list(frame["state"]) == ["completed", "failed", "completed", "open"]
+    assert list(frame["distance"].isna()) == [False, True, False, True]
+    assert frame["distance"].max() == run.worst.distance  # type: ignore[union-attr]
+    assert frame.loc[3, ["goal", "distance[0]", "distance[1]"]].tolist() == [0.25, 0.5, 1.0]
+    assert frame.loc[1, "failure"] == "RuntimeError: the motor cut out"
+    assert frame["failure"].isna().tolist() == [True, False, True, True]
+
+
+def test_a_table_without_trials_has_its_columns_and_parameters_keep_apart() -> None:
+    pytest.importorskip("pandas", reason="pandas is not installed")
+    from ctxval.campaign.display import to_dataframe
+
+    frame = to_dataframe([], TaskSpace(distance=(0, 1), goal=(0, 1)))
+    assert list(frame.columns)[3:6] == ["parameters.distance", "goal", "distance"]
+    assert frame.shape == (0, 9)
+    assert frame["goal"].dtype == np.float64
+
+
+def test_a_missing_pandas_is_an_input_error_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match=r"^a table of trials needs pandas.*: pip install pandas\.$"):
+        campaign().to_dataframe()
+
+
+def test_showing_objects_loads_neither_pandas_nor_matplotlib() -> None:
+    code = (
+        "import sys, ctxval; from ctxval import cases; "
+        "campaign = ctxval.Campaign(cases.by_name('pendulum').validation); "
+        "repr(campaign), campaign._repr_html_(); print({'pandas', 'matplotlib'} & set(sys.modules))"
+    )
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.strip() == "set()"
