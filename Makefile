@@ -84,4 +84,4 @@ clean:
 	touch $@
 
 reproduce: .venv/.test  ## the paper's experiments in full; writes docs/reproduction.md, and resumes
-	$(BIN)/ctxval reproduce all --out docs/reproduction
+	$(BIN)/ctxval reproduce all --out docs/reproduction --results benchmarks/results/reproduce

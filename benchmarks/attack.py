@@ -3,7 +3,7 @@
 ``python benchmarks/attack.py --inputs 20400`` makes each input from its family, its number and the seed alone, and runs
 its command line in a process of its own, bounded in time, memory and files. None may end with a traceback, hang, take
 much memory, run code, write elsewhere, or send the terminal what steers it. The counts go to
-benchmarks/results/attack.json, from which it goes on; `benchmarks/reliability.py` makes the page. What went wrong is
+benchmarks/results/attack.jsonl, from which it goes on; `benchmarks/reliability.py` makes the page. What went wrong is
 printed; ``python benchmarks/attack.py --repeat FAMILY NUMBER --keep FOLDER`` repeats it.
 """
 
@@ -32,11 +32,13 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
+from ctxval._util.json_lines import JsonLines  # noqa: E402
 from hostile import archives, arguments, experiments, stores  # noqa: E402
 from hostile.cage import Case, Outcome, carry_out  # noqa: E402
 from hostile.values import Rng, pick  # noqa: E402
 
-RESULTS = ROOT / "benchmarks" / "results" / "attack.json"
+RESULTS = ROOT / "benchmarks" / "results" / "attack.jsonl"
+KEY = ("family",)
 CHUNK = 40
 """Inputs that are counted together."""
 
@@ -314,7 +316,7 @@ def attack(
     done: dict[str, Any],
     apart: int = 200,
     only: list[str] | None = None,
-    on_chunk: Callable[[dict[str, Any], list[dict[str, Any]]], None] = lambda counts, found: None,
+    on_chunk: Callable[[str, dict[str, int], list[dict[str, Any]]], None] = lambda family, counts, found: None,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Inflict inputs; return counts of each family, and what went wrong."""
     counts = {name: Counter(kept) for name, kept in done.items()}
@@ -327,7 +329,7 @@ def attack(
                 kept[key] = max(kept[key], new.pop(key, 0))
             kept.update(new)
             wrong += found
-            on_chunk({key: dict(sorted(value.items())) for key, value in counts.items()}, found)
+            on_chunk(name, dict(sorted(kept.items())), found)
     return {key: dict(sorted(value.items())) for key, value in counts.items()}, wrong
 
 
@@ -369,11 +371,11 @@ def main() -> None:
             _warm()
             print(inflict(given.repeat[0], int(given.repeat[1]), given.seed, base, given.keep))
             return
-        kept = json.loads(given.results.read_text()) if given.results.exists() and not given.anew else {}
-        done = kept["families"] if kept.get("seed") == given.seed else {}
+        stored = JsonLines(given.results, KEY)
+        done = {} if given.anew else {record["family"]: record["counts"] for record in stored.select(seed=given.seed)}
 
-        def on_chunk(counts: dict[str, Any], found: list[dict[str, Any]]) -> None:
-            given.results.write_text(json.dumps({"seed": given.seed, "families": counts}, indent=1) + "\n")
+        def on_chunk(family: str, counts: dict[str, int], found: list[dict[str, Any]]) -> None:
+            stored.append({"family": family, "seed": given.seed, "counts": counts})
             for one in found:
                 print(one["family"], one["number"], *one["wrong"], one["said"][-300:].replace("\n", " | "), flush=True)
                 if given.findings:

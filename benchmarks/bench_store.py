@@ -6,7 +6,6 @@ Beside the seconds stands the load of the machine: with more processes than core
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -29,6 +28,7 @@ from ctxval import (
     searches,
     systems,
 )
+from ctxval._util.json_lines import JsonLines
 
 TRIALS = 10_000
 SEARCHES = ("random", "gp-ucb", "scalar")
@@ -132,9 +132,10 @@ def main() -> None:
         results[f"scalar alone, {count} values in 20-D"] = suggestions_alone(count, 20)
     slow = [f"{what}: {step}" for what, steps in results.items() for step, taken in steps.items() if taken > MOST]
     results["machine"] = {"cores": os.cpu_count() or 1, "load": round(os.getloadavg()[0], 1)}
-    text = json.dumps(results, indent=1)
-    print(text)
-    (Path(__file__).parent / "results" / "store.json").write_text(text + "\n")
+    stored = JsonLines(Path(__file__).parent / "results" / "store.jsonl", ("what",))
+    for what, measured in results.items():
+        print(what, measured)
+        stored.append({"what": what, **measured})
     if slow:
         raise SystemExit(f"more than {MOST:g} s: {'; '.join(slow)}")
 

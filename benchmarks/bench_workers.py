@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, searches
+from ctxval._util.json_lines import JsonLines
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 
@@ -47,10 +47,10 @@ def pace(workers: int, seconds: float) -> float:
     return ROUNDS * workers / (time.perf_counter() - started)
 
 
-def measure(seconds: float = 1.0) -> dict[str, float]:
+def measure(seconds: float = 1.0) -> dict[int, float]:
     """Return the speed-up over one worker, as a share of the number of workers."""
     alone = pace(1, seconds)
-    return {str(workers): pace(workers, seconds) / alone / workers for workers in WORKERS}
+    return {workers: pace(workers, seconds) / alone / workers for workers in WORKERS}
 
 
 if __name__ == "__main__":
@@ -59,7 +59,8 @@ if __name__ == "__main__":
     shares = measure(parser.parse_args().seconds)
     for workers, share in shares.items():
         print(f"{workers} workers: {share:.3f} of ideal")
-    results = Path(__file__).parent / "results" / "workers.json"
-    results.write_text(json.dumps({"share_of_ideal": shares}, indent=1) + "\n")
+    results = JsonLines(Path(__file__).parent / "results" / "workers.jsonl", ("workers",))
+    for workers, share in shares.items():
+        results.append({"workers": workers, "share_of_ideal": share})
     if min(shares.values()) < 0.9:
         raise SystemExit("below 0.9 of ideal")

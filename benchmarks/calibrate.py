@@ -1,6 +1,6 @@
 """Do the bounds hold as often as they say? Thousands of seeded campaigns on functions whose maximum is known.
 
-``python benchmarks/calibrate.py`` runs what is not stored yet, and writes ``docs/calibration.md`` with its pictures.
+``python benchmarks/calibrate.py`` runs what is not stored yet; ``calibration_page.py`` writes ``docs/calibration.md``.
 Each campaign is GP-UCB, as the paper has it, on a function of the unit cube; the posterior bound is drawn at a few
 sizes of its history. The paper's own systems are taken from the stored runs of ``ctxval reproduce``.
 """
@@ -8,7 +8,6 @@ sizes of its history. The paper's own systems are taken from the stored runs of 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from scipy.optimize import minimize
 
 from ctxval import cases
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import Sample, certify_posterior, draw_maxima
 from ctxval.errors import CertificateError
 from ctxval.gp.hyperposterior import Prior
@@ -28,8 +28,9 @@ from ctxval.reproduce.jobs import Job, Results
 from ctxval.searches import GPUCB
 
 ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "docs" / "calibration"
-STORED = ROOT / "docs" / "reproduction" / "results-full"
+RESULTS = ROOT / "benchmarks" / "results"
+REPRODUCED = RESULTS / "reproduce"
+"""The runs that ``make reproduce`` stores."""
 
 CONFIDENCES = (0.9, 0.95, 0.99)
 DRAWS, PATHS = 64, 4
@@ -186,7 +187,7 @@ SYSTEMS: dict[str, System] = {
 
 def stored_history(system: System, seed: int) -> tuple[Array, Array, float]:
     """Return points of the unit cube, distances and d* of a stored campaign."""
-    results = Results(STORED)
+    results = Results(REPRODUCED)
     search = results[Job("search", system.case, seed, system.options, "gp-ucb", system.budget)]
     truth = results[Job("truth", system.case, seed, system.options)]["distance"]
     space = cases.by_name(system.case, seed, **dict(system.options)).validation.space
@@ -261,7 +262,7 @@ def certified(
 
 
 def campaign(run: Run) -> dict[str, Any]:
-    """Run one campaign and certify it at its checkpoints."""
+    """Run one campaign and certify it at its checkpoints; return what is stored of it."""
     with single_threaded():
         points, values, truth = history(run)
         noisy = run.family in NOISY
@@ -269,38 +270,18 @@ def campaign(run: Run) -> dict[str, Any]:
         exact = []
         if run.family == "prior":  # the same draws, once more as Bayes has it
             exact = [certified(points[:n], values[:n], run.seed, Prior(spread_share=1.0)) for n in run.checkpoints]
-    return {"seed": run.seed, "truth": truth, "checks": checks, "exact": exact}
+    key = {"family": run.family, "dimension": run.dimension, "seed": run.seed}
+    return {**key, "truth": truth, "checks": checks, "exact": exact}
 
 
 # The stored runs
 
-
-def lines(name: str) -> list[dict[str, Any]]:
-    """Return what is stored under a name, one JSON object a line; a line cut short by a kill is left out."""
-    path = path_of(name)
-    found = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            found.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return found
-
-
-def append(name: str, result: dict[str, Any]) -> None:
-    """Store one more campaign under a name."""
-    with path_of(name).open("a") as file:
-        file.write(json.dumps(result) + "\n")
-
-
-def path_of(name: str) -> Path:
-    """Return the file of a name."""
-    return RESULTS / f"{name.replace(',', '').replace(' ', '-')}.jsonl"
+STORED = JsonLines(RESULTS / "calibrate.jsonl", ("family", "dimension", "seed"))
 
 
 def stored(family: str, dimension: int) -> list[dict[str, Any]]:
     """Return the stored campaigns of a family."""
-    return lines(f"{family}-{dimension}d")
+    return STORED.select(family=family, dimension=dimension)
 
 
 def missing(campaigns: int) -> Iterator[Run]:
@@ -313,35 +294,31 @@ def missing(campaigns: int) -> Iterator[Run]:
 
 
 def _in_turn(names: list[tuple[str, int]], campaigns: int) -> Iterator[Run]:
-    done = {name: {result["seed"] for result in stored(*name)} for name in names}
     for seed in range(campaigns):
         for family, d in names:
             most = _SEEDS if family in SYSTEMS else campaigns * _SHARE[d]
-            if seed < most and seed not in done[family, d]:
+            if seed < most and (family, d, seed) not in STORED:
                 yield Run(family, d, seed)
 
 
-def all_of(
-    campaign: Callable[[Asked], dict[str, Any]], runs: list[Asked], workers: int
-) -> Iterator[tuple[Asked, dict[str, Any]]]:
-    """Yield campaigns with their results as they end, and say how many have."""
+def all_of(campaign: Callable[[Asked], dict[str, Any]], runs: list[Asked], workers: int) -> Iterator[dict[str, Any]]:
+    """Yield the results of campaigns as they end, and say how many have."""
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        asked = {pool.submit(campaign, run): run for run in runs}
+        asked = [pool.submit(campaign, run) for run in runs]
         for done, ended in enumerate(as_completed(asked), start=1):
-            yield asked[ended], ended.result()
+            yield ended.result()
             print(f"\r{done}/{len(runs)}", end="", flush=True)
     print()
 
 
 def main() -> None:
-    """Fill, and write the page."""
+    """Run what is missing."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--campaigns", type=int, default=200, help="for each family and dimension up to 2")
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    for run, result in all_of(campaign, list(missing(arguments.campaigns)), arguments.workers):
-        append(f"{run.family}-{run.dimension}d", result)
+    for result in all_of(campaign, list(missing(arguments.campaigns)), arguments.workers):
+        STORED.append(result)
 
 
 if __name__ == "__main__":

@@ -2,22 +2,24 @@
 
 ``python benchmarks/calibrate_verdicts.py`` runs what is not stored yet. Each campaign is given a threshold of a known
 share of d*: 0.95, which must not be validated, or 1.1, which should be, and runs as ``--until-decided`` does. Stored
-lines without ``rule`` are from before corners were asked for and bounds were put to the test.
+lines with ``rule`` 1 are from before corners were asked for and bounds were put to the test.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from calibrate import FAMILIES, RESULTS, STORED, SYSTEMS, Values, all_of, append, lines, maximum
+from calibrate import FAMILIES, REPRODUCED, RESULTS, SYSTEMS, Values, all_of, maximum
 from calibration_functions import DEVELOPMENT, REPORTING, generator
 from ctxval import Campaign, Trial, cases, searches
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import RESOLUTION, covering
 from ctxval.certificates.stopping import standing
 from ctxval.certificates.verdict import counterexample
@@ -83,10 +85,10 @@ def _functions(
 
 
 def decide(one: Decision) -> dict[str, Any]:
-    """Run one campaign until it is decided."""
+    """Run one campaign until it is decided; return what is stored of it."""
     with single_threaded():
         result = _of_system(one) if one.family in SYSTEMS else _of_function(one)
-    return {"rule": RULE, "seed": one.seed, "search": one.search, "share": one.share, **result}
+    return {"rule": RULE, **dataclasses.asdict(one), **result}
 
 
 def function(one: Decision) -> Values:
@@ -138,7 +140,7 @@ def _trial(number: int, origin: Any, point: Array, distance: float) -> Trial:
 
 def _of_system(one: Decision) -> dict[str, Any]:
     system = SYSTEMS[one.family]
-    best_known = Results(STORED)[Job("truth", system.case, one.seed, system.options)]["distance"]
+    best_known = Results(REPRODUCED)[Job("truth", system.case, one.seed, system.options)]["distance"]
     experiment = cases.by_name(system.case, one.seed, **dict(system.options))
     threshold, budget = one.share * best_known, BUDGETS[one.dimension]
     campaign = Campaign(experiment.validation, search=searches.by_name(one.search), seed=one.seed)
@@ -157,27 +159,19 @@ def _summary(trials: list[Trial], threshold: float, *, decided: bool) -> dict[st
 
 # The stored campaigns
 
-
-def name_of(family: str, dimension: int) -> str:
-    """Return the name of the file that campaigns are stored in."""
-    return f"decided-{family}-{dimension}d"
+STORED = JsonLines(
+    RESULTS / "calibrate_verdicts.jsonl", ("rule", *(field.name for field in dataclasses.fields(Decision)))
+)
 
 
 def decisions(family: str, dimension: int, rule: int = RULE) -> list[dict[str, Any]]:
     """Return the stored campaigns of a family that were run by a rule of coverage."""
-    return [line for line in lines(name_of(family, dimension)) if line.get("rule", 1) == rule]
+    return STORED.select(family=family, dimension=dimension, rule=rule)
 
 
 def missing(campaigns: int) -> list[Decision]:
     """Return the campaigns that are not stored."""
-    asked = list(wanted(campaigns))
-    names = {(one.family, one.dimension) for one in asked}
-    known = {name: {_key(line) for line in decisions(*name)} for name in names}
-    return [one for one in asked if (one.search, one.share, one.seed) not in known[one.family, one.dimension]]
-
-
-def _key(line: dict[str, Any]) -> tuple[str, float, int]:
-    return line["search"], line["share"], line["seed"]
+    return [one for one in wanted(campaigns) if (RULE, *dataclasses.astuple(one)) not in STORED]
 
 
 def main() -> None:
@@ -188,9 +182,8 @@ def main() -> None:
     )
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    for one, result in all_of(decide, missing(arguments.campaigns), arguments.workers):
-        append(name_of(one.family, one.dimension), result)
+    for result in all_of(decide, missing(arguments.campaigns), arguments.workers):
+        STORED.append(result)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 ``python benchmarks/crash_states.py --each 8`` records the campaigns of `crash/campaigns.py` with strace, plays their
 writes and syncs on the model of a disk in `crash/disk.py`, cuts the power after each of them in many ways, and opens
-the store of what is left. Writes benchmarks/results/crash_states.json; `benchmarks/reliability.py` makes the page.
+the store of what is left. Writes benchmarks/results/crash_states.jsonl; `benchmarks/reliability.py` makes the page.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import hashlib
-import json
 import os
 import sqlite3
 import sys
@@ -31,10 +30,11 @@ from crash.campaigns import BUDGET, SCRIPTS, STORE, campaign, content, digest, r
 from crash.disk import Disk, Files, Mode  # noqa: E402
 from crash.recorder import Event, record  # noqa: E402
 from ctxval import Store  # noqa: E402
+from ctxval._util.json_lines import JsonLines  # noqa: E402
 from ctxval.core.trial import Trial  # noqa: E402
 from ctxval.errors import CtxvalError  # noqa: E402
 
-RESULTS = ROOT / "benchmarks" / "results" / "crash_states.json"
+STORED = JsonLines(ROOT / "benchmarks" / "results" / "crash_states.jsonl", ("synchronous", "mode"))
 MODES: tuple[Mode, ...] = ("ordered", "strict")
 COUNTS = ("states", "distinct", "opened", "lost", "twice", "changed", "refused", "crashed", "resumed", "went on")
 
@@ -218,9 +218,8 @@ def main() -> None:
                 found = count(recording, mode, given.each, given.seed, given.resume_each, given.workers)
                 print(script, mode, len(recording.events), dict(found), flush=True)
                 counts[mode].update(found)
-    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    results[given.synchronous or "own"] = {mode: dict(found) for mode, found in counts.items()}
-    RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+    for mode, found in counts.items():
+        STORED.append({"synchronous": given.synchronous or "own", "mode": mode, **found})
 
 
 if __name__ == "__main__":

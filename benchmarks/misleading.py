@@ -2,7 +2,7 @@
 
 In two of them a state is hidden, so that the residual r(x, u) that is learned does not exist as a function; in the
 third a hard stop is met in one corner of the task space only, far from where all else points to. Distances are stored
-in a folder, one file for a case, a seed and a search, so a stopped study goes on; then the table is printed.
+in a file, a line for a case, a seed and a search, so a stopped study goes on; then the table is printed.
 ``python benchmarks/misleading.py --seeds 10``.
 """
 
@@ -33,6 +33,7 @@ from ctxval import (
     systems,
 )
 from ctxval._util.arrays import Array
+from ctxval._util.json_lines import JsonLines
 from ctxval.core.controller import Controller
 from ctxval.systems.integrate import Derivative
 from study_auto import Result, add_options, campaign, print_table, stored
@@ -242,14 +243,14 @@ def truth(found: Experiment, folder: Path) -> float:
     ).distance
 
 
-def run(case: str, seed: int, search: str, folder: Path, truths: Path) -> Result:
+def run(case: str, seed: int, search: str, results: JsonLines, truths: Path) -> Result:
     """Return one campaign of a case, running what is not stored."""
 
     def compute() -> Result:
         found = CASES[case](seed)
         return campaign(found.validation, searches.by_name(search), seed, BUDGET, truth(found, truths))
 
-    return stored(folder / f"{case}-{seed}-{search}.json", compute)
+    return stored(results, case, seed, search, compute)
 
 
 def main() -> None:

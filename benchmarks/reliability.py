@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import multiprocessing
 import os
 import shutil
@@ -32,17 +31,17 @@ from test_kill import BUDGET, content, resumed  # noqa: E402
 from test_workers import start as start_workers  # noqa: E402
 from test_workers import until  # noqa: E402
 
+import attack  # noqa: E402
+import crash_states  # noqa: E402
 import rig_cluster  # noqa: E402
 import rig_command  # noqa: E402
-from attack import FAMILIES  # noqa: E402
 from conftest import make_validation  # noqa: E402
 from ctxval import Campaign, Store, searches  # noqa: E402
+from ctxval._util.json_lines import JsonLines  # noqa: E402
 from ctxval.storage.recovery import recover  # noqa: E402
 from rig_workers import campaign as logged  # noqa: E402
 
-RESULTS = ROOT / "benchmarks" / "results" / "reliability.json"
-CRASHES = RESULTS.with_name("crash_states.json")
-ATTACK = RESULTS.with_name("attack.json")
+STORED = JsonLines(ROOT / "benchmarks" / "results" / "reliability.jsonl", ("fault",))
 PAGE = ROOT / "docs" / "reliability.md"
 
 FAULTS = {
@@ -225,7 +224,7 @@ HEAD = """\
 # Reliability
 
 Faults inflicted on real processes and files, and what came of them. Written by `benchmarks/reliability.py` from
-`benchmarks/results/reliability.json`; running it again adds to the counts.
+`benchmarks/results/reliability.jsonl`; running it again adds to the counts.
 
 """
 
@@ -298,15 +297,15 @@ asking, telling, running and dying against a model of the store, and random byte
 """
 
 
-def page(results: dict[str, dict[str, int]], crashes: dict[str, Any], attack: dict[str, Any]) -> str:
+def page() -> str:
     """Return the document."""
     faults = [
-        [title, *(results[fault].get(column, "") for column in COLUMNS)]
+        [title, *(STORED[fault,].get(column, "") for column in COLUMNS)]
         for fault, title in FAULTS.items()
-        if fault in results
+        if (fault,) in STORED
     ]
-    parts = [HEAD, _table(["fault", *COLUMNS], faults), COUNTED, POWER, _crashes(crashes), POWER_TAIL]
-    return "".join([*parts, HOSTILE, _attack(attack), HOSTILE_TAIL, PROCESSORS, TAIL])
+    parts = [HEAD, _table(["fault", *COLUMNS], faults), COUNTED, POWER, _crashes(), POWER_TAIL]
+    return "".join([*parts, HOSTILE, _attack(), HOSTILE_TAIL, PROCESSORS, TAIL])
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -314,39 +313,35 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     return "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
 
 
-def _crashes(crashes: dict[str, Any]) -> str:
+def _crashes() -> str:
     columns = {"cuts": "states", "disks": "distinct", **{name: name for name in CRASH_COLUMNS}}
     rows = [
         [f"{SYNCHRONOUS[pragma]}, {mode}", *(f"{counts[key]:,}" for key in columns.values())]
-        for pragma, modes in crashes.items()
-        for mode, counts in modes.items()
+        for (pragma, mode), counts in crash_states.STORED.items()
     ]
     return _table(["stores", *columns], rows)
 
 
-def _attack(attack: dict[str, Any]) -> str:
+def _attack() -> str:
+    families = {record["family"]: record["counts"] for record in JsonLines(attack.RESULTS, attack.KEY).values()}
     rows = [
         [_title(name), *(_hostile(counts, keys) for keys in ATTACK_COLUMNS.values()), f"{counts['megabytes']} MB"]
-        for name, counts in attack["families"].items()
+        for name, counts in families.items()
     ]
     sums: Counter[str] = Counter()
-    for counts in attack["families"].values():
+    for counts in families.values():
         sums.update({key: value for key, value in counts.items() if key != "megabytes"})
-    most = max((counts["megabytes"] for counts in attack["families"].values()), default=0)
+    most = max((counts["megabytes"] for counts in families.values()), default=0)
     total = ["together", *(_hostile(sums, keys) for keys in ATTACK_COLUMNS.values()), f"{most} MB"]
     return _table(["input", *ATTACK_COLUMNS, "largest"], [*rows, total])
 
 
 def _title(family: str) -> str:
-    return FAMILIES[family].title
+    return attack.FAMILIES[family].title
 
 
 def _hostile(counts: Mapping[str, int], keys: tuple[str, ...]) -> str:
     return f"{sum(counts.get(key, 0) for key in keys):,}"
-
-
-def _stored(path: Path) -> Any:
-    return json.loads(path.read_text()) if path.exists() else {}
 
 
 def main() -> None:
@@ -354,8 +349,7 @@ def main() -> None:
     for name in ("kills", "worker-kills", "scheduler-kills", "command-kills", "flips", "cuts"):
         parser.add_argument(f"--{name}", type=int, default=0)
     given = parser.parse_args()
-    results: dict[str, dict[str, int]] = _stored(RESULTS)
-    seed = sum(counts["inflicted"] for counts in results.values())
+    seed = sum(counts["inflicted"] for counts in STORED.values())
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         jobs = {
@@ -369,10 +363,10 @@ def main() -> None:
         }
         for fault, (count, inflict) in jobs.items():
             if count:
-                new = inflict(count)
-                results[fault] = {key: results.get(fault, {}).get(key, 0) + value for key, value in new.items()}
-                RESULTS.write_text(json.dumps(results, indent=1) + "\n")
-    PAGE.write_text(page(results, _stored(CRASHES), _stored(ATTACK)))
+                before = STORED.get((fault,), {})
+                sums = {key: before.get(key, 0) + value for key, value in inflict(count).items()}
+                STORED.append({"fault": fault, **sums})
+    PAGE.write_text(page())
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """What each part of the search ``auto`` buys: the same campaigns without it, case by case and seed by seed.
 
-Distances are stored in a folder, one file for a case, a seed and what is left out, so a stopped study goes on; then
-the table is printed. ``python benchmarks/study_ablations.py linear-5 --seeds 5``.
+Distances are stored in a file, a line for a case, a seed and what is left out, so a stopped study goes on; then the
+table is printed. ``python benchmarks/study_ablations.py linear-5 --seeds 5``.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ import misleading
 import study_auto
 from ctxval import Experiment, searches
 from ctxval._util.arrays import Array
+from ctxval._util.json_lines import JsonLines
 from ctxval.gp import regression as gp
 from ctxval.searches import Climbs, Prediction, Scalar
 from ctxval.searches import trust_region as climbs
-from study_auto import ROOT, Result, add_options, campaign, print_table, stored
+from study_auto import Result, add_options, campaign, print_table, results_of, stored
 
 CASES = ("pendulum-no-data", "linear-5", "dubins-basin", "arm-fnn", *misleading.CASES)
 
@@ -70,11 +71,11 @@ def prepared(case: str, seed: int, truths: Path) -> tuple[Experiment, int, float
 def whole(case: str, seed: int, truths: Path) -> Result:
     """Return the campaign of ``auto`` itself, from where the other studies keep it."""
     study, name = (misleading, "misleading") if case in misleading.CASES else (study_auto, "auto")
-    result: Result = study.run(case, seed, "auto", ROOT / "benchmarks" / "results" / name, truths)
+    result: Result = study.run(case, seed, "auto", results_of(name), truths)
     return result
 
 
-def run(case: str, seed: int, without: str, folder: Path, truths: Path) -> Result:
+def run(case: str, seed: int, without: str, results: JsonLines, truths: Path) -> Result:
     """Return one campaign without a part, running what is not stored."""
     if without == "auto":
         return whole(case, seed, truths)
@@ -83,7 +84,7 @@ def run(case: str, seed: int, without: str, folder: Path, truths: Path) -> Resul
         found, budget, best_known = prepared(case, seed, truths)
         return campaign(found.validation, ABLATIONS[without](), seed, budget, best_known)
 
-    return stored(folder / f"{case}-{seed}-{without.replace(' ', '-')}.json", compute)
+    return stored(results, case, seed, without, compute)
 
 
 def main() -> None:

@@ -1,14 +1,13 @@
 """How many executions the searches need until they are close to the true maximum, case by case and seed by seed.
 
-Distances are stored in a folder, one file for a case, a seed and a search, so a stopped study goes on; then the table
-of medians is printed. A campaign ends within 1 % of the maximum, or with its budget.
+Distances are stored in a file, a line for a case, a seed and a search, so a stopped study goes on; then the table of
+medians is printed. A campaign ends within 1 % of the maximum, or with its budget.
 ``python benchmarks/study_auto.py pendulum dubins-basin --seeds 10 --search auto``.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
 from collections.abc import Callable
@@ -20,8 +19,11 @@ from typing import Any
 import numpy as np
 
 from ctxval import Campaign, Experiment, Truth, Validation, cached_truth, cases, grid_truth, search_truth, searches
+from ctxval._util.json_lines import JsonLines
 
 ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+KEY = ("case", "seed", "search")
 WITHIN = (5.0, 2.0, 1.0)
 
 Result = dict[str, Any]
@@ -86,17 +88,20 @@ def campaign(validation: Validation, search: searches.Search, seed: int, budget:
     }
 
 
-def stored(path: Path, compute: Callable[[], Result]) -> Result:
-    """Return a result from its file, or compute it and write that file."""
-    if not path.exists():
-        result = compute()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(result))
-    found: Result = json.loads(path.read_text())
-    return found
+def results_of(study: str) -> JsonLines:
+    """Return the stored results of a study: of this one, ``scalar``, ``ablations`` or ``misleading``."""
+    return JsonLines(RESULTS / f"{study}.jsonl", KEY)
 
 
-def run(case: str, seed: int, search: str, folder: Path, truths: Path) -> Result:
+def stored(results: JsonLines, case: str, seed: int, search: str, compute: Callable[[], Result]) -> Result:
+    """Return a stored result, or compute and store it."""
+    key = (case, seed, search)
+    if key not in results:
+        results.append({**dict(zip(KEY, key, strict=True)), **compute()})
+    return results[key]
+
+
+def run(case: str, seed: int, search: str, results: JsonLines, truths: Path) -> Result:
     """Return one campaign of a case, running what is not stored."""
 
     def compute() -> Result:
@@ -106,7 +111,7 @@ def run(case: str, seed: int, search: str, folder: Path, truths: Path) -> Result
         random = best_of_random(found.validation, seed) if case.startswith("dubins") else None
         return {**result, "random": random}
 
-    return stored(folder / f"{case}-{seed}-{search}.json", compute)
+    return stored(results, case, seed, search, compute)
 
 
 def first_within(result: Result, percent: float) -> float:
@@ -132,9 +137,9 @@ def row(case: str, search: str, results: list[Result]) -> str:
 
 
 def add_options(parser: argparse.ArgumentParser, name: str) -> None:
-    """Add the options that the studies have in common; results go to a folder of the study's name."""
+    """Add the options that the studies have in common; results go to a file of the study's name."""
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--folder", type=Path, default=ROOT / "benchmarks" / "results" / name)
+    parser.add_argument("--results", type=lambda path: JsonLines(Path(path), KEY), default=results_of(name))
     parser.add_argument("--truths", type=Path, default=ROOT / "runs" / "truth")
 
 
@@ -142,9 +147,9 @@ def print_rows(options: argparse.Namespace, run: Callable[..., Result], row: Cal
     """Run what is missing, seed by seed, so that what is stored can be compared at any time; then print the rows."""
     which = list(product(options.cases, options.search))
     for seed, (case, search) in product(range(options.seeds), which):
-        run(case, seed, search, options.folder, options.truths)
+        run(case, seed, search, options.results, options.truths)
     for case, search in which:
-        results = [run(case, seed, search, options.folder, options.truths) for seed in range(options.seeds)]
+        results = [run(case, seed, search, options.results, options.truths) for seed in range(options.seeds)]
         print(row(case, search, results))
 
 

@@ -1,23 +1,23 @@
 """Audit a model, learn it again from what the audit showed, audit it again: how often is the second verdict false?
 
-``python benchmarks/study_retrain.py`` writes ``benchmarks/results/retrain.json``, from which the calibration page is
+``python benchmarks/study_retrain.py`` writes ``benchmarks/results/retrain.jsonl``, from which the calibration page is
 made. Each model is exact near the tasks that it has seen, and wrong elsewhere: the hardest case for an audit.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, searches, systems
 from ctxval._util.arrays import Array
+from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import Options, Sample, certify
 from ctxval.certificates.verdict import judge_by
 
-PAGE_DATA = Path(__file__).parent / "results" / "retrain.json"
+STORED = JsonLines(Path(__file__).parent / "results" / "retrain.jsonl", ("second_audit",))
 
 DRAWS, VOLUME, CONFIDENCE = 59, 0.05, 0.95
 RADIUS = 0.06
@@ -84,18 +84,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=200)
     seeds = range(parser.parse_args().seeds)
-    result = {
-        name: [second_verdict(seed, same_draws=same) for seed in seeds]
-        for name, same in (("the same draws", True), ("draws that depend on the model", False))
-    }
-    counts = {
-        name: {"false": sum(bool(one["validated"]) for one in found), "campaigns": len(found)}
-        for name, found in result.items()
-    }
-    PAGE_DATA.write_text(
-        json.dumps({"draws": DRAWS, "volume": VOLUME, "confidence": CONFIDENCE, "counts": counts}, indent=1) + "\n"
-    )
-    print(counts)
+    settings = {"draws": DRAWS, "volume": VOLUME, "confidence": CONFIDENCE}
+    for name, same in (("the same draws", True), ("draws that depend on the model", False)):
+        verdicts = [second_verdict(seed, same_draws=same) for seed in seeds]
+        false = sum(bool(one["validated"]) for one in verdicts)
+        STORED.append({"second_audit": name, **settings, "false": false, "campaigns": len(verdicts)})
+        print(STORED[name,])
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """How many executions the searches that never see a trajectory need, case by case and seed by seed.
 
 ``scalar``, ``gp-ucb`` and ``random`` see distances alone; ``vector`` sees the vectors that distances are composed of,
-where they are. Distances are stored in a folder, one file for a case, a seed and a search, so a stopped study goes on;
-then the table is printed. ``python benchmarks/study_scalar.py linear-10 dubins-basin --seeds 10``.
+where they are. Distances are stored in a file, a line for a case, a seed and a search, so a stopped study goes on; then
+the table is printed. ``python benchmarks/study_scalar.py linear-10 dubins-basin --seeds 10``.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 
 from ctxval import Validation, searches
 from ctxval._util.arrays import Array
+from ctxval._util.json_lines import JsonLines
 from ctxval.distances import ComposedDistance
 from ctxval.learning.vector import predict_composed
 from study_auto import Result, add_options, experiment, first_within, print_rows, stored, truth
@@ -58,9 +59,9 @@ def suggest_by_vector(validation: Validation, seed: int) -> Callable[[list[Array
     return suggest
 
 
-def run(case: str, seed: int, search: str, folder: Path, truths: Path) -> Result:
+def run(case: str, seed: int, search: str, results: JsonLines, truths: Path) -> Result:
     """Return the distances of one search of a case, running what is not stored."""
-    return stored(folder / f"{case}-{seed}-{search}.json", partial(searched, case, seed, search, truths))
+    return stored(results, case, seed, search, partial(searched, case, seed, search, truths))
 
 
 def searched(case: str, seed: int, search: str, truths: Path) -> Result:

@@ -16,10 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from ctxval._util.json_lines import JsonLines
 from peers.functions import Function, function
 from peers.methods import METHODS
 from peers.recorder import Recorder
-from peers.run import applies, keep, record, stored
+from peers.run import applies, record
+from study_auto import RESULTS
 
 COUNTS = (20, 100, 500)
 SUGGESTIONS = 3
@@ -29,6 +31,7 @@ WARM = 45
 PATIENCE = 240.0
 """Seconds for all of them, after which a method counts as too slow."""
 SEED = 0
+STORED = JsonLines(RESULTS / "peers_overhead.jsonl", ("case", "method", "n"))
 
 # Case, methods and counts; 20 dimensions for all, and the Dubins car where the inner loop is simulated.
 MEASURED: list[tuple[str, list[str], tuple[int, ...]]] = [
@@ -80,13 +83,12 @@ def measured_apart(case: str, name: str, n: int) -> dict[str, Any]:
 
 def main() -> None:
     """Measure what is missing."""
-    done = {(result["case"], result["method"], result["n"]) for result in stored("overhead")}
     for case, names, counts in MEASURED:
         for n in counts:
             for name in names:
-                if METHODS[name].installed and applies(name, case) and (case, name, n) not in done:
+                if METHODS[name].installed and applies(name, case) and (case, name, n) not in STORED:
                     result = measured_apart(case, name, n)
-                    keep("overhead", result)
+                    STORED.append(result)
                     print(case, name, n, statistics.mean(result["seconds"] or [np.nan]), result["error"] or "")
 
 

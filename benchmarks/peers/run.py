@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import argparse
 import functools
-import json
-from pathlib import Path
 from typing import Any
 
+from ctxval._util.json_lines import JsonLines
 from peers.functions import CASES, SEEDS, function
 from peers.methods import METHODS
 from peers.recorder import Finished, Maximise, Recorder
-from study_auto import ROOT
+from study_auto import RESULTS, results_of
 
-RESULTS = ROOT / "benchmarks" / "results" / "peers"
-STUDY = ROOT / "benchmarks" / "results" / "auto"
+STORED = JsonLines(RESULTS / "peers.jsonl", ("case", "method", "seed"))
+STUDY = results_of("auto")
 CLOSE = 0.99
 """Share of d* that finishes a run."""
 
@@ -30,19 +29,6 @@ Result = dict[str, Any]
 
 the_function = functools.lru_cache(maxsize=1)(function)
 """The last one again: the arm's network takes longer to train than most methods to run."""
-
-
-def stored(name: str, folder: Path = RESULTS) -> list[Result]:
-    """Return the stored results of a function, or of ``overhead``."""
-    path = folder / f"{name}.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-def keep(name: str, result: Result, folder: Path = RESULTS) -> None:
-    """Append a result."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / f"{name}.jsonl").open("a") as file:
-        file.write(json.dumps(result) + "\n")
 
 
 def record(maximise: Maximise, recorder: Recorder, seed: int) -> tuple[Recorder, str | None]:
@@ -75,6 +61,7 @@ def run(case: str, method: str, seed: int) -> Result:
     maximise, found = METHODS[method].load(), the_function(case, seed)
     recorder, error = record(maximise, Recorder(found, budget_of(case, method), CLOSE * found.maximum), seed)
     return {
+        "case": case,
         "method": method,
         "seed": seed,
         "maximum": found.maximum,
@@ -85,17 +72,17 @@ def run(case: str, method: str, seed: int) -> Result:
     }
 
 
-def of_the_study(case: str, method: str, seed: int, folder: Path = STUDY) -> Result | None:
+def of_the_study(case: str, method: str, seed: int) -> Result | None:
     """Return the result of a campaign that ``study_auto`` has stored, which is the same; None if it ended earlier."""
-    path = folder / (f"{case}-no-data-{seed}-auto.json" if method == "auto-no-data" else f"{case}-{seed}-{method}.json")
-    if not path.exists():
+    campaign = STUDY.get((f"{case}-no-data", seed, "auto") if method == "auto-no-data" else (case, seed, method))
+    if campaign is None:
         return None
-    campaign = json.loads(path.read_text())
     values, maximum = [distance or 0.0 for distance in campaign["distances"]], campaign["truth"]
     if max(values) < CLOSE * maximum and len(values) < CASES[case].budget:
         return None
     executions = next((k for k, value in enumerate(values, 1) if value >= CLOSE * maximum), CASES[case].budget)
     return {
+        "case": case,
         "method": method,
         "seed": seed,
         "maximum": maximum,
@@ -121,12 +108,11 @@ def main() -> None:
     options = parser.parse_args()
     methods = [name for name in options.methods if METHODS[name].installed]
     for case in options.cases:
-        done = {(result["method"], result["seed"]) for result in stored(case)}
         for seed in options.seeds:
             for method in methods:
-                if applies(method, case) and (method, seed) not in done:
+                if applies(method, case) and (case, method, seed) not in STORED:
                     result = of_the_study(case, method, seed) or run(case, method, seed)
-                    keep(case, result)
+                    STORED.append(result)
                     share = max((value for _, value in result["improvements"]), default=0.0) / result["maximum"]
                     print(
                         case,

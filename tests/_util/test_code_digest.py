@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from ctxval._util.code_digest import code_of
+from ctxval._util.code_digest import code_of, module_digest
 from ctxval._util.describe import describe, first_difference
 
 BEFORE = '''
@@ -226,3 +226,34 @@ def python_of(version: str) -> str | None:
         if found is not None and subprocess.run([found, "-c", ""], capture_output=True).returncode == 0:
             return found
     return None
+
+
+MODULE = """
+'''A case.'''
+from math import sin
+
+GAIN = 2.0
+'''Of the controller.'''
+
+def distance(a: float, b: float) -> float:
+    return GAIN * sin(a - b)
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "same"),
+    [
+        ("A case.", "The case.", True),
+        ("Of the controller.", "Dimensionless.", True),
+        ("from math import sin", "from numpy import cos, sin", True),
+        ("a: float, b: float", "a, b", True),
+        ("-> float", "-> object", True),
+        ("GAIN * sin(a - b)", "(GAIN  # twice\n        * sin(a - b))", True),
+        ("GAIN = 2.0", "GAIN = 3.0", False),
+        ("a - b", "b - a", False),
+        ("def distance", "def gap", False),
+    ],
+)
+def test_a_module_is_what_it_computes(before: str, after: str, same: bool) -> None:
+    assert MODULE.count(before) == 1
+    assert (module_digest(MODULE.replace(before, after)) == module_digest(MODULE)) == same

@@ -36,7 +36,7 @@ def test_every_function_with_results_has_a_picture(case: str) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_stored_results_are_runs_of_known_methods(case: str) -> None:
-    results = run.stored(case)
+    results = run.STORED.select(case=case)
     keys = [(result["method"], result["seed"]) for result in results]
     assert len(set(keys)) == len(keys)
     for result in results:

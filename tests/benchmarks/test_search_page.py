@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from pathlib import Path
@@ -14,7 +13,8 @@ BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 import search_page  # noqa: E402
-from study_auto import CASES, first_within  # noqa: E402
+from ctxval._util.json_lines import JsonLines  # noqa: E402
+from study_auto import CASES, KEY, first_within, results_of, stored  # noqa: E402
 
 TARGETS = search_page.targets()
 
@@ -34,13 +34,23 @@ def test_every_case_of_the_study_has_a_target() -> None:
 
 @pytest.mark.parametrize("study", ["auto", "scalar", "misleading", "ablations"])
 def test_stored_campaigns_end_within_one_per_cent_or_with_their_budget(study: str) -> None:
-    paths = sorted((search_page.RESULTS / study).glob("*.json"))
-    assert paths
-    for path in paths:
-        result = json.loads(path.read_text())
+    results = results_of(study)
+    assert results
+    for key, result in results.items():
         ended = len(result["distances"])
-        assert ended <= result["budget"], path
-        assert ended == result["budget"] or first_within(result, 1.0) == ended, path
+        assert ended <= result["budget"], key
+        assert ended == result["budget"] or first_within(result, 1.0) == ended, key
+
+
+def test_what_is_stored_is_not_run_again_and_what_is_run_is_stored(tmp_path: Path) -> None:
+    run = {"truth": 1.0, "budget": 2, "distances": [0.5, 1.0], "seconds": 0.1}
+    results, computed = JsonLines(tmp_path / "study.jsonl", KEY), []
+    for seed in (0, 1, 0):
+        found = stored(results, "pendulum", seed, "no climbs", lambda: computed.append(1) or run)
+        assert found == {"case": "pendulum", "seed": seed, "search": "no climbs", **run}
+    assert len(computed) == 2
+    again = JsonLines(tmp_path / "study.jsonl", KEY)
+    assert stored(again, "pendulum", 1, "no climbs", dict)["distances"] == [0.5, 1.0]
 
 
 def test_a_target_is_met_by_the_median_or_by_all() -> None:
@@ -60,8 +70,8 @@ def test_numbers_of_executions_are_shown_with_the_budget_where_it_did_not_suffic
 def test_more_seeds_than_the_table_has_are_reported_beside_it() -> None:
     text = search_page.more_seeds()
     for case, *_ in search_page.MORE_SEEDS:
-        stored = list((search_page.RESULTS / "scalar").glob(f"{case}-*-scalar.json"))
-        assert f", {len(stored)} seeds: within" in text
+        campaigns = results_of("scalar").select(case=case, search="scalar")
+        assert f", {len(campaigns)} seeds: within" in text
 
 
 def test_what_is_missing_goes_on_flat_where_a_campaign_ended() -> None:

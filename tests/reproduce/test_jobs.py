@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +11,11 @@ from hypothesis import strategies as st
 
 from ctxval import cases, searches
 from ctxval.errors import InputError
+from ctxval.reproduce import FULL, STUDIES
 from ctxval.reproduce.jobs import DISCARDED, Job, Results, case_digest, distances_of, records, run_job
 from ctxval.reproduce.study import running_estimate
 
+ROOT = Path(__file__).parents[2]
 PROFILE = Job("profile", "pendulum", 0, budget=21)
 
 
@@ -34,25 +38,66 @@ def test_results_are_stored_once_and_reused(tmp_path: Path) -> None:
     results, done = Results(tmp_path / "results"), []
     results.fill([PROFILE, PROFILE], 1, done.append)
     assert done == [PROFILE]
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").iterdir()}
-    results.fill([PROFILE], 1, done.append)
+    before = (tmp_path / "results" / "profile.jsonl").read_bytes()
+    for again in (results, Results(tmp_path / "results")):
+        again.fill([PROFILE], 1, done.append)
     assert done == [PROFILE]
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "results").iterdir()} == before
+    assert (tmp_path / "results" / "profile.jsonl").read_bytes() == before
     case = cases.by_name("pendulum", 0)
     assert results[PROFILE]["distances"] == pytest.approx(case.validation.distances(case.validation.space.grid(21)))
 
 
 def test_a_result_of_a_case_that_has_changed_is_run_again(tmp_path: Path) -> None:
-    results, done = Results(tmp_path), []
-    results.fill([PROFILE], 1, done.append)
-    (path,) = tmp_path.iterdir()
+    done: list[Job] = []
+    Results(tmp_path).fill([PROFILE], 1, done.append)
+    path = tmp_path / "profile.jsonl"
     path.write_text(path.read_text().replace(case_digest("pendulum"), "0" * 16))
-    assert PROFILE not in results
-    results.fill([PROFILE], 1, done.append)
+    outdated = Results(tmp_path)
+    assert PROFILE not in outdated
+    outdated.fill([PROFILE], 1, done.append)
     assert done == [PROFILE, PROFILE]
+    assert PROFILE in Results(tmp_path)
 
 
-def test_every_job_has_its_own_file() -> None:
+@pytest.fixture
+def edited(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], str]]:
+    """Return the digest of a case in whose source one passage has been replaced."""
+    source = Path(cases.pendulum.__file__).read_text()
+
+    def edit(before: str, after: str) -> str:
+        assert before in source
+        monkeypatch.setattr(inspect, "getsource", lambda module: source.replace(before, after, 1))
+        case_digest.cache_clear()
+        return case_digest("pendulum")
+
+    yield edit
+    case_digest.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("import numpy as np\n", "import math\n\nimport numpy as np\n"),
+        ('"""', '"""Documented at more length: '),
+        ("horizon: int = 150", "horizon: float = 150"),
+    ],
+)
+def test_imports_docstrings_and_annotations_make_no_result_outdated(
+    edited: Callable[[str, str], str], before: str, after: str
+) -> None:
+    assert edited(before, after) == edited(before, before)
+
+
+def test_a_constant_makes_results_outdated(edited: Callable[[str, str], str]) -> None:
+    assert edited("horizon: int = 150", "horizon: int = 151") != edited("horizon: int = 150", "horizon: int = 150")
+
+
+def test_the_stored_runs_are_those_of_the_cases() -> None:
+    stored = Results(ROOT / "benchmarks" / "results" / "reproduce")
+    assert [job.key for study in STUDIES for job in study.jobs(FULL) if job not in stored] == []
+
+
+def test_every_job_has_its_own_key() -> None:
     jobs = [
         Job("search", "linear", seed, (("dim", dim),), search, 10)
         for seed in (0, 1)

@@ -73,9 +73,18 @@ def code_of(value: Any) -> Code | None:
     node = _class_node(value) if isinstance(value, type) else _function_node(value)
     if node is None:
         return None
-    digest = hashlib.sha256(repr(_plain(node, top=True)).encode()).hexdigest()[:16]
+    digest = _hashed(_plain(node, top=True))
     loaded = _loaded_by_class(value, node) if isinstance(value, type) else _loaded(value.__code__)
     return Code(digest, tuple(sorted(name for name in _names(node) if name.partition(".")[0] in loaded)))
+
+
+def module_digest(source: str) -> str:
+    """Return a digest of a module's syntax tree, without its imports, docstrings, annotations and layout.
+
+    Raises:
+        SyntaxError: the source is not Python.
+    """
+    return _hashed(_plain(_WithoutImports().visit(ast.parse(source))))
 
 
 def bytecode_digest(value: Any) -> str | None:
@@ -101,6 +110,24 @@ def _constants(code: types.CodeType) -> str:
 
 
 # The syntax tree
+
+
+class _WithoutImports(ast.NodeTransformer):
+    """Removes imports and the texts that stand alone as statements, which document what is beside them."""
+
+    def visit_Import(self, node: ast.Import) -> None:
+        """Remove an import."""
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+        """Remove an import."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        """Remove a docstring."""
+        return None if isinstance(node.value, ast.Constant) else node
+
+
+def _hashed(tree: Any) -> str:
+    return hashlib.sha256(repr(tree).encode()).hexdigest()[:16]
 
 
 def _tree(file: str | None) -> ast.Module | None:

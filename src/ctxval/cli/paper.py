@@ -28,8 +28,12 @@ def reproduce(
     name: Annotated[str, typer.Argument(metavar="STUDY|all", help="Which of the paper's figures, or all.")],
     quick: Annotated[bool, typer.Option("--quick", help="Fewer trials, coarser grids.")] = False,
     out: Annotated[
-        Path, typer.Option(help="Folder of results, figures and data; what is in it is not run again.")
+        Path, typer.Option(help="Folder of the figures and their data; the table is written beside it.")
     ] = Path("reproduction"),
+    results: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the stored runs, which are not run again (default: OUT/results)."),
+    ] = None,
     workers: Annotated[int, typer.Option(help="Processes.")] = 2,
 ) -> None:
     """Run the paper's experiments: figures, their data, and the table of its claims."""
@@ -40,6 +44,7 @@ def reproduce(
         table = paper.reproduce(
             name,
             out,
+            stored=results,
             scale=paper.QUICK if quick else paper.FULL,
             workers=workers,
             on_start=lambda missing: progress.update(line, total=missing),

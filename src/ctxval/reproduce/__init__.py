@@ -47,6 +47,7 @@ def reproduce(
     name: str,
     out: Path,
     *,
+    stored: Path | None = None,
     scale: Scale = FULL,
     workers: int = 2,
     on_start: Callable[[int], None] = lambda missing: None,
@@ -58,7 +59,8 @@ def reproduce(
 
     Args:
         name: one study, or ``all``.
-        out: folder of results, figures (PNG) and their data (CSV); the table is written beside it, ``<out>.md``.
+        out: folder of the figures (PNG) and their data (CSV); the table is written beside it, ``<out>.md``.
+        stored: folder of the runs' results, ``<out>/results`` if it is not given.
         scale: full, or quick with fewer trials and coarser grids.
         workers: processes.
         on_start: called with the number of runs that are missing.
@@ -70,9 +72,10 @@ def reproduce(
     if workers < 1:
         raise InputError(f"workers must be at least 1, got {workers}.")
     chosen = studies_named(name)
-    results = Results(out / f"results-{scale.name}")
+    results = Results(out / "results" if stored is None else stored)
     jobs = [job for study in chosen for job in study.jobs(scale)]
     on_start(len([job for job in dict.fromkeys(jobs) if job not in results]))
+    out.mkdir(parents=True, exist_ok=True)
     results.fill(jobs, workers, on_done)
     for study in chosen:
         study.draw(results, scale).savefig(out / f"{study.name}.png", dpi=150)

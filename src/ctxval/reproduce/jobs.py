@@ -1,14 +1,10 @@
-"""The single runs that the paper's figures are made of: each stored in a file of its own, run in parallel processes."""
+"""The single runs that the paper's figures are made of: each stored as a line of a file, run in parallel processes."""
 
 from __future__ import annotations
 
-import ast
 import functools
-import hashlib
 import importlib
 import inspect
-import json
-import os
 import re
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -21,6 +17,8 @@ import numpy as np
 
 from ctxval import cases, searches
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.code_digest import module_digest
+from ctxval._util.json_lines import JsonLines
 from ctxval.campaign.campaign import Campaign
 from ctxval.core.experiment import Experiment
 from ctxval.errors import InputError
@@ -56,7 +54,7 @@ class Job:
 
     @property
     def key(self) -> str:
-        """A readable name, for the file of the result."""
+        """A readable name, by which the result is stored."""
         options = [f"{name}-{value}" for name, value in self.options]
         parts = [
             self.kind,
@@ -179,22 +177,22 @@ def run_job(job: Job) -> Result:
 
 
 class Results:
-    """A folder of results, one JSON file for each job; a result of a case that has changed since is not there.
+    """Stored results, a file of JSON lines for each kind of job; those of a case that has changed since do not count.
 
     Args:
-        folder: made if it does not exist.
+        folder: of the files; it is made with the first result.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._files: dict[str, JsonLines] = {}
 
     def __contains__(self, job: Job) -> bool:
-        path = self._path(job)
-        return path.exists() and json.loads(path.read_text())["case_digest"] == case_digest(job.case)
+        found = self._of_kind(job.kind).get((job.key,))
+        return found is not None and found["case_digest"] == case_digest(job.case)
 
     def __getitem__(self, job: Job) -> Result:
-        result: Result = json.loads(self._path(job).read_text())
-        return result
+        return self._of_kind(job.kind)[job.key,]
 
     def fill(self, jobs: Iterable[Job], workers: int, on_done: Callable[[Job], None]) -> None:
         """Run what is not stored yet, in parallel; each result is stored as soon as it is there.
@@ -207,7 +205,6 @@ class Results:
         missing = [job for job in dict.fromkeys(jobs) if job not in self]
         if not missing:
             return
-        self.folder.mkdir(parents=True, exist_ok=True)
         # Fresh interpreters: a forked one would inherit locks of threads that it does not have.
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
             waiting = {pool.submit(run_job, job): job for job in missing}
@@ -219,22 +216,20 @@ class Results:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
 
-    def _path(self, job: Job) -> Path:
-        return self.folder / f"{job.key}.json"
+    def _of_kind(self, kind: str) -> JsonLines:
+        if kind not in self._files:
+            self._files[kind] = JsonLines(self.folder / f"{kind}.jsonl", ("key",))
+        return self._files[kind]
 
     def _store(self, job: Job, result: Result) -> None:
-        path = self._path(job)
-        partial = path.with_suffix(".partial")
-        partial.write_text(json.dumps({**_rounded(result), "case_digest": case_digest(job.case)}))
-        os.replace(partial, path)
+        stored = {"key": job.key, **_rounded(result), "case_digest": case_digest(job.case)}
+        self._of_kind(job.kind).append(stored)
 
 
 @functools.cache
 def case_digest(case: str) -> str:
-    """Return a digest of a case's source, whatever its comments and its layout."""
-    module = importlib.import_module(f"ctxval.cases.{case}")
-    tree = ast.dump(ast.parse(inspect.getsource(module)))
-    return hashlib.sha256(tree.encode()).hexdigest()[:16]
+    """Return a digest of what a case's source computes, whatever its imports, docstrings, annotations and layout."""
+    return module_digest(inspect.getsource(importlib.import_module(f"ctxval.cases.{case}")))
 
 
 def _rounded(value: Any) -> Any:

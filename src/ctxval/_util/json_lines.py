@@ -1,0 +1,122 @@
+"""Results of a study in one file: a JSON object a line, appended as it comes and found by its key."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ctxval.errors import InputError
+
+Record = dict[str, Any]
+Key = tuple[Any, ...]
+
+
+class JsonLines(Mapping[Key, Record]):
+    """The records of a file of JSON lines; of several records with one key, the last one counts.
+
+    One process appends, and its workers hand it what they have computed. If that process is killed in the middle of a
+    line, the incomplete last line is ignored, and it is removed before the next record is appended. The file is read
+    once, when it is first asked.
+
+    Args:
+        path: of the file; it is made, with its folder, by the first record.
+        key: the fields of a record that identify it. Their values are numbers, texts, booleans or null.
+
+    Raises:
+        InputError: when the file is read, if a line is no JSON object or lacks a field of the key.
+    """
+
+    def __init__(self, path: Path, key: Sequence[str]) -> None:
+        self.path, self.key = path, tuple(key)
+        self._records: dict[Key, Record] | None = None
+
+    def __getitem__(self, key: Key) -> Record:
+        return self._known()[key]
+
+    def __iter__(self) -> Iterator[Key]:
+        return iter(self._known())
+
+    def __len__(self) -> int:
+        return len(self._known())
+
+    def select(self, **fields: Any) -> list[Record]:
+        """Return the records with these values, in the order in which their keys were first stored."""
+        return [record for record in self.values() if all(record.get(name) == fields[name] for name in fields)]
+
+    def append(self, record: Mapping[str, Any]) -> None:
+        """Store one more record.
+
+        Raises:
+            InputError: the record lacks a field of the key.
+            OSError: the file cannot be written.
+        """
+        # What is read again later is what is known now: tuples are lists, for instance.
+        line = json.dumps(dict(record))
+        stored: Record = json.loads(line)
+        known = self._known()
+        key = self._key_of(stored, "the record")
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        _mend_end(self.path)
+        data = f"{line}\n".encode()
+        # Without a buffer the line is written in one call, so that readers find the whole of it or nothing.
+        with self.path.open("ab", buffering=0) as file:
+            if file.write(data) != len(data):
+                raise OSError(f"{self.path}: the disk took a part of a record only.")
+        known[key] = stored
+
+    def _known(self) -> dict[Key, Record]:
+        if self._records is None:
+            self._records = {}
+            for number, line in enumerate(_lines(self.path), start=1):
+                where = f"{self.path}, line {number}"
+                record = _parsed(line)
+                if record is None:
+                    start = line[:40].decode(errors="replace")
+                    raise InputError(f"{where}: a line must be a JSON object, got {start!r}.")
+                self._records[self._key_of(record, where)] = record
+        return self._records
+
+    def _key_of(self, record: Record, where: str) -> Key:
+        missing = [name for name in self.key if name not in record]
+        if missing:
+            raise InputError(f"{where}: the field {missing[0]!r} is missing; the key is {', '.join(self.key)}.")
+        return tuple(record[name] for name in self.key)
+
+
+def _lines(path: Path) -> list[bytes]:
+    """Return the lines of a file; without the last one if its end was never written."""
+    if not path.exists():
+        return []
+    *lines, last = path.read_bytes().split(b"\n")
+    return lines if _parsed(last) is None else [*lines, last]
+
+
+def _parsed(line: bytes) -> Record | None:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def _mend_end(path: Path) -> None:
+    """Remove a last line whose end was never written; one that only lacks its newline is given it."""
+    if not path.exists() or _ends_with_newline(path):
+        return
+    data = path.read_bytes()
+    last = data[data.rfind(b"\n") + 1 :]
+    with path.open("r+b") as file:
+        if _parsed(last) is None:
+            file.truncate(len(data) - len(last))
+        else:
+            file.seek(0, 2)
+            file.write(b"\n")
+
+
+def _ends_with_newline(path: Path) -> bool:
+    with path.open("rb") as file:
+        size = file.seek(0, 2)
+        file.seek(max(0, size - 1))
+        return size == 0 or file.read(1) == b"\n"
