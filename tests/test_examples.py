@@ -1,0 +1,42 @@
+"""The examples run as a reader runs them, and print what they promise."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+PRINTED = {
+    "1_first_verdict": ["12 executions of the cart", "falsified: trial", "validated: the posterior bound"],
+    "2_resume_and_inspect": ["Tuesday: 6 executions are stored.", "Tuesday: 15 executions", "The worst task"],
+    "3_hardware_by_hand": [
+        "Trial 0: load 2.00 kg, go to 1.00 m ... failed: the fuse has blown.",
+        "Trial 7",
+        "falsified",
+    ],
+    "4_own_distance_and_search": ["The search keeps the contract.", "more than promised #", "Worst goal: 1.2"],
+    "5_audit_and_retrain": ["the largest gap in 59 random tasks is 0.29 m.", "is 0.014 m.", "What this rests on:"],
+}
+
+
+def test_every_example_is_executed() -> None:
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == set(PRINTED)
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_an_example_fits_on_a_page(name: str) -> None:
+    assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 60
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PRINTED)
+def test_an_example_runs_and_leaves_nothing_behind(name: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for sentence in PRINTED[name]:
+        assert sentence in done.stdout
+    assert not list(tmp_path.iterdir())
