@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from ctxval.errors import InputError, UnknownNameError
-from ctxval.reproduce import FULL, QUICK, STUDIES, reproduce, studies_named
-from ctxval.reproduce.jobs import Results
+from ctxval.reproduce import QUICK, STUDIES, reproduce, studies_named
 from ctxval.reproduce.study import Columns, executions_within, running_estimate, spread
-from ctxval.reproduce.table import table_text
 
 
 def test_the_estimate_of_sc_is_the_largest_and_that_of_sd_the_sixth() -> None:
@@ -67,12 +65,6 @@ def test_the_runs_may_be_stored_elsewhere(tmp_path: Path) -> None:
     reproduce("converged-gp", tmp_path / "paper", stored=tmp_path / "runs", scale=QUICK, workers=1)
     assert sorted(path.name for path in (tmp_path / "paper").iterdir()) == ["converged-gp.csv", "converged-gp.png"]
     assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["profile.jsonl", "search.jsonl"]
-
-
-def test_the_page_is_what_the_stored_runs_give(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(Path(__file__).parents[2])
-    results = Results(Path("benchmarks/results/reproduce"))
-    assert Path("docs/reproduction.md").read_text() == table_text(Path("docs/reproduction"), STUDIES, results, FULL)
 
 
 def test_no_workers_are_refused(tmp_path: Path) -> None:
