@@ -221,14 +221,14 @@ def _arguments(rng: Rng, folder: Path, base: Path) -> Case:
 
 
 FAMILIES: dict[str, Family] = {
-    "damaged": Family("stores of which bytes are others", 0.2, _store(stores.damaged), own=True),
-    "crafted": Family("stores that SQL has changed", 0.22, _store(stores.crafted)),
-    "crafted-own": Family("the same, of stores that this user made", 0.08, _store(stores.crafted), own=True),
+    "damaged": Family("stores with changed bytes", 0.2, _store(stores.damaged), own=True),
+    "crafted": Family("stores changed by SQL", 0.22, _store(stores.crafted)),
+    "crafted-own": Family("the same, for stores that this user made", 0.08, _store(stores.crafted), own=True),
     "coded": Family("stores whose settings name code", 0.06, _store(stores.coded, "a.sqlite")),
-    "no-store": Family("pipes, devices, folders and others in the place of a store", 0.06, _store(stores.no_store)),
-    "told": Family("recordings, NPZ and CSV, that are told", 0.14, _told, own=True),
-    "imported": Family("tables of runs that are imported", 0.08, _imported, own=True),
-    "data": Family("recordings and networks that models are made of", 0.03, _data),
+    "no-store": Family("pipes, devices, folders and others in place of a store", 0.06, _store(stores.no_store)),
+    "told": Family("recordings for `ctxval tell`, NPZ and CSV", 0.14, _told, own=True),
+    "imported": Family("tables of runs for `ctxval import`", 0.08, _imported, own=True),
+    "data": Family("recordings and networks for models", 0.03, _data),
     "toml": Family("experiment files", 0.05, _toml),
     "systems": Family("systems", 0.03, _system),
     "arguments": Family("arguments", 0.05, _arguments, own=True),

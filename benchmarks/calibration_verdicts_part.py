@@ -12,65 +12,71 @@ from calibrate import FAMILIES, SYSTEMS
 from calibrate_verdicts import BUDGETS, DRIVEN, FRESH, HARD, LOTS, RULE, SEARCHES, SHARES, decisions
 from calibration_functions import DEVELOPMENT, DIMENSIONS, REPORTING
 
-TRIED = """What mends them, on the 5 that were false at a cusp in a corner, and on 9 others in one dimension (jumps and
-chirps: 8) and two (a narrow peak: 1). Executions are those that it takes from 8, 12 and 20 random trials on in 1-D, 2-D
-and 3-D, beside the 1.3, 17.7 and 78.7 that covering takes anyway.
+TRIED = """The next table compares possible remedies. They were tried on 14 false validations. Of these, 5 have a cusp
+in a corner, 8 are other functions in one dimension (jumps and chirps), and 1 is another function in two dimensions (a
+narrow peak). The last column is the number of additional executions from 8, 12 and 20 random trials on in 1-D, 2-D and
+3-D. The covering takes 1.3, 17.7 and 78.7 executions in any case.
 
-| what | cusps | others | more executions |
+| remedy | cusps | others | additional executions |
 | --- | --- | --- | --- |
-| corners at an eighth of the resolution (taken) | 5 of 5 | 0 of 9 | 1, 1, 2.2 |
-| corners at half of it | 2 of 5 | 0 of 9 | 0.5, 0.5, 1.5 |
-| the same, and edges at three quarters | 2 of 5 | 0 of 9 | 0.5, 5.8, 44 |
-| all tasks at 0.8 of it | 1 of 5 | 2 of 9 | 1, 12, - |
-| two tests where the highest draws of d* are (taken) | - | 3 of 9 | 2, 2, 2 |
-| the same, every other one at the farthest of these places | - | 4 of 9 | 2, 2, 2 |
+| corners within an eighth of the resolution (adopted) | 5 of 5 | 0 of 9 | 1, 1, 2.2 |
+| corners within half of the resolution | 2 of 5 | 0 of 9 | 0.5, 0.5, 1.5 |
+| the same, and edges within three quarters | 2 of 5 | 0 of 9 | 0.5, 5.8, 44 |
+| all tasks within 0.8 of the resolution | 1 of 5 | 2 of 9 | 1, 12, - |
+| two tests at places of the highest draws of d* (adopted) | - | 3 of 9 | 2, 2, 2 |
+| the same, but every other test at the farthest of these places | - | 4 of 9 | 2, 2, 2 |
 
-What is left are peaks and jumps in the middle of the largest gaps that the resolution allows, a quarter of the range in
-one dimension; tests find those of which the trials show a trace."""
+The remaining failures are peaks and jumps in the middle of the largest gaps that the resolution permits. In one
+dimension, such a gap is a quarter of the range. Tests find those peaks and jumps of which the trials show a trace."""
 
-TEXT = """## Until decided
+TEXT = """## Verdicts of campaigns that run until decided
 
-Campaigns that run as `--until-decided` does: corners and tasks that nothing came near to are executed before anything
-is validated, and the bound is put to the test twice; at most {budgets}. One
-threshold is below d*, so that `validated` is false, and one above, so that nothing can be falsified. The functions of
-this section were written down before any of them was run, and nothing was chosen by them (`REPORTING` in
-`benchmarks/calibration_functions.py`); in brackets: the share, and the limit that it stays below with confidence
-97.5 %.
+These campaigns run as `--until-decided` does. Before anything is validated, they execute the corners and the tasks that
+are far from all trials, and they test the bound twice. The budget is at most {budgets}. One threshold is below d*, so
+`validated` is false. The other threshold is above d*, so nothing can be falsified.
+
+The functions of this section were written down before any of them was run, and no choice was made with them
+(`REPORTING` in `benchmarks/calibration_functions.py`). The parentheses contain the share of false verdicts, and the
+upper limit of this share with confidence 97.5 %.
 
 {families}
 
-By search: {searches}. The target: 5 % with a limit of 7 %, and 10 % in no family.
+By search: {searches}. The target is 5 % with an upper limit of 7 %, and less than 10 % in each family.
 
 {before}
-These functions are less hard than those below, of which some were made to be missed: most campaigns are falsified by
-the search, before anything is covered.
+
+These functions are easier than the functions below, some of which were built to be missed. Here, the search falsifies
+most campaigns before the covering starts.
 
 {verdict_table}
 
-In two and three dimensions, tasks that nothing came near to are executed in lots of {lots}, as with so many workers; in
-three dimensions a campaign ends as undecided once the budget is too small to come near to every task. All of this was
-run before a bound near to a threshold took more draws (`settle_maxima`), which withholds validations that hang on them.
+In two and three dimensions, the tasks that are far from all trials are executed in batches of {lots}, as with that many
+workers. In three dimensions, a campaign ends as undecided once the budget is too small to come near every task. All of
+this was run before bounds close to a threshold took more draws (`settle_maxima`). That rule withholds validations that
+depend on the random draws.
 
-### What it was chosen by
+### Functions used for the design of the rule
 
-`before`: validated once every task was within the resolution, corners as all others, and no tests. The prior, the
-resolution, the corners and the tests were chosen by these functions, so that they tell what mends a false verdict, and
-nothing of how often one is false. Most that were false before were run again.
+`before`: a campaign was validated once every task was within the resolution. Corners were treated like all other tasks,
+and there were no tests. The prior, the resolution, the corner rule and the tests were chosen with these functions. The
+table therefore shows what prevents false verdicts, and it is not evidence of how often they occur. Most of the
+campaigns that were false before were run again.
 
 {chosen}
 
 {tried}
 
-Other functions of the families that are hardest, of seeds from {fresh} on, by which nothing was chosen:
+The next table has other functions of the hardest families, with seeds from {fresh} on. No choice was made with these
+functions:
 
 {hard}
 
-The false one, a chirp in one dimension under gp-ucb: the search crowded half of its executions on the second highest
-wave, the trials at 0 and 0.13 are both half as high as d*, and the highest wave is between them.
+The one false verdict is a chirp in one dimension with gp-ucb. The search placed half of its executions on the second
+highest wave. The trials at 0 and 0.13 are both half as high as d*, and the highest wave is between them.
 
-### What it costs
+### Cost of the rule
 
-The paper's systems, searched by `auto`, with tau = {above:g} d*; the same seeds before and now.
+The paper's systems were searched by `auto` with tau = {above:g} d*. The seeds are the same before and now.
 
 {price}
 """
@@ -132,7 +138,7 @@ def verdict_table(found: Found) -> str:
     return table(
         [
             *("function", "", "search"),
-            *(f"tau = {below:g} d*: validated, falsely", "executions"),
+            *(f"tau = {below:g} d*: falsely validated", "executions"),
             *(f"tau = {above:g} d*: left undecided", "executions"),
         ],
         rows,
@@ -198,8 +204,8 @@ def before_summary() -> str:
     """Return how many verdicts were false on the same functions before the rule."""
     results = _below(decided(((family, d) for family in REPORTING for d in DIMENSIONS), 1))
     return (
-        f"Before there was a rule for corners, and tests: {false_of(results)[1]}, in one and two dimensions. "
-        "(Campaigns falsified before anything was covered are the same then and now, and were run once.)"
+        f"Without the corner rule and the tests: {false_of(results)[1]}, in one and two dimensions. (Campaigns that "
+        "are falsified before the covering starts are the same with and without them, and were run once.)"
     )
 
 
@@ -216,7 +222,7 @@ def chosen_table() -> str:
         again = _below(now, family, d)
         still = sum(result["answer"] == "validated" for result in again)
         rows.append([family, f"{d}-D", text, f"{still} of {len(again)}" if again else "-"])
-    return table(["function", "", "before: validated, falsely", "of these again, now"], rows)
+    return table(["function", "", "before: falsely validated", "of these, false now"], rows)
 
 
 def price_table() -> str:

@@ -45,13 +45,13 @@ STORED = JsonLines(ROOT / "benchmarks" / "results" / "reliability.jsonl", ("faul
 PAGE = ROOT / "docs" / "reliability.md"
 
 FAULTS = {
-    "kill": "`kill -9` of the campaign, one worker, at a random instant",
-    "kill workers": "`kill -9` of the campaign with three workers, at a random instant",
+    "kill": "`kill -9` of a campaign with one worker, at a random time",
+    "kill workers": "`kill -9` of a campaign with three workers, at a random time",
     "kill worker": "`kill -9` of one of three workers",
-    "kill scheduler": "`kill -9` of the Dask scheduler, resumed on another",
-    "kill command": "`kill -9` of the process of a `Subprocess` system, whose failures are repeated once",
-    "flip": "1 to 3 bytes of the store changed",
-    "cut": "the store cut at a random byte",
+    "kill scheduler": "`kill -9` of the Dask scheduler; the campaign is resumed with another scheduler",
+    "kill command": "`kill -9` of the process of a `Subprocess` system; failures are repeated once",
+    "flip": "1 to 3 bytes of the store are changed",
+    "cut": "the store is truncated at a random byte",
 }
 SYNCHRONOUS = {"own": "as they are", "FULL": "with `synchronous = FULL`"}
 CRASH_COLUMNS = ("resumed", "lost", "changed", "twice", "refused")
@@ -223,7 +223,7 @@ def damage(count: int, folder: Path, seed: int, *, cut: bool) -> dict[str, int]:
 HEAD = """\
 # Reliability
 
-Faults inflicted on real processes and files, and what came of them. Written by `benchmarks/reliability.py` from
+Faults were injected into real processes and files. `benchmarks/reliability.py` writes this page of results from
 `benchmarks/results/reliability.jsonl`; running it again adds to the counts.
 
 """
@@ -231,69 +231,74 @@ Faults inflicted on real processes and files, and what came of them. Written by 
 POWER = """
 ## Power cuts
 
-A power cut takes the page cache too: what was written and not synced may be on the disk, in part, in any order, or not
-at all. `make crash-states` runs campaigns (random search, failures, two workers, by hand in many processes, killed and
-resumed, a distance that raises, a full disk) under `strace`, which sees what the package and Python's own SQLite write
-and sync. After each of these acts the power is cut, in many ways: writes dropped, torn at sectors of 512 bytes or at
-any byte, reordered, holes full of old data; names in folders as journalling file systems keep them (*ordered*: the
-first few changes since the last sync), or each at will as POSIX allows (*strict*). Every disk that is left is opened:
-the store must hold all that was acknowledged before the cut, and at most the one transaction more that was being
-written.
+A power cut also loses the page cache. Data that were written but not synchronised may be on the disk completely, in
+part, in another order, or not at all. `make crash-states` runs campaigns under `strace`, which records what the package
+and Python's own SQLite write and synchronise. The campaigns include random search, failures, two workers, manual
+operation in many processes, a kill and a resume, a distance that raises an exception, and a full disk.
+
+After each recorded operation, power cuts are simulated in many ways. Writes are dropped, torn at sectors of 512 bytes
+or at any byte, or reordered, and holes contain old data. File names in folders are treated in two modes. In the mode
+*ordered*, the first few changes since the last synchronisation survive, as on journalling file systems. In the mode
+*strict*, any subset of the changes survives, as POSIX allows. Every resulting disk is opened. The store must contain
+all transactions that were acknowledged before the cut, and at most the one further transaction that was being written.
 
 """
 
 POWER_TAIL = """
-- *cuts* counts what was tried, *disks* those that differ; *resumed* are campaigns that went on to the end of their
-  budget.
-- *lost*: an acknowledged transaction was not there; *changed*: something was there that had never been written;
-  *twice*: the resumed campaign executed again what had ended; *refused*: the store could not be opened.
-- With `synchronous = FULL`, SQLite's default, a removed journal may come back, and takes the last transaction with it.
-  Stores use `EXTRA`, and new folders are synced into those that they are in.
+- *cuts*: number of simulated power cuts. *disks*: number of different resulting disks. *resumed*: number of campaigns
+  that continued to the end of their budget.
+- *lost*: an acknowledged transaction was missing. *changed*: the store contained something that had never been written.
+  *twice*: the resumed campaign repeated an execution that had ended. *refused*: the store could not be opened.
+- With `synchronous = FULL`, SQLite's default, a removed journal may reappear, and the last transaction is then lost.
+  Stores use `EXTRA`, and a new folder is synchronised into its parent folder.
 """
 
 HOSTILE = """
 ## Hostile input
 
-`make attack` makes each input from a seed and runs its command line, each in a process of its own: what `ctxval` prints
-and how it ends is looked at, its memory and time are bounded, and an audit hook sees whether it runs or writes what it
-should not. A share goes through interpreters of their own, as a shell starts them.
+`make attack` creates each input from a seed and runs the corresponding command line in a process of its own. It checks
+the output and the exit status of `ctxval` and limits its memory and time. An audit hook detects whether `ctxval` runs
+or writes something that it should not. Some of the inputs run in a newly started interpreter, as from a shell; the
+column *apart* counts these.
 
 """
 
 HOSTILE_TAIL = """
-- *traceback*: an exception reached the top; *hang*: more than 12 s of processor time; *memory*: more than 700 MB beyond
-  the interpreter with the package; *status*: an exit status that the README does not list, or a signal.
-- *code*: something of the input ran, where the input is data; *elsewhere*: a file outside of the folder was written.
-- *output*: control characters, more than 200 kB, no JSON where `--json` promised it, or a failure without a word.
-- *largest*: the most memory of one process, the interpreter with the package included.
+- *traceback*: an exception reached the top level. *hang*: more than 12 s of processor time. *memory*: more than 700 MB
+  in addition to the interpreter with the package. *status*: an exit status that the README does not list, or a signal.
+- *code*: a part of the input was run although the input is data. *elsewhere*: a file outside the folder was written.
+- *output*: control characters, more than 200 kB, no JSON although `--json` was given, or a failure without a message.
+- *largest*: the peak memory of one process, including the interpreter with the package.
 """
 
 PROCESSORS = """
 ## Other processors
 
-A campaign is repeated bit for bit on one kind of processor. The kernels of another one round otherwise in linear
-algebra: distances differ in their last digits, and what a search chooses by what an optimiser makes of that. A campaign
-that is moved goes on with all of its trials: `tests/test_processors.py` runs one with the kernels of one processor and
-resumes it with those of another.
+A campaign is repeatable bit for bit on one kind of processor. The linear algebra kernels of another kind round
+differently. Distances then differ in their last digits, and the choices of a search differ by the effect of this on an
+optimiser. A campaign that is moved to another processor continues with all of its trials:
+`tests/campaign/test_processors.py` runs a campaign with the kernels of one processor and resumes it with those of
+another.
 
-## Everything else
+## Other faults
 """
 
 COUNTED = """
-- *midway*: some executions had been stored, and not all. The instants of the first row are drawn over the time that the
-  unbroken campaign takes, so that some fall before the first execution is stored, or after the last.
-- *lost*: a stored execution was gone or changed after the fault; *twice*: one was counted twice.
-- *same end*: the resumed campaign ended as the unbroken one did, bit for bit.
-- *noticed*: reading the store gave an error that says so; *harmless*: every trial and every trajectory was read as it
-  had been written; *silent*: something was read that had never been written.
+- *midway*: some of the executions were stored, but not all. The times of the first row are drawn over the duration of
+  the uninterrupted campaign, so some kills come before the first execution is stored, or after the last.
+- *lost*: a stored execution was missing or changed after the fault. *twice*: an execution was counted twice.
+- *same end*: the resumed campaign ended exactly as the uninterrupted one, bit for bit.
+- *noticed*: reading the store gave an error that reports the damage. *harmless*: every trial and every trajectory was
+  read as it had been written. *silent*: something was read that had never been written.
 """
 
 TAIL = """
-The tests inflict each of them too, fewer times, and besides: a store on a full disk and in a read-only folder, a clock
-that is set back, executions that hang, raise, return NaN, the wrong shape or a part of a trajectory, Ctrl-C once and
-twice, a Dask worker killed in a campaign, an FMU that crashes or hangs, several terminals at once, random sequences of
-asking, telling, running and dying against a model of the store, and random bytes for every reader
-(`tests/test_faults.py`, `tests/test_workers.py`, `tests/test_hand.py`, `tests/test_kill.py`, `tests/systems`).
+The tests inject each of these faults too, fewer times. They also cover a store on a full disk or in a read-only folder,
+and a clock that is set back. Executions hang, raise an exception, or return NaN, the wrong shape or a part of a
+trajectory. Ctrl-C comes once and twice. A Dask worker is killed during a campaign. An FMU crashes or hangs. Several
+terminals are used at once. Random sequences of asking, telling, running and killing are compared with a model of the
+store, and every reader gets random bytes (`tests/campaign/test_faults.py`, `tests/campaign/test_workers.py`,
+`tests/campaign/test_by_hand.py`, `tests/campaign/test_kill.py`, `tests/systems`).
 """
 
 
