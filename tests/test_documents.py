@@ -5,10 +5,14 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
+from typing import Any, get_args
 
+import numpy as np
 import pytest
 
+from ctxval.certificates import KINDS, Sample, certify_audit, certify_convergence, certify_posterior, draw_maxima
 from ctxval.config.settings import Settings
+from ctxval.core.trial import Origin, State
 from ctxval.testing import check_search
 
 ROOT = Path(__file__).parents[1]
@@ -40,9 +44,42 @@ def test_the_search_of_the_contributing_guide_conforms() -> None:
 
 @pytest.mark.parametrize(
     "document",
-    ["README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/theory.md", "docs/search.md", "docs/security.md"],
+    [
+        "README.md",
+        "CONTRIBUTING.md",
+        *(f"docs/{name}.md" for name in ("architecture", "calibration", "glossary", "search", "security", "theory")),
+    ],
 )
 def test_links_lead_somewhere(document: str) -> None:
     path = ROOT / document
     for target in re.findall(r"\]\(([^)#:]+)\)", path.read_text()):
         assert (path.parent / target).exists(), target
+
+
+def keys(report: Any) -> set[str]:
+    """Return the keys of a report, at every depth."""
+    if not isinstance(report, dict):
+        return set()
+    return set(report).union(*(keys(value) for value in report.values()))
+
+
+def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
+    points = np.linspace(0.05, 0.95, 8)[:, None]
+    origins: list[Origin] = ["iid"] * 4 + ["acquisition"] * 4
+    sample = Sample(points, np.sin(5 * points[:, 0]) + 2, origins, ["completed"] * 8)
+    certificates = [
+        certify_audit(sample),
+        certify_convergence(sample, 1.0),
+        certify_posterior(sample, 0.5, found=draw_maxima(sample, draws=4, paths=2)),
+    ]
+    used = set().union(*(keys(certificate.to_json()) for certificate in certificates))
+    used |= {*get_args(Origin), *get_args(State), *KINDS, "validated", "falsified", "undecided"}
+    explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    assert used <= set(explained)
+
+
+def test_the_glossary_is_in_alphabetical_order() -> None:
+    lines = (ROOT / "docs" / "glossary.md").read_text().splitlines()
+    terms = [line.split("|")[1].strip().replace("`", "").lower() for line in lines if line.startswith("| ")][1:]
+    assert len(terms) > 100
+    assert terms == sorted(terms)

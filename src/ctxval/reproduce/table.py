@@ -37,8 +37,7 @@ def table_text(out: Path, studies: Sequence[Study], results: Results, scale: Sca
     for study in studies:
         lines += ["", f"## {study.title}", "", f"![{study.title}]({out.name}/{study.name}.png)", ""]
         lines += [f"Data: [{study.name}.csv]({out.name}/{study.name}.csv)"]
-    said = "The paper gives few of them. These are the values used here, with the reason for each:"
-    lines += ["", "## Free parameters", "", said]
+    lines += ["", "## Free parameters", "", "The paper gives few of them. These values are used here, with reasons:"]
     for case in dict.fromkeys(study.case for study in studies):
         lines += ["", f"### {case}", "", *_parameters(case)]
     return "\n".join(lines) + "\n"
