@@ -2,9 +2,15 @@
 
 An implementation of CuSTOM, *Context-Specific Validation of Data-Driven Models* (Bansal, Ghosh,
 Sangiovanni-Vincentelli, Seshia and Tomlin).
+
+The part packages, such as ``ctxval.controllers``, are imported when they are first used.
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from ctxval._util.arrays import Array
+from ctxval._util.registry import part
 from ctxval.campaign import Campaign, OpenTrial
 from ctxval.certificates.verdict import Verdict
 from ctxval.core.experiment import Experiment
@@ -16,6 +22,20 @@ from ctxval.core.truth import Truth, cached_truth, grid_truth, search_truth
 from ctxval.core.validation import Outcome, Plan, Validation
 from ctxval.storage.store import Store
 from ctxval.version import VERSION
+
+if TYPE_CHECKING:
+    from ctxval import cases as cases
+    from ctxval import certificates as certificates
+    from ctxval import controllers as controllers
+    from ctxval import distances as distances
+    from ctxval import errors as errors
+    from ctxval import gp as gp
+    from ctxval import models as models
+    from ctxval import plot as plot
+    from ctxval import reproduce as reproduce
+    from ctxval import searches as searches
+    from ctxval import systems as systems
+    from ctxval import testing as testing
 
 __version__ = VERSION
 
@@ -38,5 +58,34 @@ __all__ = [
     "Verdict",
     "cached_truth",
     "grid_truth",
+    "part",
     "search_truth",
 ]
+
+_SUBMODULES = (
+    "cases",
+    "certificates",
+    "controllers",
+    "distances",
+    "errors",
+    "gp",
+    "models",
+    "plot",
+    "reproduce",
+    "searches",
+    "systems",
+    "testing",
+)
+"""The public modules, which ``import ctxval`` alone makes usable: each is imported when it is first used."""
+
+
+if not TYPE_CHECKING:  # a type checker, which reads the imports above, would take any name for granted
+
+    def __getattr__(name: str) -> Any:
+        if name in _SUBMODULES:
+            return importlib.import_module(f"{__name__}.{name}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*__all__, *_SUBMODULES, "__version__"})

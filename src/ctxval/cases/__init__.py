@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from typing import Any
 
 from ctxval import Experiment
-from ctxval.errors import UnknownNameError
+from ctxval._util.registry import Registry
+from ctxval.errors import InputError, UnknownNameError
 
 NAMES: dict[str, str] = {
     "pendulum": "inverted pendulum, learned linear model, iLQR to a goal angle (1-D)",
@@ -15,9 +15,12 @@ NAMES: dict[str, str] = {
     "dubins": "Dubins car, learned linear model, LQR along ten sine waves (11-D)",
     "linear": "random linear systems and models with n = 1 to 10 states, random feedback (2 n-D)",
 }
-"""The cases that the command line knows, and what each is."""
+"""The cases of this package, each the function ``experiment`` of the module of its name, and what each is."""
 
-__all__ = ["NAMES", "by_name"]
+__all__ = ["NAMES", "REGISTRY", "by_name", "options_of"]
+
+REGISTRY = Registry("case", __name__, modules={name: f"{__name__}.{name}:experiment" for name in NAMES})
+"""The cases that are found by name: those of this package, and those that installed packages add."""
 
 
 def by_name(name: str, /, seed: int = 0, **options: Any) -> Experiment:
@@ -25,14 +28,27 @@ def by_name(name: str, /, seed: int = 0, **options: Any) -> Experiment:
 
     Raises:
         UnknownNameError: there is no such case, or it has no such option; the message has the nearest name.
-        InputError: the value of an option is not allowed.
+        InputError: the value of an option is not allowed, or the case of an installed package gives no experiment.
     """
-    if name not in NAMES:
-        raise UnknownNameError.among("case", name, NAMES)
-    build = importlib.import_module(f"ctxval.cases.{name}").experiment
-    taken = list(inspect.signature(build).parameters)[1:]
+    taken = options_of(name)
     for option in options:
         if option not in taken:
             raise UnknownNameError.among(f"option of the case {name!r}", option, taken)
-    case: Experiment = build(seed, **options)
+    case = REGISTRY.find(name)(seed, **options)
+    if not isinstance(case, Experiment):
+        raise InputError(f"the case {name!r} must make an Experiment, got {type(case).__name__}.")
     return case
+
+
+def options_of(name: str) -> dict[str, Any]:
+    """Return the options of a case with their defaults, ``inspect.Parameter.empty`` if there is none.
+
+    The first parameter of a case is its seed, which is not an option.
+
+    Raises:
+        UnknownNameError: there is no such case.
+        InputError: the case belongs to an installed package and cannot be loaded.
+    """
+    parameters = list(inspect.signature(REGISTRY.find(name)).parameters.values())[1:]
+    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return {parameter.name: parameter.default for parameter in parameters if parameter.kind not in variadic}

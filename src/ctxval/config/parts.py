@@ -1,4 +1,7 @@
-"""The parts of an experiment by name, as experiment files give them; nothing in them is code but ``module:attr``."""
+"""The parts of an experiment, made from the tables of an experiment file.
+
+A table names a part of a registry, or ``module:attr``. Only the latter, and parts of installed packages, are code.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -16,7 +18,7 @@ from pydantic_core import SchemaError
 from ctxval import controllers, distances, models, systems
 from ctxval._util.files import read_bytes
 from ctxval._util.npz import Archive
-from ctxval._util.texts import reason_of
+from ctxval._util.registry import Declaration, Registry, construct, declaration_of
 from ctxval.config.references import accepts, is_function, reference, require_function, require_part
 from ctxval.core.model import Model
 from ctxval.core.space import Parameters, TaskSpace
@@ -24,33 +26,11 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
 
-_ROOMS: dict[str, tuple[ModuleType, tuple[str, ...]]] = {
-    "system": (systems, ("FMU", "Function", "Gymnasium", "Manual", "MuJoCo", "Simulated", "Subprocess")),
-    "model": (models, ("Function", "GaussianProcessModel", "Linear", "Onnx", "ScikitLearn", "state_space")),
-    "synthesizer": (controllers, ("ILQR", "LQR", "MPC", "OnnxPolicy", "Policy", "StationaryLQR")),
-    "distance": (distances, ("FinalState", "GoalError", "MeanDeviation", "WholeTrajectory")),
+REGISTRIES: dict[str, Registry] = {
+    registry.kind: registry
+    for registry in (systems.REGISTRY, models.REGISTRY, controllers.REGISTRY, distances.REGISTRY)
 }
-
-DATA_ONLY: dict[str, tuple[str, ...]] = {
-    "system": ("Function", "Manual", "MuJoCo", "Simulated"),
-    "model": _ROOMS["model"][1],
-    "synthesizer": _ROOMS["synthesizer"][1],
-    "distance": _ROOMS["distance"][1],
-}
-"""Parts that run no code but what ``{ref = "module:attr"}`` gives them; the others run programs or foreign code."""
-
-_FILES = {"FMU": "path", "MuJoCo": "mjcf", "Onnx": "source", "OnnxPolicy": "source"}
-"""Arguments that are files, by part."""
-
-_FUNCTIONS = {
-    "step": (2, "(x, u) -> x_next"),
-    "execute": (2, "(controller, task) -> trajectory"),
-    "get_state": (1, "environment -> x"),
-    "set_state": (2, "(environment, x)"),
-    "observe": (3, "(t, x, task) -> observations"),
-    "policy": (3, "(t, x, task) -> u"),
-}
-"""Arguments of built-in parts that are functions: of how many arguments, and which."""
+"""Where the parts that an experiment file describes are found, by the name of their table."""
 
 
 def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) -> Any:
@@ -58,8 +38,8 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) 
 
     Args:
         kind: which of them.
-        given: ``module:attr``; or a table with ``type``, a built-in name or ``module:attr``, and its arguments. An
-            argument ``{ref = "module:attr"}`` is what that names. A model with ``data``, files of trajectories, is
+        given: ``module:attr``; or a table with ``type``, a name of the registry or ``module:attr``, and its arguments.
+            An argument ``{ref = "module:attr"}`` is what that names. A model with ``data``, files of trajectories, is
             learned from them.
         folder: where files and modules are sought; the current folder by default.
 
@@ -67,35 +47,37 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) 
         UnknownNameError: there is no such part, or it takes no such argument.
         InputError: it cannot be made so; the message says why.
     """
+    registry = REGISTRIES[kind]
     table = {"type": given} if isinstance(given, str) else dict(given)
     name = table.pop("type", None)
     if not isinstance(name, str):
-        raise InputError(f"[{kind}] needs a type, such as {_ROOMS[kind][1][0]!r} or 'module:attr'.")
+        raise InputError(f"[{kind}] needs a type, such as {registry.built_in[0]!r} or 'module:attr'.")
     what = f"the {kind} {name}"
     if ":" in name:
         arguments = {key: argument(value, folder) for key, value in table.items()}
-        return _own(kind, what, reference(name, folder), arguments, folder)
-    room, names = _ROOMS[kind]
-    if name not in names:
-        raise UnknownNameError.among(kind, name, names)
-    arguments = {key: argument(value, folder) for key, value in _beside(name, table, folder).items()}
+        return _referenced(registry, what, reference(name, folder), arguments, folder)
+    build = registry.find(name)
+    declared = declaration_of(build) or Declaration(name)
+    arguments = {key: argument(value, folder) for key, value in _with_paths(declared, table, folder).items()}
     for key, value in arguments.items():
-        if key in _FUNCTIONS and isinstance(table[key], Mapping) and not isinstance(value, Model):
-            require_function(f"{key} of {what}", value, *_FUNCTIONS[key])
-    return _built(kind, what, getattr(room, name), arguments, folder)
+        if key in declared.functions and isinstance(table[key], Mapping) and not isinstance(value, Model):
+            require_function(f"{key} of {what}", value, declared.functions[key])
+    return registry.require_made(name, _built(kind, what, build, arguments, folder))
 
 
-def _own(kind: str, what: str, found: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
+def _referenced(registry: Registry, what: str, found: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
     """Return the part that a reference names: an object, or what a class or a function makes; checked before a call."""
+    kind = registry.kind
     if isinstance(found, type):
-        return require_part(kind, what, _built(kind, what, require_part(kind, what, found), arguments, folder))
+        build = require_part(registry, what, found)
+        return require_part(registry, what, _built(kind, what, build, arguments, folder))
     if inspect.isfunction(found) and (arguments or not _is_part(kind, found)):
         if not arguments and not accepts(found, 0):
-            require_part(kind, what, found)  # says what is wrong
-        return require_part(kind, what, _built(kind, what, found, arguments, folder))
+            require_part(registry, what, found)  # says what is wrong
+        return require_part(registry, what, _built(kind, what, found, arguments, folder))
     if arguments:
         raise InputError(f"{what} is an object already, so it takes no arguments, got {', '.join(arguments)}.")
-    return require_part(kind, what, found)
+    return require_part(registry, what, found)
 
 
 def _is_part(kind: str, found: Any) -> bool:
@@ -106,40 +88,21 @@ def _is_part(kind: str, found: Any) -> bool:
 def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
     if kind == "model" and "data" in arguments and hasattr(build, "fit"):
         build, arguments = build.fit, {**arguments, "data": recorded(arguments["data"], folder)}
-    return made(what, build, arguments)
+    return construct(what, build, arguments)
 
 
-def _beside(name: str, table: Mapping[str, Any], folder: Path | None) -> dict[str, Any]:
-    """Return a built-in part's arguments, with the files that it names in the folder."""
+def _with_paths(declared: Declaration, table: Mapping[str, Any], folder: Path | None) -> dict[str, Any]:
+    """Return the arguments of a part, in which the paths that they name begin with the folder."""
     found = dict(table)
     if folder is None:
         return found
-    if name == "Subprocess":
-        found["folder"] = str(folder / str(found.get("folder", "")))
-    file = found.get(_FILES.get(name, ""))
-    if isinstance(file, str) and "<" not in file:  # which begins a model of MuJoCo as text
-        found[_FILES[name]] = str(folder / file)
+    if declared.folder is not None:
+        found[declared.folder] = str(folder / str(found.get(declared.folder, "")))
+    for name in declared.files:
+        file = found.get(name)
+        if isinstance(file, str) and "<" not in file:  # which begins a model of MuJoCo as text
+            found[name] = str(folder / file)
     return found
-
-
-def made(what: str, build: Any, arguments: Mapping[str, Any]) -> Any:
-    """Call what makes a part.
-
-    Raises:
-        UnknownNameError: it takes no such argument.
-        InputError: it refuses these arguments.
-    """
-    try:
-        signature = inspect.signature(build)
-        if not any(p.kind is p.VAR_KEYWORD for p in signature.parameters.values()):
-            for key in arguments:
-                if key not in signature.parameters:
-                    raise UnknownNameError.among(f"argument of {what}", key, signature.parameters)
-        return build(**arguments)
-    except CtxvalError:
-        raise
-    except Exception as error:
-        raise InputError(f"{what} cannot be made: {reason_of(error)}.") from error
 
 
 def argument(value: Any, folder: Path | None = None) -> Any:
@@ -237,7 +200,7 @@ def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any,
         InputError: the table misses something, or names what is no task parameter.
     """
     if isinstance(given, str):
-        return require_function(f"the task {given}", reference(given, folder), 1, "p -> Task")
+        return require_function(f"the task {given}", reference(given, folder), "p -> Task")
     for key in given:
         if key not in _TASK_KEYS:
             raise UnknownNameError.among("entry of [task]", key, _TASK_KEYS)

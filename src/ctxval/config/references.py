@@ -13,11 +13,9 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
+from ctxval._util.registry import Registry, has_method
 from ctxval._util.texts import reason_of
 from ctxval.errors import CtxvalError, InputError
-
-_METHODS = {"system": "execute", "model": "step", "synthesizer": "design", "distance": "__call__"}
-"""The method that makes an object a part of an experiment, by kind."""
 
 _added: set[str] = set()
 """Folders of experiments that were put on the path of modules here."""
@@ -146,20 +144,20 @@ def _place(file: str | None, folders: Any) -> str | None:
 # What is expected of it
 
 
-def require_part(kind: str, what: str, found: Any) -> Any:
+def require_part(registry: Registry, what: str, found: Any) -> Any:
     """Return an object or a class if it has the method of its kind, a model or a distance also if it is a function.
 
     Args:
-        kind: system, model, synthesizer or distance.
+        registry: of the systems, models, synthesizers or distances.
         what: how the object is called in the message.
         found: the object or the class, which is not called here.
 
     Raises:
         InputError: it has not.
     """
-    method = _METHODS[kind]
+    kind, method = registry.kind, str(registry.method)
     if isinstance(found, type):
-        has = any(callable(vars(base).get(method)) for base in found.__mro__)
+        has = has_method(found, method)
     elif kind == "distance":
         has = is_function(found) and accepts(found, 3)
     else:
@@ -172,18 +170,18 @@ def require_part(kind: str, what: str, found: Any) -> Any:
     return found
 
 
-def require_function(what: str, found: Any, count: int, form: str) -> Any:
-    """Return a function that takes so many arguments; it is not called here.
+def require_function(what: str, found: Any, form: str) -> Any:
+    """Return a function that takes as many positional arguments as its form says; it is not called here.
 
     Args:
         what: how it is called in the message.
         found: the function.
-        count: of its positional arguments.
-        form: how the message describes it, such as ``p -> Task``.
+        form: the arguments and what they give, such as ``(x, u) -> x_next`` or ``p -> Task``.
 
     Raises:
         InputError: it is no function written in Python, or takes other arguments.
     """
+    count = form.partition("->")[0].count(",") + 1
     if not is_function(found):
         raise InputError(f"{what} must be a function {form} written in Python, got {_named(found)}.")
     if not accepts(found, count):

@@ -1,29 +1,25 @@
-"""Experiments by name: cases, experiment files and ``module:attr`` references."""
+"""Settings: what to run, as an experiment file and the command line say it, and as a store keeps it."""
 
 from __future__ import annotations
 
-import importlib
 import shlex
 import tomllib
-from inspect import signature
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from ctxval import cases
-from ctxval._util.texts import reason_of
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import KINDS, RESOLUTION, USES, require_use
 from ctxval.certificates.verdict import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME
+from ctxval.config.experiments import named_experiment
 from ctxval.config.parts import argument, part, require_types, space_of, task_function
-from ctxval.config.references import accepts, is_function, reference
 from ctxval.config.signatures import code_named, signed, unsigned, verifies
 from ctxval.core.experiment import Experiment, labels_of
 from ctxval.core.validation import Validation
-from ctxval.errors import CertificateError, CtxvalError, InputError, UnknownNameError
-from ctxval.searches import NAMES as SEARCHES
+from ctxval.errors import CertificateError, InputError, UnknownNameError
+from ctxval.searches import REGISTRY as SEARCHES
 from ctxval.searches import Search, by_name
 from ctxval.storage.store import Store
 
@@ -51,8 +47,7 @@ class SearchTable(BaseModel):
             InputError: it does not take these options.
         """
         options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
-        if self.name in SEARCHES:
-            options = require_types(f"search {self.name!r}", SEARCHES[self.name], options)
+        options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
         return by_name(self.name, repeats=self.repeats, **options)
 
 
@@ -162,9 +157,7 @@ class Settings(BaseModel):
             )
         if "seed" in self.options:
             raise InputError("the seed stands beside [options], not in it.")
-        if ":" in self.experiment:
-            return _from_reference(self.experiment, self.seed, self.options, self.folder)
-        return _case(self.experiment, self.seed, self.options)
+        return named_experiment(self.experiment, self.seed, self.options, self.folder)
 
     def _described(self) -> Experiment:
         missing = [name for name in _WHOLE if getattr(self, name) is None]
@@ -380,38 +373,3 @@ def _sentence(target: str, error: ValidationError) -> str:
         table = CertificateTable if first["loc"][:-1] == ("certificate",) else Settings
         return f"{target}: {UnknownNameError.among('setting', str(first['loc'][-1]), table.model_fields)}"
     return f"{target}: {where}: {first['msg'].lower()}, got {str(first['input'])[:100]!r}."
-
-
-def _case(name: str, seed: int, options: dict[str, Any]) -> Experiment:
-    """Return a case; its options are plain values."""
-    if name in cases.NAMES and options:
-        build = importlib.import_module(f"ctxval.cases.{name}").experiment
-        options = require_types(f"case {name!r}", build, options)
-    return cases.by_name(name, seed, **options)
-
-
-def _from_reference(text: str, seed: int, options: dict[str, Any], folder: Path | None) -> Experiment:
-    """Return what ``module:attr`` names or makes; this runs the module's code."""
-    found = reference(text, folder)
-    if is_function(found) and not isinstance(found, Validation | Experiment):
-        found = _called(text, found, seed, options)
-    if isinstance(found, Validation):
-        return Experiment(text.partition(":")[2], found)
-    if not isinstance(found, Experiment):
-        raise InputError(
-            f"{text} must be an Experiment or a Validation, or a function of a seed that makes one, "
-            f"got {type(found).__name__}."
-        )
-    return found
-
-
-def _called(text: str, make: Any, seed: int, options: dict[str, Any]) -> Any:
-    if not accepts(make, 1, **options):
-        given = f" {', '.join(options)}" if options else ""
-        raise InputError(f"{text} must be callable with a seed and its options{given}; it takes {signature(make)}.")
-    try:
-        return make(seed, **options)
-    except CtxvalError:
-        raise
-    except Exception as error:
-        raise InputError(f"{text} failed: {reason_of(error)}.") from error

@@ -12,12 +12,14 @@ import json
 import os
 import secrets
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ctxval.config.parts import DATA_ONLY
+from ctxval import cases, searches
+from ctxval.certificates import KINDS
+from ctxval.config.parts import REGISTRIES
 from ctxval.errors import InputError
 
 SIGNATURES = "signatures"
@@ -164,8 +166,9 @@ def _read_key(path: Path) -> bytes:
 def code_named(settings: Mapping[str, Any]) -> list[str]:
     """Return what in settings would be imported or run if their experiment were built; each as a text to show.
 
-    Whatever is not known to be data counts as code: a reference anywhere, a task by name, and every part but those of
-    :data:`ctxval.config.parts.DATA_ONLY`.
+    Whatever is not known to be data counts as code: a reference anywhere, a task by name, a part of this package that
+    runs programs or foreign libraries, and every case, part, search and certificate that this package does not have:
+    an installed package may have it, and its code would be imported. No package is looked at to find out.
     """
     try:
         return _code_named(settings)
@@ -174,18 +177,28 @@ def code_named(settings: Mapping[str, Any]) -> list[str]:
 
 
 def _code_named(settings: Mapping[str, Any]) -> list[str]:
-    found = [_shown(key, settings[key]) for key in ("experiment", "task") if _is_reference(key, settings.get(key))]
-    for kind, harmless in DATA_ONLY.items():
-        given = settings.get(kind)
-        name = given.get("type") if isinstance(given, Mapping) else given
-        if name is not None and name not in harmless:
-            found.append(_shown(kind, given))
+    found = []
+    if isinstance(settings.get("task"), str):
+        found.append(_shown("task", settings["task"]))
+    for key, name_key, is_data in _NAMED:
+        given = settings.get(key)
+        name = given.get(name_key) if name_key and isinstance(given, Mapping) else given
+        if name is not None and not is_data(name):
+            found.append(_shown(key, given))
     return [*found, *_references("", settings)]
 
 
-def _is_reference(key: str, value: Any) -> bool:
-    """Return whether a setting is code by name; experiments without a colon are cases of ours or nothing."""
-    return isinstance(value, str) and (":" in value or key == "task")
+def _is_kind(name: Any) -> bool:
+    return isinstance(name, str) and name in KINDS
+
+
+_NAMED: tuple[tuple[str, str | None, Callable[[Any], bool]], ...] = (
+    ("experiment", None, cases.REGISTRY.is_data),
+    *((kind, "type", registry.is_data) for kind, registry in REGISTRIES.items()),
+    ("search", "name", searches.REGISTRY.is_data),
+    ("certificate", "kind", _is_kind),
+)
+"""Settings that name a part: the key, the key of the name if it is a table, and whether a name is known to be data."""
 
 
 def _references(where: str, value: Any) -> Iterator[str]:

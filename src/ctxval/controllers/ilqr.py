@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
+from ctxval._util.registry import part
 from ctxval._util.representation import call, record
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
@@ -56,6 +57,7 @@ class ILQRSolution:
         return record(self)
 
 
+@part()
 class ILQR:
     """Finite-horizon iterative LQR on any model, a whole batch of tasks at once.
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike
+from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
@@ -15,6 +16,7 @@ from ctxval.core.task import Task
 from ctxval.errors import DesignError, InputError
 
 
+@part()
 class LQR:
     """The linear-quadratic regulator that tracks the task's reference over its horizon.
 
@@ -62,6 +64,7 @@ class LQR:
         return call(self, **self.cost.weights(), limits=self.limits)
 
 
+@part()
 class StationaryLQR:
     """The infinite-horizon linear-quadratic regulator: one gain, from the algebraic Riccati equation.
 

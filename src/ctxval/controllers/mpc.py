@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
+from ctxval._util.registry import part
 from ctxval._util.representation import call, record
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import Limits, LimitsLike
@@ -22,6 +23,7 @@ _EXACT = 2.0  # the merit's weight of violations, in multiplicities of the large
 _STRICT = 1e-6  # quadratic share of the cost of a violation, which keeps the problem strictly convex
 
 
+@part()
 class MPC:
     """Receding-horizon control that plans with limits, by sequential quadratic programming in CasADi.
 

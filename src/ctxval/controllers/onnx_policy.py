@@ -11,6 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
+from ctxval._util.registry import part
 from ctxval._util.representation import call, record
 from ctxval.core.controller import Limits, LimitsLike, describe_limits, given_limits
 from ctxval.core.model import Model
@@ -20,6 +21,7 @@ from ctxval.errors import InputError
 Observe = Callable[[int, Array, Task], Array]
 
 
+@part(files=("source",), functions={"observe": "(t, x, task) -> observations"})
 class OnnxPolicy:
     """The same trained network for every task, as a synthesizer; the model is not asked.
 

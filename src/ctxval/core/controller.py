@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_floats
+from ctxval._util.registry import part
 from ctxval._util.representation import call, record
 from ctxval.core.model import Model
 from ctxval.core.task import Task
@@ -198,6 +199,7 @@ class AffineFeedback:
         return call(self, gains=self.gains, inputs=self.inputs, limits=self.limits)
 
 
+@part(functions={"policy": "(t, x, task) -> u"})
 class Policy:
     """The same policy for every task: ``policy(t, x, task) -> u``, as a synthesizer.
 

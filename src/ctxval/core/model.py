@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.errors import InputError, ModelError
 
@@ -26,6 +27,7 @@ class Model(Protocol):
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
 
 
+@part(functions={"step": "(x, u) -> x_next"})
 class Function:
     """A plain function ``(x, u) -> x_next`` as a model.
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ctxval._util.arrays import Array
+from ctxval._util.registry import part
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.distances.base import ErrorNorm, selected
 
 
+@part()
 @dataclass(frozen=True)
 class FinalState(ErrorNorm):
     """Norm of the difference between the final states (the paper's eq. 5, with ``norm=1``).

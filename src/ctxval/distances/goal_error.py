@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ctxval._util.arrays import Array
+from ctxval._util.registry import part
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.distances.base import ErrorNorm, selected
 
 
+@part()
 @dataclass(frozen=True)
 class GoalError(ErrorNorm):
     """Norm of the difference between the system's final state and the goal: both aspects of Remark 1 in one.

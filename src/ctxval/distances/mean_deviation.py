@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, as_norm_order, vector_norm
+from ctxval._util.registry import part
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.distances.base import selected
 
 
+@part()
 @dataclass(frozen=True)
 class MeanDeviation:
     """Mean over the times 1..H of the norm of the difference between the states, e.g. an average in metres.

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, as_norm_order, vector_norm
+from ctxval._util.registry import part
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.distances.base import selected
 
 
+@part()
 @dataclass(frozen=True)
 class WholeTrajectory:
     """Norm of the difference between whole trajectories, as one long vector.

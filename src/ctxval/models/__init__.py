@@ -1,5 +1,10 @@
 """Learned models M: ready-made ones and adapters."""
 
+from __future__ import annotations
+
+from typing import Any
+
+from ctxval._util.registry import Registry
 from ctxval.core.model import Function, Model, linearize
 from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
 from ctxval.models.linear import Linear
@@ -10,6 +15,7 @@ from ctxval.models.scikit_learn import ScikitLearn
 from ctxval.models.state_space import state_space
 
 __all__ = [
+    "REGISTRY",
     "FeedforwardReLU",
     "Function",
     "GaussianProcessModel",
@@ -19,6 +25,25 @@ __all__ = [
     "Onnx",
     "ScikitLearn",
     "SquaredExponential",
+    "by_name",
     "linearize",
     "state_space",
 ]
+
+REGISTRY = Registry("model", __name__, method="step")
+"""The models that are found by name: those of this package, and those that installed packages add."""
+
+
+def by_name(name: str, /, **arguments: Any) -> Model:
+    """Return a new model from its name and its arguments.
+
+    Args:
+        name: of :data:`REGISTRY`, such as ``"Linear"``.
+        arguments: those of its class.
+
+    Raises:
+        UnknownNameError: there is no such model, or it takes no such argument; the message has the nearest name.
+        InputError: the model refuses these arguments.
+    """
+    made: Model = REGISTRY.make(name, **arguments)
+    return made

@@ -10,6 +10,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.registry import part
 from ctxval._util.representation import call, record
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
@@ -48,6 +49,7 @@ class SquaredExponential:
         return record(self)
 
 
+@part()
 class GaussianProcessModel:
     """The posterior mean of Gaussian processes, one for each state's increment, that share a covariance.
 

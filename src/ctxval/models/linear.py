@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
@@ -15,6 +16,7 @@ _LARGEST_CONDITION = 1e8
 """Half of the digits of a double: beyond it the weights are those of rounding and of noise."""
 
 
+@part()
 class Linear:
     """The model ``x_next = A x + B u + c``.
 

@@ -9,10 +9,12 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
+from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
 
 
+@part(files=("source",))
 class Onnx:
     """A network from an ONNX file as a model, of any toolbox that writes one.
 

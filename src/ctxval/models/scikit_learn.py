@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.registry import part
 from ctxval._util.representation import call, name_of
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
 
+@part()
 class ScikitLearn:
     """A fitted regressor of scikit-learn as a model: a pipeline, a forest, ridge regression, a Gaussian process.
 

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, as_finite
+from ctxval._util.registry import part
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.linear import Linear
 
 
+@part()
 def state_space(system: Any, dt: float) -> Linear:
     """Return the linear model, with its Jacobian, of a ``StateSpace`` of python-control or of scipy.
 

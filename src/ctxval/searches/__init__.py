@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from ctxval.errors import InputError, UnknownNameError
+from ctxval._util.registry import Registry
+from ctxval.errors import InputError
 from ctxval.searches.annealing import Annealing
 from ctxval.searches.auto import Auto
 from ctxval.searches.base import Note, Prediction, Search, SequentialSearch
@@ -19,6 +20,7 @@ __all__ = [
     "CMAES",
     "GPUCB",
     "NAMES",
+    "REGISTRY",
     "Annealing",
     "Auto",
     "Climbs",
@@ -33,35 +35,28 @@ __all__ = [
     "by_name",
 ]
 
-NAMES: dict[str, type[Any]] = {
-    "annealing": Annealing,
-    "auto": Auto,
-    "climbs": Climbs,
-    "cma-es": CMAES,
-    "gp-ucb": GPUCB,
-    "random": Random,
-    "sampling-discarding": SamplingDiscarding,
-    "scalar": Scalar,
-}
-"""The searches that the command line and experiment files know."""
+REGISTRY = Registry("search", __name__, method="ask")
+"""The searches that are found by name: those of this package, and those that installed packages add."""
+
+NAMES: dict[str, type[Any]] = {name: REGISTRY.find(name) for name in sorted(REGISTRY.built_in)}
+"""The searches of this package, by name."""
 
 
 def by_name(name: str, *, repeats: int = 1, **options: Any) -> Search:
     """Return a new search from its name and its options.
 
     Args:
-        name: of ``NAMES``.
-        repeats: how often each point is evaluated, of a noisy function.
+        name: of :data:`REGISTRY`, such as ``"auto"``.
+        repeats: how often each point is evaluated; more than once if the function is noisy.
         options: of the search.
 
     Raises:
         UnknownNameError: there is no such search; the message has the nearest name.
-        InputError: it does not take these options.
+        InputError: the search does not take these options, or belongs to an installed package and cannot be loaded.
     """
-    if name not in NAMES:
-        raise UnknownNameError.among("search", name, NAMES)
+    build = REGISTRY.find(name)
     try:
-        search: Search = NAMES[name](**options)
+        search: Search = REGISTRY.require_made(name, build(**options))
     except TypeError as error:
         raise InputError(f"search {name!r}: {error}.") from error
     return search if repeats == 1 else Repeated(search, repeats)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch
 
@@ -12,6 +13,7 @@ _SMALLEST_MOVE = 0.1
 """Moves shrink with the temperature, down to this share of the first ones."""
 
 
+@part("annealing")
 class Annealing(SequentialSearch):
     """A Metropolis walk through the unit cube, at a temperature that falls geometrically.
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.searches.base import Prediction
 from ctxval.searches.trust_region import Climbs
 
 
+@part("auto")
 class Auto(Climbs):
     """Climbs on the distance that executed trajectories predict; the scalar search where there are none.
 

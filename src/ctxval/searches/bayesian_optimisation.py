@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.gp import regression as gp
 from ctxval.gp.acquisition import Acquisition, Box, LogExpectedImprovement, UpperConfidenceBound, maximise
@@ -67,6 +68,7 @@ class _Branch:
         return low, high
 
 
+@part("scalar")
 class Scalar(SequentialSearch):
     """The search where only values are known: expected improvement and upper bounds, with branches out of basins.
 

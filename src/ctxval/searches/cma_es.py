@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch
 
@@ -18,6 +19,7 @@ _POINT = 1e-4
 """A generation that spans less than this of the cube on every axis has nothing left to find."""
 
 
+@part("cma-es")
 class CMAES(SequentialSearch):
     """Covariance matrix adaptation inside the unit cube, one point of a generation after the other.
 

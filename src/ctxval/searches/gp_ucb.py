@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.gp import regression as gp
 from ctxval.gp.acquisition import Uncertainty, UpperConfidenceBound, maximise
@@ -19,6 +20,7 @@ _KEPT = 500
 """Points of a long history that the surrogate is fitted to: its hyperparameters are learned anew each time."""
 
 
+@part("gp-ucb")
 class GPUCB(SequentialSearch):
     """Bayesian optimisation with the GP upper confidence bound (Algorithm 1, eqs. 10 and 11).
 

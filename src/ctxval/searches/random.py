@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch
 
 
+@part("random")
 class Random(SequentialSearch):
     """Independent uniform points: scenario optimisation, SC. Its estimate of d* is the largest distance."""
 
@@ -19,6 +21,7 @@ class Random(SequentialSearch):
         return rng.random(self.dimension)
 
 
+@part("sampling-discarding")
 class SamplingDiscarding(Random):
     """Independent uniform points of which the largest are left out: sampling and discarding, SD.
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, single_threaded
+from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.gp import regression as gp
 from ctxval.gp.ascent import Ascent
@@ -63,6 +64,7 @@ class _Climb:
     stale: int = 0
 
 
+@part("climbs")
 class Climbs(SequentialSearch):
     """Trust-region climbs with restarts on a prediction of the values; the scalar search where there is none any good.
 

@@ -1,5 +1,10 @@
 """True systems S: ready-made ones and adapters."""
 
+from __future__ import annotations
+
+from typing import Any
+
+from ctxval._util.registry import Registry
 from ctxval.core.system import System
 from ctxval.systems.fmu import FMU
 from ctxval.systems.function import Function
@@ -10,4 +15,34 @@ from ctxval.systems.mujoco import MuJoCo
 from ctxval.systems.simulated import Simulated
 from ctxval.systems.subprocess import Subprocess
 
-__all__ = ["FMU", "Function", "Gymnasium", "Manual", "MuJoCo", "Simulated", "Subprocess", "System", "rk4"]
+__all__ = [
+    "FMU",
+    "REGISTRY",
+    "Function",
+    "Gymnasium",
+    "Manual",
+    "MuJoCo",
+    "Simulated",
+    "Subprocess",
+    "System",
+    "by_name",
+    "rk4",
+]
+
+REGISTRY = Registry("system", __name__, method="execute")
+"""The systems that are found by name: those of this package, and those that installed packages add."""
+
+
+def by_name(name: str, /, **arguments: Any) -> System:
+    """Return a new system from its name and its arguments.
+
+    Args:
+        name: of :data:`REGISTRY`, such as ``"Simulated"``.
+        arguments: those of its class.
+
+    Raises:
+        UnknownNameError: there is no such system, or it takes no such argument; the message has the nearest name.
+        InputError: the system refuses these arguments.
+    """
+    made: System = REGISTRY.make(name, **arguments)
+    return made

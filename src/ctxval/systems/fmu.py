@@ -17,6 +17,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import require_regular_file
+from ctxval._util.registry import part
 from ctxval._util.representation import call, options
 from ctxval._util.temporary import TemporaryFolder
 from ctxval.core.controller import Controller
@@ -29,6 +30,7 @@ from ctxval.systems.subprocess import signal_name
 _PROGRAM = Path(__file__).with_name("fmu_process.py")
 
 
+@part(runs_code=True, files=("path",))
 class FMU:
     """An FMU for co-simulation, FMI 2 or 3, as the true system.
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ctxval._util.arrays import as_floats
+from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
@@ -13,6 +14,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ExecutionError, InputError
 
 
+@part(functions={"execute": "(controller, task) -> trajectory"})
 class Function:
     """A plain function ``(controller, task) -> trajectory`` as the true system: a robot's own driver, a simulator.
 

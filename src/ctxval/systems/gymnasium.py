@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, as_floats
+from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
@@ -21,6 +22,7 @@ StateGetter = Callable[[Any], Any]
 StateSetter = Callable[[Any, Array], None]
 
 
+@part(runs_code=True, functions={"get_state": "environment -> x", "set_state": "(environment, x)"})
 class Gymnasium:
     """A gymnasium environment with continuous actions as the true system.
 

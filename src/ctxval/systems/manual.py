@@ -7,12 +7,14 @@ from typing import NoReturn
 
 import numpy as np
 
+from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.errors import ExecutionError, InputError
 
 
+@part()
 class Manual:
     """A system that only people can execute: take tasks with ``campaign.ask()``, report with ``campaign.tell()``.
 

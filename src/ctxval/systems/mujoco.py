@@ -11,6 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
 from ctxval._util.files import read_bytes
+from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
@@ -22,6 +23,7 @@ _SAME_POSITION = 1e-6
 """Metres by which the given position of a site may miss the actual one in an initial state."""
 
 
+@part(files=("mjcf",))
 class MuJoCo:
     """An MJCF model as the true system, with feedback, whole batches of closed loops at once.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.model import Function, Model, Step
@@ -10,6 +11,7 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 
 
+@part(functions={"step": "(x, u) -> x_next"})
 class Simulated:
     """A step function, or a model, as the true system.
 

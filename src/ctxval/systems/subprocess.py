@@ -14,6 +14,7 @@ from typing import IO
 
 import numpy as np
 
+from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval._util.temporary import temporary_folder
 from ctxval.core.controller import Controller
@@ -31,6 +32,7 @@ _TAIL = 4096
 """Bytes at the end of stderr in which its last line is looked for."""
 
 
+@part(runs_code=True, folder="folder")
 class Subprocess:
     """A command that executes one task as the true system.
 

@@ -1,0 +1,233 @@
+"""Registries: the parts of one kind by name, built-in ones and those that installed packages add by entry points."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from ctxval._util.texts import reason_of
+from ctxval.errors import CtxvalError, InputError, UnknownNameError
+
+if TYPE_CHECKING:  # importlib.metadata is slow to import, and is needed only for names that are not built in
+    from importlib.metadata import EntryPoint
+
+Part = TypeVar("Part", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What a registry must know of a part beyond its class.
+
+    Attributes:
+        name: by which the part is found.
+        runs_code: whether plain arguments, such as a text, can make the part run code: a program, a library, a module.
+        files: arguments that are paths of files.
+        folder: the argument that is a folder, which is the experiment's by default; None if there is none.
+        functions: arguments that are functions, each with its form, such as ``(x, u) -> x_next``.
+    """
+
+    name: str
+    runs_code: bool = False
+    files: tuple[str, ...] = ()
+    folder: str | None = None
+    functions: Mapping[str, str] = field(default_factory=dict)
+
+
+_declarations: dict[Any, Declaration] = {}
+
+
+def part(
+    name: str | None = None,
+    *,
+    runs_code: bool = False,
+    files: tuple[str, ...] = (),
+    folder: str | None = None,
+    functions: Mapping[str, str] | None = None,
+) -> Callable[[Part], Part]:
+    """Declare a class, or a function that makes an object, as a part that is found by name.
+
+    A part of this package is found once its package exports it in ``__all__``.
+
+    Args:
+        name: by which the part is found; the name of the class by default.
+        runs_code, files, folder, functions: see :class:`Declaration`.
+    """
+
+    def declare(made: Part) -> Part:
+        called = made.__name__ if name is None else name
+        _declarations[made] = Declaration(called, runs_code, files, folder, functions or {})
+        return made
+
+    return declare
+
+
+def declaration_of(found: Any) -> Declaration | None:
+    """Return how a class or a function was declared; None if it was not. A subclass does not inherit it."""
+    try:
+        return _declarations.get(found)
+    except TypeError:  # it cannot be hashed
+        return None
+
+
+class Registry(Mapping[str, Any]):
+    """The parts of one kind by name: a mapping of names to classes, or to functions that make an object.
+
+    A built-in part is never replaced by one of an installed package. Installed packages are looked at only if a name
+    is not built in, or if names are listed; their code is imported only if one of their parts is asked for.
+
+    Args:
+        kind: what a part is, in messages: system, model, synthesizer, distance, search, certificate, case.
+        package: the package that exports the parts; the group of the entry points has the same name.
+        method: the method that each part has; None if parts are plain functions.
+        modules: built-in parts that are imported when they are asked for: name -> ``module:attr``.
+    """
+
+    def __init__(
+        self, kind: str, package: str, *, method: str | None = None, modules: Mapping[str, str] | None = None
+    ) -> None:
+        self.kind, self.group, self.method = kind, package, method
+        exported = vars(sys.modules[package])
+        found = [exported[name] for name in exported["__all__"] if declaration_of(exported.get(name)) is not None]
+        self._built_in: dict[str, Any] = {_declarations[one].name: one for one in found}
+        self._modules = dict(modules or {})
+
+    @property
+    def built_in(self) -> tuple[str, ...]:
+        """The names of the parts that this package has."""
+        return (*self._built_in, *self._modules)
+
+    @property
+    def installed(self) -> tuple[str, ...]:
+        """The names of the parts that other installed packages add, sorted; none if their metadata is damaged."""
+        try:
+            return tuple(sorted({point.name for point in self._entry_points()} - set(self.built_in)))
+        except InputError:
+            return ()
+
+    def is_data(self, name: Any) -> bool:
+        """Return whether a part with plain arguments runs no code; what is not built in always counts as code.
+
+        No package is looked at, and nothing is imported.
+        """
+        if not isinstance(name, str) or name not in self.built_in:
+            return False
+        declared = declaration_of(self._built_in.get(name))
+        return declared is None or not declared.runs_code
+
+    def find(self, name: str) -> Any:
+        """Return the class or the function that has a name.
+
+        Raises:
+            UnknownNameError: nothing has the name; the message has the nearest name.
+            InputError: it belongs to an installed package and cannot be loaded, or two packages have it.
+        """
+        if name in self._built_in:
+            return self._built_in[name]
+        if name in self._modules:
+            module, _, attribute = self._modules[name].partition(":")
+            return getattr(importlib.import_module(module), attribute)
+        points = [point for point in self._entry_points() if point.name == name]
+        if not points:
+            raise UnknownNameError.among(self.kind, name, [*self.built_in, *self.installed])
+        if len(points) > 1:
+            packages = " and ".join(sorted(_package(point) for point in points))
+            raise InputError(f"two installed packages have a {self.kind} {name!r}: {packages}; uninstall one of them.")
+        return self._loaded(points[0])
+
+    def make(self, name: str, /, **arguments: Any) -> Any:
+        """Return a new part from its name and its arguments.
+
+        Raises:
+            UnknownNameError: nothing has the name, or the part takes no such argument.
+            InputError: the part cannot be loaded, or refuses these arguments.
+        """
+        return self.require_made(name, construct(f"the {self.kind} {name}", self.find(name), arguments))
+
+    def require_made(self, name: str, made: Any) -> Any:
+        """Return a part that was made if it has the method of its kind.
+
+        Raises:
+            InputError: it has not.
+        """
+        if self.method is not None and not callable(getattr(made, self.method, None)):
+            got = type(made).__qualname__
+            raise InputError(f"the {self.kind} {name} must have the method {self.method}; its class, {got}, has none.")
+        return made
+
+    def __getitem__(self, name: str) -> Any:
+        try:
+            return self.find(name)
+        except UnknownNameError:
+            raise KeyError(name) from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter((*self.built_in, *self.installed))
+
+    def __len__(self) -> int:
+        return len(self.built_in) + len(self.installed)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.built_in or name in self.installed
+
+    def __repr__(self) -> str:
+        return f"Registry({self.kind}: {', '.join(self)})"
+
+    def _entry_points(self) -> list[EntryPoint]:
+        from importlib.metadata import entry_points
+
+        try:
+            return list(entry_points(group=self.group))
+        except Exception as error:  # metadata is files of others, in which anything may stand
+            raise InputError(
+                f"the entry points of installed packages cannot be read, in which a {self.kind} is sought: "
+                f"{reason_of(error)}."
+            ) from error
+
+    def _loaded(self, point: EntryPoint) -> Any:
+        what = f"the {self.kind} {point.name!r} of the installed package {_package(point)}"
+        try:
+            found = point.load()
+        except (Exception, SystemExit) as error:
+            raise InputError(f"{what} cannot be loaded from {point.value!r}: {reason_of(error)}.") from error
+        if not callable(found) or (isinstance(found, type) and not has_method(found, self.method)):
+            wanted = "a function" if self.method is None else f"a class with the method {self.method}"
+            raise InputError(f"{what} must be {wanted}, which {point.value!r} is not.")
+        return found
+
+
+def has_method(cls: type, method: str | None) -> bool:
+    """Return whether objects of a class have a method; True if there is none to have."""
+    return method is None or any(callable(vars(base).get(method)) for base in cls.__mro__)
+
+
+def _package(point: EntryPoint) -> str:
+    return "of unknown name" if point.dist is None else str(point.dist.name)
+
+
+def construct(what: str, build: Any, arguments: Mapping[str, Any]) -> Any:
+    """Call a class, or a function that makes a part.
+
+    Args:
+        what: how the part is called in messages.
+        build: the class or the function.
+        arguments: by name.
+
+    Raises:
+        UnknownNameError: it takes no such argument; the message has the nearest one.
+        InputError: it refuses these arguments.
+    """
+    try:
+        taken = inspect.signature(build).parameters
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values()):
+            for key in arguments:
+                if key not in taken:
+                    raise UnknownNameError.among(f"argument of {what}", key, taken)
+        return build(**arguments)
+    except CtxvalError:
+        raise
+    except Exception as error:
+        raise InputError(f"{what} cannot be made: {reason_of(error)}.") from error

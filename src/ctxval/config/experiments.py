@@ -1,0 +1,62 @@
+"""Experiments that are made elsewhere: cases by name, and ``module:attr`` references."""
+
+from __future__ import annotations
+
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+from ctxval import cases
+from ctxval._util.texts import reason_of
+from ctxval.config.parts import require_types
+from ctxval.config.references import accepts, is_function, reference
+from ctxval.core.experiment import Experiment
+from ctxval.core.validation import Validation
+from ctxval.errors import CtxvalError, InputError
+
+
+def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path | None = None) -> Experiment:
+    """Return a case, or what ``module:attr`` names or makes; the latter runs the module's code.
+
+    Args:
+        text: the name of a case, or the reference.
+        seed: of the data and so of the model.
+        options: plain values, passed on to the case or the function.
+        folder: where the module is sought; the current folder by default.
+
+    Raises:
+        UnknownNameError: there is no such case, or it has no such option; the message has the nearest name.
+        InputError: the experiment cannot be loaded or made.
+    """
+    if ":" in text:
+        return _from_reference(text, seed, options, folder)
+    if options:
+        options = require_types(f"case {text!r}", cases.REGISTRY.find(text), options)
+    return cases.by_name(text, seed, **options)
+
+
+def _from_reference(text: str, seed: int, options: dict[str, Any], folder: Path | None) -> Experiment:
+    """Return what ``module:attr`` names or makes; this runs the module's code."""
+    found = reference(text, folder)
+    if is_function(found) and not isinstance(found, Validation | Experiment):
+        found = _called(text, found, seed, options)
+    if isinstance(found, Validation):
+        return Experiment(text.partition(":")[2], found)
+    if not isinstance(found, Experiment):
+        raise InputError(
+            f"{text} must be an Experiment or a Validation, or a function of a seed that makes one, "
+            f"got {type(found).__name__}."
+        )
+    return found
+
+
+def _called(text: str, make: Any, seed: int, options: dict[str, Any]) -> Any:
+    if not accepts(make, 1, **options):
+        given = f" {', '.join(options)}" if options else ""
+        raise InputError(f"{text} must be callable with a seed and its options{given}; it takes {signature(make)}.")
+    try:
+        return make(seed, **options)
+    except CtxvalError:
+        raise
+    except Exception as error:
+        raise InputError(f"{text} failed: {reason_of(error)}.") from error
