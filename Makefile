@@ -7,7 +7,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test check reliability crash-states attack bench bench-peers study reproduce search calibrate pictures clean
+.PHONY: demo test check reliability crash-states attack bench bench-peers study reproduce search calibrate parts pictures clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -61,6 +61,9 @@ search: .venv/.test  ## how many executions the searches need; writes docs/searc
 	$(BIN)/python benchmarks/misleading.py
 	$(BIN)/python benchmarks/study_ablations.py
 	$(BIN)/python benchmarks/search_page.py
+
+parts: .venv/.test  ## the parts that are found by name; writes docs/parts.md
+	$(BIN)/python benchmarks/parts_page.py
 
 clean:
 	rm -rf .venv build dist

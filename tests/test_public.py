@@ -2,30 +2,63 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
 import ctxval
 from ctxval import errors
 
-ROOMS = ["", ".models", ".systems", ".controllers", ".distances", ".searches", ".cases"]
+ROOT = Path(__file__).parents[1]
+PACKAGES = ["", *(f".{name}" for name in ctxval._SUBMODULES)]
+COMPLETE = [".cases", ".certificates", ".controllers", ".distances", ".models", ".searches", ".systems"]
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_all_is_sorted_and_complete(room: str) -> None:
-    module = importlib.import_module(f"ctxval{room}")
+@pytest.mark.parametrize("package", PACKAGES)
+def test_all_is_sorted_and_importable(package: str) -> None:
+    module = importlib.import_module(f"ctxval{package}")
+    names = list(getattr(module, "__all__", ()))
     # Capitals first, as the linter sorts; `__all__` names nothing that is not there.
-    assert list(module.__all__) == sorted(
-        module.__all__, key=lambda name: (not name.isupper(), not name[0].isupper(), name)
-    )
-    assert all(hasattr(module, name) for name in module.__all__)
+    assert names == sorted(names, key=lambda name: (not name.isupper(), not name[0].isupper(), name))
+    assert all(hasattr(module, name) for name in names)
+
+
+@pytest.mark.parametrize("package", ["", *COMPLETE])
+def test_all_is_complete(package: str) -> None:
+    module = importlib.import_module(f"ctxval{package}")
     public = {
-        n
-        for n, v in vars(module).items()
-        if not n.startswith("_") and getattr(v, "__module__", "").startswith("ctxval")
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_") and (getattr(value, "__module__", None) or "").startswith("ctxval")
     }
-    assert public <= set(module.__all__) | {"errors", "InputError", "UnknownNameError", "Experiment", "COMPLETE"}
+    assert public - {"Registry", "InputError", "UnknownNameError", "Experiment"} <= set(module.__all__)
+
+
+def test_the_part_packages_are_usable_after_importing_ctxval_alone() -> None:
+    code = (
+        "import sys, ctxval; light = [m for m in ctxval._SUBMODULES if f'ctxval.{m}' not in sys.modules]; "
+        "assert set(ctxval._SUBMODULES) <= set(dir(ctxval)); "
+        "[getattr(ctxval, name) for name in dir(ctxval)]; "
+        "print(ctxval.controllers.LQR.__name__, ctxval.testing.check_search.__name__, *light)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert said[:2] == ["LQR", "check_search"]
+    assert {"cases", "controllers", "distances", "plot", "reproduce", "systems", "testing"} <= set(said)
+    with pytest.raises(AttributeError, match="module 'ctxval' has no attribute 'nothing'"):
+        _ = ctxval.nothing  # type: ignore[attr-defined]
+
+
+def test_a_type_checker_sees_the_same_part_packages() -> None:
+    tree = ast.parse((ROOT / "src" / "ctxval" / "__init__.py").read_text())
+    guarded = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+    seen = [alias.asname for node in guarded for each in node.body for alias in each.names]  # type: ignore[attr-defined]
+    assert tuple(seen) == ctxval._SUBMODULES
 
 
 @pytest.mark.parametrize("name", list(ctxval.__all__))
@@ -44,3 +77,32 @@ def test_unknown_names_come_with_the_nearest_one() -> None:
     error = errors.UnknownNameError.among("search", "gp_ucb", ["random", "gp-ucb"])
     assert "did you mean 'gp-ucb'" in str(error)
     assert "known: gp-ucb, random" in str(errors.UnknownNameError.among("search", "xyz", ["random", "gp-ucb"]))
+
+
+def extras() -> dict[str, list[str]]:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    found: dict[str, list[str]] = project["optional-dependencies"]
+    return found
+
+
+def test_every_extra_that_is_named_exists() -> None:
+    files = [*(ROOT / "src").rglob("*.py"), *ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), ROOT / "pyproject.toml"]
+    named = {
+        extra.strip()
+        for file in files
+        for listed in re.findall(r"ctxval\[([a-z0-9, -]+)\]", file.read_text())
+        for extra in listed.split(",")
+    }
+    assert {"mujoco", "fmu", "onnx", "all"} <= named
+    assert named <= set(extras())
+
+
+def test_all_brings_every_extra_and_each_is_used() -> None:
+    brought = set(re.findall(r"[a-z]+", extras()["all"][0].partition("[")[2]))
+    assert brought == set(extras()) - {"all", "test", "dev"}
+    source = "".join(file.read_text() for file in (ROOT / "src").rglob("*.py"))
+    imported = {"scikit-learn": "sklearn", "dask": "distributed"}
+    for extra in brought:
+        names = [re.split(r"[\[><=]", requirement)[0] for requirement in extras()[extra]]
+        for name in names:
+            assert re.search(rf"\b{imported.get(name, name)}\b", source), f"{extra} brings {name}, which nothing uses"

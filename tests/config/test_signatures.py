@@ -24,6 +24,7 @@ from ctxval.config import signatures as trust
 from ctxval.config.settings import read_settings, stored_settings, trusted_settings
 from ctxval.config.signatures import SIGNATURES, code_named, key_path, signed, verifies
 from ctxval.errors import InputError
+from rig_packages import install
 
 PLAIN: dict[str, Any] = {
     "name": "cart",
@@ -143,6 +144,9 @@ ATTACKS: dict[str, dict[str, Any]] = {
     "command": {**PLAIN, "system": EVIL_CALL},
     "environment": {**PLAIN, "system": {"type": "Gymnasium", "environment": "evil:Environment-v0"}},
     "fmu": {**PLAIN, "system": {"type": "FMU", "path": "evil.fmu", "states": ["x"], "inputs": ["u"]}},
+    "installed distance": {**PLAIN, "distance": {"type": "Speed"}},
+    "installed search": {**PLAIN, "search": {"name": "corners", "repeats": 1}},
+    "installed case": {"experiment": "swing"},
     "folder": {**PLAIN, "task": "evil:task", "folder": "."},
     "forged": {**PLAIN, "task": "evil:task", SIGNATURES: ["0" * 64]},
     "deep": {**PLAIN, "system": {"type": "Simulated", "step": [[{"a": [{"ref": "evil:step"}]}]]}},
@@ -332,6 +336,60 @@ def test_an_experiment_that_was_moved_is_named_where_it_is_now(folder: Path) -> 
     Path("my_rig.py").write_text(MODULE.format(sentinel="imported.txt"))
     done("ask", "a.sqlite", "--experiment", "my_rig:experiment")
     done("ask", "a.sqlite")
+
+
+# Parts of installed packages: code that the user installed, but that this store's maker chose
+
+
+@pytest.fixture
+def site(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package with a distance ``Speed``, a search ``corners``, a case ``swing`` and a certificate ``theirs``."""
+    monkeypatch.delitem(sys.modules, "their_parts", raising=False)
+    monkeypatch.syspath_prepend(str(install(folder / "site")))
+    return folder / "site"
+
+
+INSTALLED: dict[str, dict[str, Any]] = {
+    **{name: content for name, content in ATTACKS.items() if name.startswith("installed")},
+    "installed certificate": {**PLAIN, "certificate": {"kind": "theirs"}},
+}
+
+
+@pytest.mark.parametrize("attack", INSTALLED)
+def test_a_foreign_store_imports_no_part_of_an_installed_package(attack: str, site: Path) -> None:
+    store_with(INSTALLED[attack])
+    for command in (*COMMANDS.values(), ("status", "a.sqlite"), ("export", "a.sqlite"), ("certify", "a.sqlite")):
+        assert invoke(*command).exit_code in (0, 1, 2)
+    for command in COMMANDS.values():
+        refusal(*command)
+    assert code_named(INSTALLED[attack])
+    assert "their_parts" not in sys.modules
+    assert not (site / "imported.txt").exists()
+
+
+def test_what_the_user_names_may_be_of_an_installed_package(site: Path) -> None:
+    lines = [f"{key} = {_toml(PLAIN[key])}" for key in ("space", "task", "system", "model", "synthesizer")]
+    Path("cart.toml").write_text("\n".join([*lines, 'distance = "Speed"', 'search = { name = "corners" }']))
+    done("ask", "cart.toml", "--store", "a.sqlite")
+    assert (site / "imported.txt").exists()
+    done("ask", "a.sqlite")  # it is the user's own store
+    Store("a.sqlite").keep_settings(trust.unsigned(Store("a.sqlite").settings()))
+    said = refusal("ask", "a.sqlite")  # it is not any more
+    assert "distance = 'Speed'; search = {'name': 'corners', 'repeats': 1}" in said
+    assert "is signed for you now" in done("ask", "a.sqlite", "--trust").stderr
+    done("ask", "a.sqlite")
+
+
+def test_cases_of_installed_packages_are_listed_with_their_options(site: Path) -> None:
+    said = done("cases").stdout
+    assert "swing     A pendulum of a size; options: size=1" in said
+    assert json.loads(done("cases", "swing", "--json").stdout)["options"] == {"size": 1}
+    assert "case 'swing': size" in refusal("run", "swing", "--option", "size=large")
+    (site / "their_parts.py").write_text("1 / 0")
+    sys.modules.pop("their_parts")
+    assert "cannot be loaded from 'their_parts:swing': ZeroDivisionError" in " ".join(done("cases").stdout.split())
+    assert "pendulum" in done("cases").stdout
+    refusal("cases", "swing")
 
 
 # Naming the experiment again

@@ -138,6 +138,16 @@ class Registry(Mapping[str, Any]):
             raise InputError(f"two installed packages have a {self.kind} {name!r}: {packages}; uninstall one of them.")
         return self._loaded(points[0])
 
+    def summary(self, name: str) -> str:
+        """Return the first line of a part's docstring, without its full stop.
+
+        Raises:
+            UnknownNameError: nothing has the name.
+            InputError: the part cannot be loaded.
+        """
+        lines = (inspect.getdoc(self.find(name)) or "").splitlines()
+        return lines[0].removesuffix(".") if lines else ""
+
     def make(self, name: str, /, **arguments: Any) -> Any:
         """Return a new part from its name and its arguments.
 

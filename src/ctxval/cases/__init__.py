@@ -17,7 +17,7 @@ NAMES: dict[str, str] = {
 }
 """The cases of this package, each the function ``experiment`` of the module of its name, and what each is."""
 
-__all__ = ["NAMES", "REGISTRY", "by_name", "options_of"]
+__all__ = ["NAMES", "REGISTRY", "by_name", "options_of", "text_of"]
 
 REGISTRY = Registry("case", __name__, modules={name: f"{__name__}.{name}:experiment" for name in NAMES})
 """The cases that are found by name: those of this package, and those that installed packages add."""
@@ -52,3 +52,13 @@ def options_of(name: str) -> dict[str, Any]:
     parameters = list(inspect.signature(REGISTRY.find(name)).parameters.values())[1:]
     variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     return {parameter.name: parameter.default for parameter in parameters if parameter.kind not in variadic}
+
+
+def text_of(name: str) -> str:
+    """Return what a case is, in a few words.
+
+    Raises:
+        UnknownNameError: there is no such case.
+        InputError: the case belongs to an installed package and cannot be loaded.
+    """
+    return NAMES[name] if name in NAMES else REGISTRY.summary(name)

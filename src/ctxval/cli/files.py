@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from ctxval.cli.base import BAD_INPUT, AsJson, app, command, out
+from ctxval.cli.options import CaseOptions, case_options
 from ctxval.config.check import Finding, check_experiment
 from ctxval.config.settings import read_settings
 from ctxval.errors import InputError
@@ -131,11 +132,12 @@ def init(
 @command
 def check(
     target: Annotated[str, typer.Argument(metavar="CASE|FILE.toml|module:attr", help="What to check.")],
-    execute: Annotated[bool, typer.Option("--execute", help="Execute one task twice.")] = False,
+    execute: Annotated[bool, typer.Option("--execute", help="Execute one task twice on the system.")] = False,
     as_json: AsJson = False,
+    option: CaseOptions = None,
 ) -> Any:
-    """Check an experiment and its parts against each other; nothing is executed unless you say so."""
-    settings = read_settings(target, {})
+    """Check an experiment and its parts against each other; the system is executed only with --execute."""
+    settings = read_settings(target, {"options": case_options(option)})
     experiment = settings.load()
     settings.search.build(settings.folder)
     findings = check_experiment(experiment, execute=execute, seed=settings.seed)

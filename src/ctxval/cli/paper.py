@@ -1,4 +1,4 @@
-"""``ctxval cases`` and ``ctxval reproduce``: what the paper has."""
+"""``ctxval cases`` and ``ctxval reproduce``: the cases that are found by name, and the paper's experiments."""
 
 from __future__ import annotations
 
@@ -11,15 +11,43 @@ from rich.progress import Progress, TextColumn
 from ctxval import cases as known_cases
 from ctxval.cli.base import AsJson, app, command, err, print_table
 from ctxval.cli.base import out as screen
+from ctxval.config.experiments import plain_options
+from ctxval.errors import InputError
 
 
 @app.command()
 @command
-def cases(as_json: AsJson = False) -> Any:
-    """List the paper's systems that can be run by name."""
+def cases(
+    name: Annotated[str | None, typer.Argument(metavar="CASE", help="Show this case alone.")] = None,
+    as_json: AsJson = False,
+) -> Any:
+    """List the cases that can be run by name, with their options: the paper's systems, and those of installed packages.
+
+    Set an option with `ctxval run CASE --option NAME=VALUE`.
+    """
+    listed = list(known_cases.REGISTRY) if name is None else [name]
+    found = {each: _described(each, skip_broken=name is None) for each in listed}
     if not as_json:
-        print_table(known_cases.NAMES)
-    return known_cases.NAMES
+        print_table({each: "; ".join([text, *_options_text(options)]) for each, (text, options) in found.items()})
+    if name is None:
+        return {each: text for each, (text, _) in found.items()}
+    text, options = found[name]
+    return {"case": name, "text": text, "options": options}
+
+
+def _described(name: str, *, skip_broken: bool) -> tuple[str, dict[str, Any]]:
+    """Return what a case is, and its options; of one that cannot be loaded why, if it is to be skipped."""
+    try:
+        return known_cases.text_of(name), plain_options(name)
+    except InputError as error:
+        if not skip_broken:
+            raise
+        return str(error), {}
+
+
+def _options_text(options: dict[str, Any]) -> list[str]:
+    texts = [name if default is None else f"{name}={default}" for name, default in options.items()]
+    return [f"options: {', '.join(texts)}"] if texts else []
 
 
 @app.command()

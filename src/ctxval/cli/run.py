@@ -36,6 +36,7 @@ from ctxval.cli.base import (
     worst_of,
 )
 from ctxval.cli.certify import decide
+from ctxval.cli.options import CaseOptions, case_options
 from ctxval.cli.trust import AcceptChange
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment
@@ -71,12 +72,13 @@ def run(
     timeout: Timeout = None,
     accept_change: AcceptChange = None,
     as_json: AsJson = False,
-    variant: Annotated[str | None, typer.Option(help="Variant of a case.")] = None,
-    model: Annotated[str | None, typer.Option(help="Which learned model of a case.")] = None,
-    dim: Annotated[int | None, typer.Option(help="Number of states of a case.")] = None,
+    option: CaseOptions = None,
+    variant: Annotated[str | None, typer.Option(help="Variant of a case; the same as --option variant=...")] = None,
+    model: Annotated[str | None, typer.Option(help="Learned model of a case; the same as --option model=...")] = None,
+    dim: Annotated[int | None, typer.Option(help="Number of states of a case; the same as --option dim=...")] = None,
 ) -> Any:
     """Search for the task at which the system differs most from its model."""
-    options = {k: v for k, v in {"variant": variant, "model": model, "dim": dim}.items() if v is not None}
+    options = case_options(option, variant=variant, model=model, dim=dim)
     given = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence, "seed": seed}
     settings = read_settings(target, {**given, "store": store, "options": options})
     said = {"stochastic": stochastic, "resolution": resolution}

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from inspect import signature
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ctxval import cases
 from ctxval._util.texts import reason_of
@@ -33,6 +33,26 @@ def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path
     if options:
         options = require_types(f"case {text!r}", cases.REGISTRY.find(text), options)
     return cases.by_name(text, seed, **options)
+
+
+def plain_options(case: str) -> dict[str, Any]:
+    """Return the options of a case that a file or a command line can set, with their defaults; None if there is none.
+
+    Raises:
+        UnknownNameError: there is no such case.
+        InputError: the case belongs to an installed package and cannot be loaded.
+    """
+    try:
+        hints = get_type_hints(cases.REGISTRY.find(case))
+    except (NameError, TypeError):
+        hints = {}
+    found = {name: default for name, default in cases.options_of(case).items() if _is_plain(hints.get(name, str))}
+    return {name: None if default is Parameter.empty else default for name, default in found.items()}
+
+
+def _is_plain(hint: Any) -> bool:
+    """Return whether an annotation allows a number, a Boolean or a text."""
+    return get_origin(hint) is Literal or bool({hint, *get_args(hint)} & {str, int, float, bool})
 
 
 def _from_reference(text: str, seed: int, options: dict[str, Any], folder: Path | None) -> Experiment:

@@ -1,0 +1,166 @@
+"""Registries: built-in parts, and those of packages that are really installed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ctxval import cases, controllers, distances, models, part, searches, systems
+from ctxval._util.registry import Registry, construct, declaration_of
+from ctxval.errors import InputError, UnknownNameError
+from rig_packages import install
+
+REGISTRIES: list[Registry] = [each.REGISTRY for each in (systems, models, controllers, distances, searches, cases)]
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of installed packages, with one that adds parts."""
+    monkeypatch.delitem(sys.modules, "their_parts", raising=False)
+    monkeypatch.syspath_prepend(str(install(tmp_path / "site")))
+    return tmp_path / "site"
+
+
+@pytest.mark.parametrize("registry", REGISTRIES, ids=lambda registry: registry.kind)
+def test_built_in_parts_are_found_and_have_the_method_of_their_kind(registry: Registry) -> None:
+    assert registry.built_in
+    assert list(registry) == list(registry.built_in)
+    assert len(registry) == len(registry.built_in)
+    for name in registry.built_in:
+        assert name in registry
+        assert registry[name] is registry.find(name)
+        assert registry.summary(name)
+    assert registry.get("nothing") is None
+    with pytest.raises(UnknownNameError, match=f"no {registry.kind} is called 'nothing'"):
+        registry.find("nothing")
+
+
+NOT_BY_NAME = {"FeedforwardReLU", "IncrementScaling", "Repeated", "SequentialSearch"}
+"""What has the method of its kind and cannot be made from a file: of arrays, of another search, or abstract."""
+
+
+@pytest.mark.parametrize("package", [systems, models, controllers, distances, searches])
+def test_what_a_package_exports_is_found_by_name(package: Any) -> None:
+    known = {package.REGISTRY.find(name) for name in package.REGISTRY.built_in}
+    for name in package.__all__:
+        found = getattr(package, name)
+        is_part = isinstance(found, type) and any(callable(vars(b).get(package.REGISTRY.method)) for b in found.__mro__)
+        is_protocol = getattr(found, "_is_protocol", False)
+        if is_part and not is_protocol and name not in NOT_BY_NAME | {"AffineFeedback", "BoundOnnxPolicy"}:
+            assert found in known, f"{name} has the method of a {package.REGISTRY.kind} but is not declared by @part"
+
+
+def test_a_part_is_made_by_name() -> None:
+    assert distances.by_name("FinalState", norm=2) == distances.FinalState(2)
+    assert isinstance(models.by_name("Linear", A=[[1.0]], B=[[1.0]]), models.Linear)
+    assert isinstance(controllers.by_name("LQR", Q=[1.0], R=[1.0]), controllers.LQR)
+    assert isinstance(systems.by_name("Simulated", step=lambda x, u: x), systems.Simulated)
+    with pytest.raises(UnknownNameError, match="no argument of the distance FinalState is called 'nrm'; did you mean"):
+        distances.by_name("FinalState", nrm=2)
+    with pytest.raises(InputError, match="the model Linear cannot be made: TypeError"):
+        models.by_name("Linear", A=[[1.0]])
+
+
+def test_only_built_in_parts_that_run_nothing_are_data() -> None:
+    assert systems.REGISTRY.is_data("Manual")
+    for name in ("FMU", "Gymnasium", "Subprocess", "Nothing", "a:b", "", None, 3, ["Manual"], {}):
+        assert not systems.REGISTRY.is_data(name), name
+
+
+def test_a_declaration_is_of_one_class_alone() -> None:
+    @part("mine", runs_code=True, files=("path",))
+    class Mine:
+        pass
+
+    class Derived(Mine):
+        pass
+
+    declared = declaration_of(Mine)
+    assert declared is not None
+    assert (declared.name, declared.runs_code, declared.files) == ("mine", True, ("path",))
+    assert declaration_of(Derived) is None
+    assert declaration_of([]) is None
+
+
+def test_a_class_that_takes_any_argument_is_given_it() -> None:
+    assert construct("it", lambda **options: options, {"a": 1}) == {"a": 1}
+
+
+# Parts of installed packages
+
+
+def test_parts_of_an_installed_package_are_found_by_name(site: Path) -> None:
+    assert distances.REGISTRY.installed == ("Gone", "Nothing", "Number", "Speed")
+    assert "Speed" in distances.REGISTRY
+    assert len(distances.REGISTRY) == 8
+    assert not (site / "imported.txt").exists()  # names alone import nothing
+    made: Any = distances.by_name("Speed", weight=2.0)
+    assert made.weight == 2.0
+    assert distances.REGISTRY.summary("Speed") == "Difference of the final speeds"
+    search = searches.by_name("corners")
+    search.reset(2, 0)
+    assert set(search.ask(1)[0]) <= {0.0, 1.0}
+    assert cases.by_name("swing", 1, size=2).name == "pendulum"
+
+
+def test_a_built_in_part_is_never_replaced(site: Path) -> None:
+    assert distances.by_name("FinalState") == distances.FinalState()
+    assert type(searches.by_name("auto")) is searches.Auto
+    assert not (site / "imported.txt").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        (
+            "Gone",
+            r"the distance 'Gone' of the installed package their-parts cannot be loaded from 'no_such_module:Gone'",
+        ),
+        ("Nothing", r"must be a class with the method __call__, which 'their_parts:Nothing' is not"),
+        ("Number", r"must be a class with the method __call__, which 'math:pi' is not"),
+        ("Sped", r"no distance is called 'Sped'; did you mean 'Speed'\?"),
+    ],
+)
+def test_what_is_wrong_with_an_entry_point_is_one_sentence(site: Path, name: str, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as refused:
+        distances.by_name(name)
+    assert "\n" not in str(refused.value)
+    assert distances.by_name("FinalState") == distances.FinalState()
+
+
+def test_a_case_that_makes_no_experiment_is_refused(site: Path) -> None:
+    with pytest.raises(InputError, match="the case 'odd' must make an Experiment, got int"):
+        cases.by_name("odd")
+    with pytest.raises(UnknownNameError, match="no option of the case 'swing' is called 'sise'; did you mean 'size'"):
+        cases.by_name("swing", sise=2)
+
+
+def test_two_packages_with_one_name_are_both_named(site: Path) -> None:
+    install(site, "other-parts", "[ctxval.distances]\nSpeed = their_parts:Speed\n")
+    with pytest.raises(InputError, match="two installed packages have a distance 'Speed': other-parts and their-parts"):
+        distances.by_name("Speed")
+
+
+def test_damaged_metadata_breaks_no_built_in_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path)
+    (next(tmp_path.glob("*.dist-info")) / "entry_points.txt").write_bytes(b"[ctxval.distances]\n\xff\xfe = x:y\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert distances.by_name("FinalState") == distances.FinalState()
+    assert "FinalState" in list(distances.REGISTRY)
+    assert "Speed" not in distances.REGISTRY
+    with pytest.raises(InputError, match="the entry points of installed packages cannot be read"):
+        distances.by_name("Speed")
+
+
+def test_an_installed_package_is_found_by_a_new_process(site: Path) -> None:
+    code = (
+        "import ctxval, sys; assert 'their_parts' not in sys.modules; "
+        "print(ctxval.distances.by_name('Speed').weight, *ctxval.cases.REGISTRY)"
+    )
+    environment = {"PYTHONPATH": f"{site}:{Path(distances.__file__).parents[2]}", "OMP_NUM_THREADS": "1"}
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["1.0", "pendulum", "arm", "dubins", "linear", "odd", "swing"]
