@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from ctxval.cli.base import BAD_INPUT, AsJson, app, command, out
-from ctxval.cli.options import CaseOptions, case_options
+from ctxval.cli.case_options import CaseOptions, case_options
 from ctxval.config.check import Finding, check_experiment
 from ctxval.config.settings import read_settings
 from ctxval.errors import InputError

@@ -35,8 +35,8 @@ from ctxval.cli.base import (
     say_error,
     worst_of,
 )
+from ctxval.cli.case_options import CaseOptions, case_options
 from ctxval.cli.certify import decide
-from ctxval.cli.options import CaseOptions, case_options
 from ctxval.cli.trust import AcceptChange
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment

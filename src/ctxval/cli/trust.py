@@ -1,4 +1,4 @@
-"""Building the experiment that a store names, if its user may be taken to know what that is."""
+"""Opening a store with the experiment that it names, if the user made the store or trusts it."""
 
 from __future__ import annotations
 
@@ -18,15 +18,18 @@ from ctxval.storage.store import Store
 
 Trust = Annotated[
     bool,
-    typer.Option("--trust", help="Import and run the code that the store names, although you did not make the store."),
+    typer.Option(
+        "--trust",
+        help="Import and run the code that the store names, although you did not make the store on this computer.",
+    ),
 ]
 AcceptChange = Annotated[
     str | None,
     typer.Option(
         "--accept-change",
         metavar="WHY",
-        help="Go on although the experiment differs from the stored one, for this reason, which the store keeps: the "
-        "system was repaired, or the code computes the same.",
+        help="Continue although the experiment differs from the stored one. Give the reason, which the store keeps: "
+        "for example, the system was repaired, or the code computes the same.",
     ),
 ]
 Named = Annotated[
@@ -34,14 +37,14 @@ Named = Annotated[
     typer.Option(
         "--experiment",
         metavar="CASE|FILE.toml|module:attr",
-        help="The store's experiment, if what the store itself names is not to be trusted.",
+        help="Name the experiment of the store yourself. Use it if you do not trust what the store names.",
     ),
 ]
 
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """A store with what was run into it."""
+    """A store, with its settings, its experiment and its campaign."""
 
     settings: Settings
     experiment: Experiment
@@ -53,7 +56,7 @@ def settings_of(store: Store, experiment: str | None, trust: bool) -> Settings:
     """Return the settings that the experiment of a store may be built from.
 
     Raises:
-        InputError: they name code, and nobody says that it may be run.
+        InputError: they name code that the user has not allowed to run.
     """
     if experiment is not None and trust:
         raise InputError("of --trust and --experiment only one can be given.")
@@ -74,11 +77,13 @@ def open_store(
     Args:
         store: the store.
         path: of its file, as it was typed.
-        experiment: what the user names instead of what the store names.
+        experiment: the experiment that the user names; None if it is the one that the store names.
         trust: whether the user trusts what the store names.
+        accept_change: why the experiment may differ from the stored one; None if it may not.
+        remeasure: whether the distance may differ from the stored one.
 
     Raises:
-        InputError: it names code, and nobody says that it may be run.
+        InputError: it names code that the user has not allowed to run.
         StoreError: it was made by another experiment.
     """
     settings = settings_of(store, experiment, trust)

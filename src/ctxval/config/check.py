@@ -1,4 +1,4 @@
-"""What can be known of an experiment before the system is executed, and what two executions more would show."""
+"""Checks of an experiment: its parts against each other without executing the system, and two executions on request."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from ctxval.errors import ConformanceError, CtxvalError
 from ctxval.testing import check_distance, check_model, check_synthesizer
 
 _TASKS = 8
-"""Random tasks that are planned beside the corners' and the middle one."""
+"""Number of random tasks that are planned, besides the lowest, the middle and the highest one."""
 
 _SAME_START = 1e-6
-"""By how much an execution may miss the task's initial state."""
+"""Largest error of the initial state of an execution, in each state."""
 
-State = Literal["ok", "noted", "failed", "skipped"]
+FindingState = Literal["ok", "noted", "failed", "skipped"]
 
 
 @dataclass(frozen=True)
@@ -31,23 +31,23 @@ class Finding:
     """What one check found.
 
     Attributes:
-        check: what was looked at.
-        state: failed is a fault; noted is worth knowing.
+        check: what was checked.
+        state: ``failed`` is a fault, ``noted`` is worth knowing, ``skipped`` was not checked.
         text: one sentence.
     """
 
     check: str
-    state: State
+    state: FindingState
     text: str
 
 
 def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int = 0) -> list[Finding]:
-    """Check the parts of an experiment against each other; S is executed only where that is asked for, twice.
+    """Check the parts of an experiment against each other.
 
     Args:
-        experiment: what to check.
-        execute: whether to execute the middle task twice.
-        seed: of the tasks that are tried.
+        experiment: the experiment.
+        execute: whether to execute the middle task twice. If not, the system is not executed.
+        seed: the seed of the random tasks that are planned.
     """
     validation = experiment.validation
     findings = [_space(validation)]
@@ -90,7 +90,7 @@ def _space(validation: Validation) -> Finding:
 
 
 def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Finding]:
-    """Plan tasks: the lowest corner, the middle, the highest corner and random ones; the paper's Aspect-1."""
+    """Plan the lowest, the middle, the highest and random tasks, and check the paper's Aspect 1 on them."""
     space = validation.space
     points = np.concatenate(
         [
@@ -140,7 +140,7 @@ def _names(experiment: Experiment, plan: Plan) -> Iterator[Finding]:
 
 
 def _system(validation: Validation, plan: Plan) -> Iterator[Finding]:
-    """Hold what a system says of itself against the task and the controller."""
+    """Compare the time step, states and inputs that a system states with those of the task and the controller."""
     system, task = validation.system, plan.task
     dt = getattr(system, "dt", None)
     if isinstance(dt, int | float) and not np.isclose(dt, task.dt, rtol=1e-9, atol=0):
@@ -216,7 +216,7 @@ def _stacked(trajectories: Sequence[Trajectory], shift: float) -> Trajectory:
 
 
 def _executions(validation: Validation, plan: Plan, execute: bool) -> Iterator[Finding]:
-    """Execute one task twice: does the system start where the task says, and do the same again?"""
+    """Execute one task twice, and check the initial state and the repeatability."""
     if getattr(validation.system, "manual", False):
         yield Finding("execution", "skipped", "people execute this system: see `ctxval ask`")
         return

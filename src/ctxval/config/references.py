@@ -1,4 +1,4 @@
-"""What ``module:attr`` names: where its module is sought, and what it must be before it is called."""
+"""References ``module:attr``: where the module is sought, and what the object must be before it is called."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def reference(text: str, folder: Path | None = None) -> Any:
             the current folder is not found if another folder is given.
 
     Raises:
-        InputError: it is no reference, cannot be loaded, is of Python's standard library, or another module of this
-            name is in use already.
+        InputError: the text is not a reference, or the object cannot be loaded, or is in Python's standard library, or
+            another module of this name is in use already.
     """
     module, colon, attribute = text.partition(":")
     if not (colon and attribute and all(name.isidentifier() for name in module.split("."))):
@@ -51,9 +51,9 @@ def reference(text: str, folder: Path | None = None) -> Any:
 
 @contextmanager
 def _sought_in(home: str) -> Iterator[str]:
-    """Put a folder first on the path of modules, where it stays: a module may import others when it is called.
+    """Put a folder first on ``sys.path``. It stays there, because a module may import others when it is called.
 
-    Meanwhile neither the current folder, which ``python -m`` puts there, nor that of another experiment is searched.
+    Meanwhile neither the current folder, which ``python -m`` adds, nor the folder of another experiment is searched.
     """
     before = list(sys.path)
     if home not in before:
@@ -80,7 +80,7 @@ def _here() -> str:
 
 
 def _require_place(text: str, module: str, home: str) -> None:
-    """Check that importing a top-level module gives the one that would be found now, and none that was loaded before.
+    """Check that importing a top-level module gives the one that would be found now, not another that is loaded.
 
     Raises:
         InputError: it is not found, or is another.
@@ -105,7 +105,7 @@ def _require_place(text: str, module: str, home: str) -> None:
 
 
 def _require_apart(text: str, home: str) -> None:
-    """Check that no module of another experiment's folder would be taken for one of this folder by those it imports.
+    """Check that no loaded module of another experiment's folder has the name of a module in this folder.
 
     Raises:
         InputError: a module of the same name is in use from there.
@@ -141,7 +141,7 @@ def _place(file: str | None, folders: Any) -> str | None:
     return None if where is None else os.path.realpath(where)
 
 
-# What is expected of it
+# What a reference must name
 
 
 def require_part(registry: Registry, what: str, found: Any) -> Any:
@@ -149,11 +149,11 @@ def require_part(registry: Registry, what: str, found: Any) -> Any:
 
     Args:
         registry: of the systems, models, synthesizers or distances.
-        what: how the object is called in the message.
+        what: how the message calls the object.
         found: the object or the class, which is not called here.
 
     Raises:
-        InputError: it has not.
+        InputError: it does not have the method, or is not a function of the right arguments.
     """
     kind, method = registry.kind, str(registry.method)
     if isinstance(found, type):
@@ -174,12 +174,12 @@ def require_function(what: str, found: Any, form: str) -> Any:
     """Return a function that takes as many positional arguments as its form says; it is not called here.
 
     Args:
-        what: how it is called in the message.
+        what: how the message calls the function.
         found: the function.
         form: the arguments and what they give, such as ``(x, u) -> x_next`` or ``p -> Task``.
 
     Raises:
-        InputError: it is no function written in Python, or takes other arguments.
+        InputError: it is not a function written in Python, or takes other arguments.
     """
     count = form.partition("->")[0].count(",") + 1
     if not is_function(found):
@@ -192,7 +192,7 @@ def require_function(what: str, found: Any, form: str) -> Any:
 def is_function(found: Any) -> bool:
     """Return whether it is a function written in Python, or an object whose class has such a ``__call__``.
 
-    Builtin functions and methods of other libraries' objects are none: they are no part of anybody's experiment.
+    Builtin functions and methods of other libraries' objects do not count: no user wrote them for an experiment.
     """
     if isinstance(found, functools.partial):
         return is_function(found.func)

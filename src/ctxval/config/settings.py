@@ -27,11 +27,11 @@ DEFAULT_SEARCH = "auto"
 
 
 class SearchTable(BaseModel):
-    """The table ``[search]``: a name, and the options of that search.
+    """The table ``[search]``: the name of a search, and its options.
 
     Attributes:
-        name: of the search.
-        repeats: how often each task is executed, of a noisy system.
+        name: the name in the registry of searches.
+        repeats: how often each task is executed; more than once if the system is noisy.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -40,7 +40,10 @@ class SearchTable(BaseModel):
     repeats: int = Field(default=1, ge=1)
 
     def build(self, folder: Path | None = None) -> Search:
-        """Return the search; modules that its options name are sought in the folder, the current one by default.
+        """Return the search.
+
+        Args:
+            folder: where modules are sought that the options name; the current folder by default.
 
         Raises:
             UnknownNameError: there is no such search.
@@ -99,24 +102,26 @@ _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
 
 class Settings(BaseModel):
-    """What to run: the content of an experiment file, with the command line's options over it.
+    """What to run: the content of an experiment file, overridden by the options of the command line.
 
-    It names an experiment that is made elsewhere, or describes the whole of it.
+    Either ``experiment`` names the experiment, or ``name`` to ``units`` describe all of it.
 
     Attributes:
         experiment: a case, or ``module:attr`` of an experiment or of a function of a seed that makes one.
         options: passed on to the case or function.
-        name: of an experiment that is described here, and so are
-        space: ``name = [low, high, "unit"]`` of each task parameter,
-        task: ``module:attr`` of a function, or a table of an initial state, a goal, a horizon and a time step,
-        system, model, synthesizer, distance: ``module:attr``, or a table with a type and its arguments,
-        states, inputs: names and units,
-        units: of the distance.
-        budget, threshold, seed, store: None where the experiment decides.
-        confidence: of a validation.
-        certificate: what a validation rests on.
+        name: the name of the experiment.
+        space: ``name = [low, high, "unit"]`` for each task parameter.
+        task: ``module:attr`` of a function, or a table with an initial state, a goal, a horizon and a time step.
+        system, model, synthesizer, distance: ``module:attr``, or a table with a type and its arguments.
+        states, inputs: names and units.
+        units: the units of the distance.
+        budget, threshold, store: None if the experiment's own are used.
+        seed: the seed of the data, the model and the search.
+        confidence: the confidence level of the certificate.
+        certificate: the certificate that a validation needs.
         search: which search, and its options.
-        folder: where modules and files are sought, that of the experiment file; the current one if it is not known.
+        folder: where modules and files are sought: the folder of the experiment file. None if it is not known; then the
+            current folder.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -193,14 +198,14 @@ class Settings(BaseModel):
         accept_change: str | None = None,
         remeasure: bool = False,
     ) -> Campaign:
-        """Return the campaign of what :meth:`load` gave, into a store that then knows how it was made.
+        """Return a campaign, and write these settings into its store, signed by this user.
+
+        The signature lets later commands run the code that the settings name without asking.
 
         Args:
-            experiment: of these settings.
-            store: the store, or where it is.
+            experiment: the experiment that :meth:`load` returned.
+            store: the store, or its path.
             accept_change, remeasure: as :class:`ctxval.Campaign` takes them.
-
-        What the store is told is signed by this user, so that its code is run again without a question.
 
         Raises:
             StoreError: the store cannot be used, or was made by another experiment.
@@ -243,11 +248,11 @@ class Settings(BaseModel):
 
 
 def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
-    """Return what to run, from a case's name, an experiment file or ``module:attr``.
+    """Return the settings of a case, an experiment file or ``module:attr``.
 
     Args:
         target: ``pendulum``, ``experiment.toml`` or ``my_module:my_experiment``.
-        overrides: options of the command line, over what the file says; None where not given.
+        overrides: options of the command line, which override the file; None if an option was not given.
 
     Raises:
         InputError: the file cannot be read, or a value in it is not allowed; the message names it.
@@ -276,10 +281,10 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
 
 
 def stored_settings(store: Store) -> Settings:
-    """Return what was run into a store, whoever wrote it; its code may be built only by :func:`trusted_settings`.
+    """Return the settings in a store, whoever wrote them. Nothing may be built from them: see :func:`trusted_settings`.
 
     Raises:
-        InputError: the store does not say it, or what it says is not allowed.
+        InputError: the store has no settings, or they are not valid.
     """
     return _of_store(store.settings())
 
@@ -300,13 +305,13 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
     """Return the settings from which a store's experiment may be built.
 
     Args:
-        store: the store; if its settings name code, this user must have signed them.
-        experiment: a case, a file or ``module:attr`` that the user names instead. The seed remains the store's, and so
-            does the search if it names no code.
-        trust: take the store's settings whoever wrote them.
+        store: the store. If its settings name code, this user must have signed them.
+        experiment: a case, a file or ``module:attr`` that the user names instead. The seed is still the store's, and so
+            is the search if it names no code.
+        trust: accept the store's settings, whoever wrote them.
 
     Raises:
-        InputError: the settings name code, and nobody says that they may; the message shows what would be run.
+        InputError: the settings name code that the user has not allowed to run; the message shows the code.
     """
     kept = store.settings()
     if experiment is not None:
@@ -327,7 +332,7 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
 
 
 _SHOWN = 8
-"""Things that would be imported or run which are shown: as many as a message has room for."""
+"""How many of the things that would be imported or run a message shows."""
 
 
 def _named_again(kept: dict[str, Any], experiment: str) -> Settings:

@@ -1,4 +1,4 @@
-"""Whether this user wrote the settings in a store on this computer, and what in them would run code.
+"""Signatures of the settings in a store, and which settings would run code.
 
 A command that writes settings signs them with a secret key of its user; settings that were edited, or that come from
 somebody else, do not verify. Signatures of several users stand side by side.
@@ -27,7 +27,7 @@ SIGNATURES = "signatures"
 
 _BYTES = 32
 _USERS = 16
-"""Signatures that settings keep at most; each is of one user on one computer."""
+"""Largest number of signatures that settings keep; each is of one user on one computer."""
 
 _SHOWN = 160
 """Characters of a setting in a store that are shown."""
@@ -89,7 +89,7 @@ def unsigned(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def why_no_key() -> str | None:
-    """Return why this user can sign nothing; None if there is a key or one can be made.
+    """Return why this user cannot sign; None if there is a key or one can be made.
 
     Raises:
         InputError: the key is damaged.
@@ -160,11 +160,11 @@ def _read_key(path: Path) -> bytes:
     return key
 
 
-# What would run code
+# Settings that would run code
 
 
 def code_named(settings: Mapping[str, Any]) -> list[str]:
-    """Return what in settings would be imported or run if their experiment were built; each as a text to show.
+    """Return the settings whose code would run if the experiment were built, each as a text to show.
 
     Whatever is not known to be data counts as code: a reference anywhere, a task by name, a part of this package that
     runs programs or foreign libraries, and every case, part, search and certificate that this package does not have:

@@ -1,0 +1,107 @@
+"""Options of cases on the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner, Result
+
+from ctxval.cli import app
+from ctxval.cli.case_options import case_options, parsed
+from ctxval.errors import InputError
+
+
+@pytest.fixture
+def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> Result:
+        return CliRunner().invoke(app, list(arguments))
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("4", 4),
+        ("1e-3", 0.001),
+        ("true", True),
+        ("basin", "basin"),
+        ("'4'", "4"),
+        ('"a b"', "a b"),
+        ("[1, 2]", [1, 2]),
+        ("", ""),
+        ("2024-01-01", "2024-01-01"),
+        ('{ ref = "os:getcwd" }', '{ ref = "os:getcwd" }'),
+        ("4\nfolder = 5", "4\nfolder = 5"),
+        ("[" * 5_000, "[" * 5_000),
+    ],
+)
+def test_a_value_is_what_a_file_would_hold_or_else_text(text: str, value: Any) -> None:
+    assert parsed(text) == value
+    assert type(parsed(text)) is type(value)
+
+
+@given(st.text())
+def test_no_text_is_too_odd_for_a_value(text: str) -> None:
+    assert isinstance(parsed(text), str | int | float | bool | list)
+
+
+def test_options_with_an_option_of_their_own_stand_beside_the_others() -> None:
+    assert case_options(["drag=0.5", " name = x=y "], dim=3, model=None) == {"dim": 3, "drag": 0.5, "name": "x=y"}
+    assert case_options(None) == {}
+
+
+@pytest.mark.parametrize(
+    ("given_options", "sentence"),
+    [
+        (["dim"], r"--option must be NAME=VALUE, such as --option dim=4, got 'dim'\."),
+        (["=4"], "--option must be NAME=VALUE"),
+        (["dim=4", "dim=5"], "the option dim is given twice: as 4 and as '5'"),
+        (["model=gp"], "the option model is given twice: as 'fnn' and as 'gp'"),
+    ],
+)
+def test_an_option_that_cannot_be_used_is_named(given_options: list[str], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        case_options(given_options, model="fnn")
+
+
+def test_any_option_of_a_case_can_be_set(invoke: Any) -> None:
+    command = ("run", "linear", "--budget", "2", "--search", "random", "--json")
+    by_option = invoke(*command, "--option", "dim=2", "--store", "a.sqlite")
+    by_name = invoke(*command, "--dim", "2", "--store", "b.sqlite")
+    assert by_option.exit_code == by_name.exit_code == 1
+    first, second = (json.loads(result.stdout) for result in (by_option, by_name))
+    assert first["options"] == second["options"] == {"dim": 2}
+    assert first["worst"] == second["worst"]
+    assert invoke("check", "linear", "--option", "dim=2").exit_code == 0
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_a_wrong_option_is_refused_with_the_nearest(invoke: Any, command: str) -> None:
+    for option, sentence in (
+        ("dims=2", "no option of the case 'linear' is called 'dims'; did you mean 'dim'?"),
+        ("dim=large", "case 'linear': dim: input should be a valid integer, got 'large'."),
+    ):
+        result = invoke(command, "linear", "--option", option)
+        assert result.exit_code == 2
+        assert sentence in result.stderr.replace("\n", " ")
+
+
+def test_cases_are_listed_with_their_options(invoke: Any) -> None:
+    said = invoke("cases").stdout
+    assert "options: dim=4" in said
+    assert "options: model=fnn" in said
+    listed = json.loads(invoke("cases", "--json").stdout)
+    assert {"pendulum", "arm", "dubins", "linear"} <= set(listed)
+    assert listed["linear"].startswith("random linear systems")
+    one = json.loads(invoke("cases", "dubins", "--json").stdout)
+    assert one == {"case": "dubins", "text": listed["dubins"], "options": {"variant": "paper", "distance": None}}
+    refused = invoke("cases", "dubin")
+    assert (refused.exit_code, "did you mean 'dubins'" in refused.stderr) == (2, True)

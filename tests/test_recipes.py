@@ -1,0 +1,179 @@
+"""The recipes of CONTRIBUTING.md, followed to the letter in a copy of the tree."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ctxval import cases, controllers, distances, models, searches, systems
+
+ROOT = Path(__file__).parents[1]
+GUIDE = (ROOT / "CONTRIBUTING.md").read_text()
+LINES = 40
+FILES = 2
+"""Files of the package that a recipe touches; its test comes on top."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One recipe: its blocks of code by file, and how an experiment file names the part."""
+
+    part: str
+    module: str
+    source: str
+    export: str
+    line: str
+    test: str
+    check: str
+    toml: dict[str, Any]
+
+
+def recipes() -> dict[str, Recipe]:
+    found = {}
+    for part, text in re.findall(r"^### An? (\w+)\n(.*?)(?=^##|\Z)", GUIDE, re.DOTALL | re.MULTILINE):
+        blocks = re.findall(r"`((?:src|tests)/[\w/]+\.py)`:\n\n```python\n(.*?)```", text, re.DOTALL)
+        (toml,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+        found[part] = Recipe(part, *(each for block in blocks for each in block), tomllib.loads(toml))
+    return found
+
+
+RECIPES = recipes()
+
+WHOLE: dict[str, Any] = {
+    "space": {"goal": [0.5, 2.0, "m"]},
+    "task": {"initial_state": [0.0, 0.0], "goal": ["goal", 0.0], "horizon": 20, "dt": 0.1},
+    "system": {"type": "Manual", "states": {"position": "m", "speed": "m/s"}, "inputs": {"force": "N"}, "dt": 0.1},
+    "model": {"type": "Linear", "A": [[1.0, 0.1], [0.0, 1.0]], "B": [[0.0], [0.1]]},
+    "synthesizer": {"type": "LQR", "Q": [10.0, 1.0], "R": [0.1]},
+}
+"""An experiment file, of which a recipe replaces a table."""
+
+MY_RIG = """
+import numpy as np
+
+def step(x, u):
+    return np.stack([x[..., 0] + 0.1 * x[..., 1], x[..., 1] + 0.1 * u[..., 0]], axis=-1)
+"""
+
+COPIED = ("src", "benchmarks", "docs", "tests", "pyproject.toml", "README.md", "CONTRIBUTING.md", "CHANGELOG.md")
+TESTS = (
+    "tests/test_architecture.py",
+    "tests/test_public.py",
+    "tests/_util/test_part_registry.py",
+    "tests/benchmarks/test_parts_page.py",
+)
+"""Tests that hold any part against what all parts must be."""
+
+
+def not_needed(folder: str, names: list[str]) -> set[str]:
+    """Return what of a folder is left out of the copy: results and pictures, which no recipe has to do with."""
+    return {name for name in names if name in ("__pycache__", "results") or name.endswith((".json", ".png", ".sqlite"))}
+
+
+def run(tree: Path, *command: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a Python module in the copy."""
+    environment = {**os.environ, "PYTHONPATH": str(tree / "src"), "OMP_NUM_THREADS": "1", "NO_COLOR": "1"}
+    return subprocess.run(
+        [sys.executable, "-m", *command], cwd=cwd or tree, env=environment, capture_output=True, text=True
+    )
+
+
+def exported(text: str, line: str) -> str:
+    """Return an ``__init__.py`` with an import and its name in ``__all__``, or with a line of NAMES."""
+    if line.startswith("from "):
+        name = line.split()[-1]
+        text = text.replace("\nfrom ctxval.", f"\n{line}from ctxval.", 1)
+        return text.replace("__all__ = [", f'__all__ = ["{name}", ', 1)
+    return re.sub(r"(^NAMES[^\n]*\{\n)", lambda found: found[0] + line, text, count=1, flags=re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the tree in which all recipes were followed, up to `make parts`."""
+    copy = tmp_path_factory.mktemp("clone")
+    for name in COPIED:
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, copy / name, ignore=not_needed)
+        else:
+            shutil.copy2(source, copy / name)
+    for recipe in RECIPES.values():
+        for path, content in ((recipe.module, recipe.source), (recipe.test, recipe.check)):
+            assert not (copy / path).exists(), f"{path} exists already; the recipe needs another example."
+            (copy / path).write_text(content)
+        package = copy / recipe.export
+        package.write_text(exported(package.read_text(), recipe.line))
+    for command in (("ruff", "check", "--fix", "."), ("ruff", "format", "."), ("benchmarks.parts_page",)):
+        done = run(copy, *command, "--no-cache") if command[0] == "ruff" else run(copy, *command)
+        assert done.returncode == 0, done.stdout + done.stderr
+    return copy
+
+
+def test_there_is_a_recipe_for_each_of_these() -> None:
+    assert {"search", "distance", "system", "case"} <= set(RECIPES)
+
+
+@pytest.mark.parametrize("part", RECIPES)
+def test_a_recipe_is_short(part: str) -> None:
+    recipe = RECIPES[part]
+    written = [line for block in (recipe.source, recipe.line, recipe.check) for line in block.splitlines()]
+    assert len(recipe.source.splitlines()) < LINES
+    assert len([line for line in written if line.strip()]) < LINES
+    assert len({recipe.module, recipe.export}) <= FILES
+    assert recipe.module.startswith("src/ctxval/")
+    assert Path(recipe.test).parts[1] == Path(recipe.module).parts[2]  # tests mirror the source
+
+
+def test_what_the_recipes_give_passes_make_check(tree: Path) -> None:
+    for recipe in RECIPES.values():  # it is formatted and in order as it is written in the guide
+        assert (tree / recipe.module).read_text() == recipe.source
+        assert (tree / recipe.test).read_text() == recipe.check
+    for command in (("ruff", "check", "--no-cache", "."), ("ruff", "format", "--no-cache", "--check", "."), ("mypy",)):
+        done = run(tree, *command)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_what_the_recipes_give_passes_its_tests_and_those_of_all_parts(tree: Path) -> None:
+    own = [recipe.test for recipe in RECIPES.values()]
+    done = run(tree, "pytest", "-q", "-p", "no:cacheprovider", *own, *TESTS)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("part", RECIPES)
+def test_a_part_is_found_in_an_experiment_file_and_in_the_page(part: str, tree: Path, tmp_path: Path) -> None:
+    toml = RECIPES[part].toml
+    content = toml if part == "case" else {**WHOLE, **toml}
+    (tmp_path / "e.toml").write_text("".join(f"{key} = {written(value)}\n" for key, value in content.items()))
+    (tmp_path / "my_rig.py").write_text(MY_RIG)
+    done = run(tree, "ctxval.cli", "check", "e.toml", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert json.loads(done.stdout)["ok"]
+    table = toml.get(part, toml)
+    name = table.get("type") or table.get("name") or table.get("kind") or table["experiment"]
+    assert f"| `{name}` |" in (tree / "docs" / "parts.md").read_text()
+    assert f"| `{name}` |" not in (ROOT / "docs" / "parts.md").read_text()
+
+
+def written(value: Any) -> str:
+    """Return a value as TOML."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {written(item)}" for key, item in value.items()) + " }"
+    return json.dumps(value)
+
+
+def test_the_groups_of_entry_points_are_those_of_the_registries() -> None:
+    named = set(re.findall(r"`(ctxval\.[a-z]+)`", GUIDE.partition("The groups are")[2].partition("The rules")[0]))
+    groups = {each.REGISTRY.group for each in (systems, models, controllers, distances, searches, cases)}
+    assert named == groups | {"ctxval.certificates"}
+    (text,) = re.findall(r"```toml\n(\[project\.entry-points.*?)```", GUIDE, re.DOTALL)
+    assert set(tomllib.loads(text)["project"]["entry-points"]) <= named
