@@ -14,6 +14,7 @@ from ctxval._util.registry import part
 from ctxval.campaign import Campaign, OpenTrial
 from ctxval.certificates.verdict import Verdict
 from ctxval.core.experiment import Experiment
+from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
@@ -59,6 +60,7 @@ __all__ = [
     "cached_truth",
     "grid_truth",
     "part",
+    "rollout",
     "search_truth",
 ]
 
