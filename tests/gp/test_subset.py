@@ -8,7 +8,8 @@ from scipy.spatial.distance import cdist
 
 from ctxval import searches
 from ctxval._util.arrays import Array
-from ctxval.gp.subset import LONG, kept_rows
+from ctxval.gp.kernels import Matern
+from ctxval.gp.subset import LONG, kept_rows, pivoted_rows
 
 
 def long_history(count: int, dimension: int = 2, failed: int = 0) -> tuple[Array, Array]:
@@ -90,3 +91,19 @@ def test_a_surrogate_of_a_long_history_has_its_best_point() -> None:
     mean, deviation = surrogate.predict(points[[values.argmax()]])
     assert mean[0] == pytest.approx(values.max(), abs=0.01)
     assert deviation[0] < 0.01
+
+
+def test_each_pivot_has_the_largest_variance_that_those_before_it_leave() -> None:
+    kernel, theta = Matern(2.5), np.log([2.0, 0.6])
+    X = np.random.default_rng(0).random((30, 2))
+    rows = pivoted_rows(kernel, theta, X, 8, least=0.0)
+    K = kernel(theta, X, X)
+    for count in range(1, 8):
+        before = rows[:count]
+        left = np.diag(K - K[:, before] @ np.linalg.solve(K[np.ix_(before, before)], K[before]))
+        assert left[rows[count]] == pytest.approx(left.max(), rel=1e-6)
+
+
+def test_pivots_end_where_the_others_add_nothing() -> None:
+    X = np.repeat(np.random.default_rng(0).random((3, 2)), 5, axis=0)
+    assert len(pivoted_rows(Matern(), np.log([1.0, 0.5]), X, 10, least=1e-9)) == 3

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctxval.errors import InputError
-from ctxval.gp import regression as gp
+from ctxval.gp import regression
 from ctxval.gp.kernels import Linear, Matern
 from ctxval.gp.surrogate import Learned, fit_surrogate, learn
 
@@ -95,7 +95,7 @@ def test_fewer_than_two_known_values_are_refused(known: int) -> None:
 
 
 @pytest.mark.parametrize("prior", [lambda X: np.full(len(X), np.nan), lambda X: X, lambda X: 0.0])
-def test_a_prior_mean_without_one_finite_value_a_point_is_refused(prior: gp.Mean) -> None:
+def test_a_prior_mean_without_one_finite_value_a_point_is_refused(prior: regression.Mean) -> None:
     with pytest.raises(InputError, match="one finite value for each point"):
         fit_surrogate(*data(), prior_mean=prior)
 

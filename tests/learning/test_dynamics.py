@@ -4,7 +4,7 @@ import numpy as np
 
 from ctxval import Transitions, models
 from ctxval._util.arrays import Array
-from ctxval.learning.dynamics import CorrectedModel, Residual, Staying, learn_corrected, learn_residual
+from ctxval.learning.dynamics import CorrectedModel, Identity, Residual, learn_corrected, learn_residual
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 
@@ -97,4 +97,4 @@ def test_around_a_model_that_is_rougher_than_the_system_the_steps_are_learned_in
     rough = models.Function(lambda x, u: MODEL.step(x, u) + 0.3 * np.sign(np.sin(9 * x)), vectorized=True)
     data = record(400)
     corrected = [learn_corrected(model, data, np.full(400, -1), 200) for model in (MODEL, rough)]
-    assert [type(hat.model) for hat in corrected if hat is not None] == [models.Linear, Staying]
+    assert [type(hat.model) for hat in corrected if hat is not None] == [models.Linear, Identity]

@@ -15,14 +15,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import Bounds, differential_evolution, minimize
+from scipy.optimize import Bounds, differential_evolution
 
 from ctxval._util.arrays import Array
+from ctxval._util.boxes import climb
 from ctxval._util.describe import describe, rounded
 from ctxval._util.representation import call, line, lines
 from ctxval.core.space import Parameters
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
+
+_STEP = 1e-6
+"""Step of the central differences, in widths of the unit cube."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,21 +177,22 @@ class _TruthSearch:
     def _climb(self, value: float, point: Array) -> Array:
         scale = value if 0 < value < np.inf else 1.0  # L-BFGS-B's tolerances suit values about 1
 
-        def negative(x: Array) -> tuple[float, Array]:
-            return self._loss_and_slope(x, scale)
+        def sloped(points: Array) -> tuple[Array, Array]:
+            here, slope = self._value_and_slope(points[0], scale)
+            return here, slope[None]
 
-        bounds = [(0.0, 1.0)] * self.dimension
         with np.errstate(all="ignore"):
-            climbed = minimize(negative, point, jac=True, method="L-BFGS-B", bounds=bounds)
-        return np.asarray(climbed.x) if -float(climbed.fun) * scale > value else point
+            climbed, top = climb(sloped, point[None], np.zeros(self.dimension), np.ones(self.dimension))
+        return climbed[0] if top * scale > value else point
 
-    def _loss_and_slope(self, point: Array, scale: float) -> tuple[float, Array]:
-        moves = 1e-6 * np.eye(self.dimension)
+    def _value_and_slope(self, point: Array, scale: float) -> tuple[Array, Array]:
+        """Return d at a point, shape ``(1,)``, and its central differences ``(d,)``, both over the scale."""
+        moves = _STEP * np.eye(self.dimension)
         up, down = np.clip(point + moves, 0, 1), np.clip(point - moves, 0, 1)
-        losses = -self.values(np.concatenate([point[None], up, down])) / scale
+        values = self.values(np.concatenate([point[None], up, down])) / scale
         widths = np.diagonal(up) - np.diagonal(down)
-        slope = (losses[1 : self.dimension + 1] - losses[self.dimension + 1 :]) / widths
-        return float(losses[0]), np.where(np.isfinite(slope), slope, 0.0)
+        slope = (values[1 : self.dimension + 1] - values[self.dimension + 1 :]) / widths
+        return values[:1], np.where(np.isfinite(slope), slope, 0.0)
 
 
 def _gap(found: list[tuple[float, Array]]) -> float:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 from scipy.special import erfcx, log_ndtr, ndtr
 
-from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.arrays import Array, Mask
+from ctxval._util.boxes import climb, moves_to_bounds, separated_rows
 from ctxval.gp.regression import GaussianProcess
 
 
@@ -24,14 +24,21 @@ class Acquisition(Protocol):
         """Return the values ``(m,)`` and their gradients ``(m, d)``."""
 
 
-_DISTINCT, _APART = 1e-6, 0.02
-"""How far a proposal is from every known point, in one coordinate at least; and from each that it shall keep away from,
-as a share of the cube's diagonal."""
+_DISTINCT = 1e-6
+"""How far a proposal is from every known point, in one coordinate at least."""
+_APART = 0.02
+"""How far a proposal is from points to keep away from, as a share of the cube's diagonal."""
+_STARTS = 4
+"""Candidates that are climbed from."""
+_SEPARATION = 0.05
+"""Least distance between them, as a share of the cube's diagonal."""
+_ITERATIONS = 20
+"""The most of one climb."""
 
 _FAR_BELOW = -1e3
 """Standard deviations below the best value from which on series replace differences of large logarithms."""
 _CERTAIN = 1e-9
-"""The least standard deviation that an improvement is expected from."""
+"""The least standard deviation from which an improvement is expected."""
 _LOG_ROOT_2PI = 0.5 * float(np.log(2 * np.pi))
 
 
@@ -166,7 +173,10 @@ def maximise(
     if away is not None and (apart := _is_apart(candidates, away)).any():
         candidates = candidates[apart]
     order = np.argsort(-acquisition(candidates), kind="stable")
-    climbed = _climb(acquisition, candidates[_spread(candidates, order, count=4)], low, high)
+    reach = _SEPARATION * float(np.sqrt(dimension))
+    best = candidates[order[:200]]
+    starts = best[separated_rows(best, reach, _STARTS)]
+    climbed, _ = climb(acquisition.with_gradient, starts, low, high, iterations=_ITERATIONS)
     if corners:
         climbed = np.concatenate([climbed, _polish(acquisition, climbed, low, high)])
     finalists = np.concatenate([climbed, candidates[order[:16]]])
@@ -188,39 +198,13 @@ def _polish(acquisition: Acquisition, points: Array, low: Array, high: Array) ->
     """Move one coordinate of the best point at a time to the bound that pays most, while one does."""
     values = acquisition(points)
     point, value = points[np.argmax(values)], float(values.max())
-    moves = np.tile(np.eye(len(low), dtype=bool), (2, 1))
-    ends = np.repeat([low, high], len(low), axis=0)
     for _ in range(2 * len(low)):
-        moved = np.where(moves, ends, point)
+        moved = moves_to_bounds(point, low, high)
         values = acquisition(moved)
         if values.max() <= value:
             break
         point, value = moved[np.argmax(values)], float(values.max())
     return np.asarray(point[None])
-
-
-def _spread(candidates: Array, order: Rows, count: int) -> list[int]:
-    """Return the best candidates that are not neighbours of a better one."""
-    chosen: list[int] = []
-    reach = 0.05 * np.sqrt(candidates.shape[1])
-    for i in order[:200].tolist():
-        if all(np.linalg.norm(candidates[i] - candidates[j]) > reach for j in chosen):
-            chosen.append(i)
-        if len(chosen) == count:
-            break
-    return chosen
-
-
-def _climb(acquisition: Acquisition, starts: Array, low: Array, high: Array) -> Array:
-    """Climb from all starts at once: their sum is separable, so one quasi-Newton search serves them all."""
-
-    def negative(flat: Array) -> tuple[float, Array]:
-        values, gradients = acquisition.with_gradient(flat.reshape(starts.shape))
-        return -float(values.sum()), -gradients.ravel()
-
-    bounds = list(zip(np.tile(low, len(starts)), np.tile(high, len(starts)), strict=True))
-    result = minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 20})
-    return np.asarray(np.clip(result.x.reshape(starts.shape), low, high))
 
 
 def _is_apart(points: Array, away: Array) -> Mask:

@@ -1,22 +1,32 @@
-"""Maximising a plain function over a box in few, large batches; many of the maxima sought lie at corners."""
+"""Maximising a function without gradients over a box, in few and large batches.
+
+Many of the maxima that are sought lie at corners of the box.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array
+from ctxval._util.boxes import climb, moves_to_bounds, separated_rows
 
 Values = Callable[[Array], Array]
 """Points ``(m, d)`` -> values ``(m,)``."""
 
 _STARTS = 6
+"""Points from which the function is climbed."""
 _POLISHED = 3
+"""Best points of which several coordinates at a time are moved to bounds."""
 _STEP = 1e-4
-_FEW, _ZOOMS = 3, (0.03, 0.01, 0.003, 0.001)
-"""Dimensions up to which there are no slopes, and how closely the best points are sampled instead."""
+"""Step of the one-sided differences."""
+_SEPARATION = 0.1
+"""Least distance between the starts, as a share of the box's diagonal."""
+_FEW = 3
+"""Dimensions up to which the best points are sampled ever more closely instead of climbed from."""
+_ZOOMS = (0.03, 0.01, 0.003, 0.001)
+"""Standard deviations of these samples, as shares of the box."""
 
 
 class Ascent:
@@ -80,14 +90,9 @@ class Ascent:
     def _spread_best(self) -> Array:
         """Return some of the best points, none a neighbour of a better one."""
         points, values = self._found()
-        reach = 0.1 * np.linalg.norm(self._high - self._low)
-        chosen: list[Array] = []
-        for point in points[np.isfinite(values)][:200]:
-            if all(np.linalg.norm(point - other) > reach for other in chosen):
-                chosen.append(point)
-            if len(chosen) == _STARTS:
-                break
-        return np.array(chosen)
+        finite = points[np.isfinite(values)]
+        reach = _SEPARATION * float(np.linalg.norm(self._high - self._low))
+        return finite[separated_rows(finite, reach, _STARTS)]
 
     def _zoom(self, rng: np.random.Generator) -> None:
         """Sample ever closer around the best points: cheaper than slopes in few dimensions, and kinks do no harm."""
@@ -100,20 +105,17 @@ class Ascent:
             self._look(np.clip(np.resize(best, (count, len(self._low))) + moves, self._low, self._high))
 
     def _climb(self, starts: Array) -> None:
-        """Climb from all starts at once: their sum is separable, so one quasi-Newton search serves them all."""
+        """Climb from all starts at once along differences; what they reach is among the points looked at."""
         if not len(starts):
             return
         scale = max(float(np.abs(self._found()[1][0])), 1e-300)
         batch = len(starts) * (len(self._low) + 1)
         calls = max(2, int(0.8 * self._left()) // batch)
 
-        def negative(flat: Array) -> tuple[float, Array]:
-            values, slopes = self._slopes(np.clip(flat.reshape(starts.shape), self._low, self._high))
-            return -float(values.sum()) / scale, -slopes.ravel() / scale
+        def sloped(points: Array) -> tuple[Array, Array]:
+            return self._slopes(np.clip(points, self._low, self._high))
 
-        bounds = list(zip(np.tile(self._low, len(starts)), np.tile(self._high, len(starts)), strict=True))
-        options = {"maxfun": calls, "maxiter": calls}
-        minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        climb(sloped, starts, self._low, self._high, scale=scale, iterations=calls, evaluations=calls)
 
     def _slopes(self, points: Array) -> tuple[Array, Array]:
         """Return values and one-sided differences, inward where a bound is near."""
@@ -132,11 +134,11 @@ class Ascent:
         points, values = self._found()
         d = len(self._low)
         best = points[:_POLISHED]
-        ends = np.concatenate([np.tile(self._low, (d, 1)), np.tile(self._high, (d, 1))])
-        single = np.where(np.tile(np.eye(d, dtype=bool), (2, 1)), ends, best[0])
+        ends = np.stack([self._low, self._high])
+        single = moves_to_bounds(best[0], self._low, self._high)
         parents = best[rng.integers(len(best), size=2 * d)]
         several = np.where(
-            rng.random(parents.shape) < 2 / d, ends[rng.integers(2, size=parents.shape) * d, np.arange(d)], parents
+            rng.random(parents.shape) < 2 / d, ends[rng.integers(2, size=parents.shape), np.arange(d)], parents
         )
         moved = np.concatenate([single, several])
         gain = 1e-9 * abs(values[0]) if np.isfinite(values[0]) else 0.0

@@ -13,22 +13,30 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
 
 from ctxval._util.arrays import Array, ArrayLike, Rows
+from ctxval._util.boxes import farthest_rows
 from ctxval._util.representation import call, record
 from ctxval.errors import InputError
+from ctxval.gp.cholesky import CholeskyFactor, factorise
 from ctxval.gp.kernels import Matern
 
 EXACT = 1e-10
 """Noise variance, relative to sigma^2, of values without noise: it keeps the Cholesky factor safe."""
 
 _FEWEST = 6
-"""Data that are asked apart at least."""
+"""The fewest well-spread data whose hyperparameters are drawn separately."""
 
 _STEP = 1.0
+"""Width of the slice sampler's first interval."""
 _MOST_STEPS = 8
+"""Widths that this interval may grow to."""
 _MOST_SHRINKS = 60
+"""Proposals for which it may shrink; then the state stays."""
+_BURN_IN = 20
+"""Sweeps of the chain before the first draw."""
+_FARTHEST = 12.0
+"""The largest logarithm of a length-scale, in magnitude."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +155,7 @@ class Conditioned:
         hyperparameters: the draw.
         warp: the scale of the values.
         y: the values on that scale, shape ``(n,)``.
-        L: lower Cholesky factor of the observations' correlations.
+        factor: Cholesky factor of the observations' correlations.
         mean: the most likely mu.
         mean_variance: its variance relative to sigma^2.
         scale2: the most likely sigma^2, with ``n - 1`` degrees of freedom.
@@ -157,11 +165,16 @@ class Conditioned:
     hyperparameters: Hyperparameters
     warp: Warp
     y: Array
-    L: Array
+    factor: CholeskyFactor
     mean: float
     mean_variance: float
     scale2: float
     log_likelihood: float
+
+    @property
+    def L(self) -> Array:
+        """The lower triangular matrix of the factor, shape ``(n, n)``."""
+        return self.factor.L
 
     def __repr__(self) -> str:
         return call(self, self.hyperparameters, values=self.y, mean=self.mean, scale2=self.scale2)
@@ -175,21 +188,19 @@ def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: W
     """
     scale = Warp() if warp is None else warp
     n, y = len(values), scale.forward(values)
-    correlations = hyperparameters.kernel(X, X)
-    correlations[np.diag_indices(n)] += np.exp(hyperparameters.log_noise)
-    try:
-        L = cholesky(correlations, lower=True, check_finite=False)
-    except np.linalg.LinAlgError as error:
-        raise InputError(f"the correlations of {n} observations are not positive definite.") from error
-    pull = cho_solve((L, True), np.stack([np.ones(n), y], axis=1), check_finite=False)
+    factor = factorise(hyperparameters.kernel(X, X), float(np.exp(hyperparameters.log_noise)))
+    pull = factor.solve(np.stack([np.ones(n), y], axis=1))
     precision = pull[:, 0].sum()
     mean = float(pull[:, 1].sum() / precision)
     scale2 = float((y - mean) @ (pull[:, 1] - mean * pull[:, 0])) / (n - 1)
     scale2 = max(scale2, np.finfo(np.float64).tiny)
     log_likelihood = (
-        scale.log_slope(values) - np.log(np.diag(L)).sum() - 0.5 * np.log(precision) - 0.5 * (n - 1) * np.log(scale2)
+        scale.log_slope(values)
+        - factor.half_log_determinant()
+        - 0.5 * np.log(precision)
+        - 0.5 * (n - 1) * np.log(scale2)
     )
-    return Conditioned(hyperparameters, scale, y, L, mean, float(1 / precision), scale2, float(log_likelihood))
+    return Conditioned(hyperparameters, scale, y, factor, mean, float(1 / precision), scale2, float(log_likelihood))
 
 
 def draw_hyperparameters(
@@ -206,7 +217,7 @@ def draw_hyperparameters(
     drawn = _Sampler(X, y, believed, rng).draw(count)
     apart = max(_FEWEST, int(np.ceil(believed.spread_share * len(y))))
     if apart < len(y):
-        rows = _spread(X, y, apart)
+        rows = _well_spread(X, y, apart)
         rougher = _Sampler(X[rows], y[rows], believed, rng).draw(count)
         drawn = [(_as_rough_as(own, other), warp) for (own, warp), (other, _) in zip(drawn, rougher, strict=True)]
     return [condition(own, X, y, warp) for own, warp in drawn]
@@ -232,7 +243,7 @@ class _Sampler:
 
     def draw(self, count: int) -> list[tuple[Hyperparameters, Warp]]:
         """Return draws two sweeps apart, after a burn-in."""
-        for _ in range(20):
+        for _ in range(_BURN_IN):
             self._sweep()
         draws = []
         for _ in range(count):
@@ -247,7 +258,7 @@ class _Sampler:
 
     def _log_density(self, choice: tuple[float, Warp], state: Array) -> float:
         nu, warp = choice
-        if not self.low <= state[-1] <= self.high or np.abs(state[:-1]).max() > 12:
+        if not self.low <= state[-1] <= self.high or np.abs(state[:-1]).max() > _FARTHEST:
             return -np.inf
         try:
             conditioned = condition(self._hyperparameters(nu, state), self.X, self.y, warp)
@@ -275,15 +286,12 @@ class _Sampler:
         self.choice = choices[int(self.rng.choice(len(choices), p=shares / shares.sum()))]
 
 
-def _spread(X: Array, y: Array, count: int) -> Rows:
+def _well_spread(X: Array, y: Array, count: int) -> Rows:
     """Return the rows of the largest value and of the points farthest from those before, in the data's order."""
-    rows = [int(y.argmax())]
-    gaps = np.linalg.norm(X - X[rows[0]], axis=1)
-    while len(rows) < min(count, len(y)):
-        gaps[rows[-1]] = -1.0  # never again, though other points are where it is
-        rows.append(int(gaps.argmax()))
-        gaps = np.minimum(gaps, np.linalg.norm(X - X[rows[-1]], axis=1))
-    return np.sort(rows)
+    first = int(y.argmax())
+    gaps = np.linalg.norm(X - X[first], axis=1)
+    gaps[first] = -np.inf
+    return np.sort([first, *farthest_rows(X, gaps, count - 1)])
 
 
 def _slice(log_density: Callable[[Array], float], state: Array, direction: Array, rng: np.random.Generator) -> Array:

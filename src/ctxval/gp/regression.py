@@ -2,33 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
-from ctxval.gp.kernels import Kernel
+from ctxval.gp.cholesky import CholeskyFactor, factorise
+from ctxval.gp.kernels import Bounds, Kernel
 
 Mean = Callable[[Array], Array]
 """A prior mean: points ``(n, d)`` -> values ``(n,)``."""
 
-LogPrior = Callable[[Array], tuple[float, Array]]
-"""A prior of the hyperparameters: theta -> (log density, its gradient)."""
+LogDensity = Callable[[Array], tuple[float, Array]]
+"""Hyperparameters -> (the logarithm of their density, its gradient)."""
 
 NOISE = 1e-6
 """The least noise variance, for values of unit variance: it keeps the Cholesky factor safe."""
 
 _IMPOSSIBLE = 1e25
+"""Minus the log density of hyperparameters whose covariance matrix is not positive definite."""
 _MANY = 30
 """Beyond so many observations the likelihood has one clear mode, and one climb finds it."""
+_ITERATIONS = 50
+"""The most of each climb of :func:`fit`."""
+_TOLERANCE = 1e-7
+"""Relative change of the log density at which such a climb ends."""
 _SMOOTHNESS = np.array([0.25, 0.5, 0.75])
+"""Places of the first length-scales between the logarithms of their bounds."""
 
 
 def zero_mean(X: Array) -> Array:
@@ -45,7 +51,7 @@ class GaussianProcess:
         noise: variance of the observations' noise.
         mean: prior mean function.
         X, y: observations, shapes ``(n, d)`` and ``(n,)``.
-        L: lower Cholesky factor of ``K + noise I``.
+        factor: Cholesky factor of ``K + noise I``.
         alpha: ``(K + noise I)^-1 (y - mean(X))``.
     """
 
@@ -55,13 +61,13 @@ class GaussianProcess:
     mean: Mean
     X: Array
     y: Array
-    L: Array
+    factor: CholeskyFactor
     alpha: Array
 
     def predict(self, X: Array) -> tuple[Array, Array]:
         """Return the posterior mean and variance of the noise-free function at ``(m, d)``, shapes ``(m,)``."""
         k = self.kernel(self.theta, X, self.X)
-        half = dtrtrs(self.L, k.T, lower=1)[0]
+        half = self.factor.whiten(k.T)
         variance = self.kernel.diagonal(self.theta, X) - (half**2).sum(axis=0)
         return self.mean(X) + k @ self.alpha, np.maximum(variance, 0.0)
 
@@ -73,7 +79,7 @@ class GaussianProcess:
         """Return mean and variance ``(m,)`` and their gradients ``(m, d)``, for less than the two one by one."""
         k = self.kernel(self.theta, X, self.X)
         dk = self.kernel.input_gradient(self.theta, X, self.X)
-        weights = _solve(self.L, k.T).T
+        weights = self.factor.solve(k.T).T
         variance = np.maximum(self.kernel.diagonal(self.theta, X) - (k * weights).sum(axis=1), 0.0)
         d_mean = (dk.transpose(0, 2, 1) @ self.alpha) + _mean_gradient(self.mean, X)
         pull = (dk.transpose(0, 2, 1) @ weights[:, :, None])[:, :, 0]
@@ -85,12 +91,53 @@ class GaussianProcess:
 
         Rasmussen and Williams 2006, eq. 5.12.
         """
-        precision = np.diag(_inverse(self.L))
-        return self.y - self.alpha / precision, 1 / precision
+        return self.y - self.factor.left_out_errors(self.alpha), 1 / self.factor.precisions
 
     def log_marginal_likelihood(self) -> float:
         """Return log p(y | X, theta)."""
-        return _log_likelihood(self.L, self.alpha, self.y - self.mean(self.X))
+        return _log_likelihood(self.factor, self.alpha, self.y - self.mean(self.X))
+
+
+@dataclass(frozen=True, eq=False)
+class MultiOutputProcess:
+    """Gaussian processes of zero mean for several outputs that share a covariance, conditioned on observations.
+
+    Attributes:
+        kernel, theta: the covariance and the logarithms of its hyperparameters.
+        X, Y: observations, shapes ``(n, d)`` and ``(n, k)``.
+        noises: variances of the observations' noise; the first for which the covariance matrix is positive definite
+            is taken.
+
+    Raises:
+        InputError: on use, if there is no such noise variance.
+    """
+
+    kernel: Kernel
+    theta: Array
+    X: Array
+    Y: Array
+    noises: Sequence[float] = (NOISE,)
+
+    @functools.cached_property
+    def factor(self) -> CholeskyFactor:
+        """The Cholesky factor of ``K + noise I``."""
+        return factorise(self.kernel(self.theta, self.X, self.X), self.noises)
+
+    @functools.cached_property
+    def weights(self) -> Array:
+        """``(K + noise I)^-1 Y``, shape ``(n, k)``."""
+        return self.factor.solve(self.Y)
+
+    def predict(self, X: Array) -> tuple[Array, Array]:
+        """Return the posterior means ``(m, k)`` at ``(m, d)``, and the variance ``(m,)`` that all outputs share."""
+        k = self.kernel(self.theta, X, self.X)
+        half = self.factor.whiten(k.T)
+        variance = self.kernel.diagonal(self.theta, X) - (half**2).sum(axis=0)
+        return k @ self.weights, np.maximum(variance, 0.0)
+
+    def left_out(self) -> Array:
+        """Return the mean ``(n, k)`` of each observation given all others."""
+        return self.Y - self.factor.left_out_errors(self.weights)
 
     def __repr__(self) -> str:
         return call(self, self.kernel, points=len(self.X), dimension=self.X.shape[1], noise=self.noise)
@@ -117,55 +164,36 @@ def condition(
     """
     if X.ndim != 2 or y.shape != (len(X),):
         raise ShapeError(f"observations need X (n, d) and y (n,), got {X.shape} and {y.shape}.")
-    L = _factor(kernel, theta, noise, X)
-    alpha = _solve(L, y - mean(X))
-    return GaussianProcess(kernel, np.asarray(theta, dtype=np.float64), noise, mean, X, y, L, alpha)
+    factor = factorise(kernel(theta, X, X), noise)
+    alpha = factor.solve(y - mean(X))
+    return GaussianProcess(kernel, np.asarray(theta, dtype=np.float64), noise, mean, X, y, factor, alpha)
 
 
-def _factor(kernel: Kernel, theta: Array, noise: float, X: Array) -> Array:
-    covariance = kernel(theta, X, X)
-    covariance[np.diag_indices_from(covariance)] += noise
-    L, info = dpotrf(covariance, lower=1, clean=1)
-    if info or np.isnan(np.trace(L)):  # some LAPACKs let NaN pass
-        raise InputError(f"the covariance of {len(X)} observations is not positive definite; raise the noise.")
-    return np.asarray(L)
-
-
-def _solve(L: Array, right: Array) -> Array:
-    """Return ``(L L')^-1 right``; LAPACK is called without the checks that cost more than a small solve."""
-    return np.asarray(dpotrs(L, right, lower=1)[0])
-
-
-def _inverse(L: Array) -> Array:
-    """Return ``(L L')^-1``."""
-    lower = dpotri(L, lower=1)[0]  # L is zero above its diagonal, and stays so
-    inverse = lower + lower.T
-    inverse[np.diag_indices_from(inverse)] *= 0.5
-    return np.asarray(inverse)
-
-
-def _log_likelihood(L: Array, alpha: Array, residual: Array) -> float:
+def _log_likelihood(factor: CholeskyFactor, alpha: Array, residual: Array) -> float:
     fit = -0.5 * residual @ alpha
-    return float(fit - np.log(np.diag(L)).sum() - 0.5 * len(L) * np.log(2 * np.pi))
+    return float(fit - factor.half_log_determinant() - 0.5 * len(alpha) * np.log(2 * np.pi))
 
 
-def log_likelihood_of_outputs(K: Array, Y: Array) -> tuple[float, Array]:
-    """Return ``sum_o log p(Y[:, o])``, but for a constant, and W, with which ``sum(W * dK)`` is how it changes with K.
+def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, Array]:
+    """Return ``sum_o log p(Y[:, o])`` up to a constant, and its derivative W with respect to K.
+
+    ``sum(W * dK)`` is the change of the value with a change dK of the covariance.
 
     Args:
-        K: covariance of the observations, their noise included, ``(n, n)``.
-        Y: outputs that share it, ``(n, k)``.
+        K: covariance of the noise-free outputs, ``(n, n)``.
+        noise: variance of their noise.
+        Y: outputs that share the covariance, ``(n, k)``.
 
     Raises:
-        LinAlgError: the covariance is not positive definite.
+        InputError: the covariance is not positive definite.
 
     Source:
         Rasmussen and Williams 2006, eqs. 5.8 and 5.9.
     """
-    factor = cho_factor(K, lower=True)
-    alpha = cho_solve(factor, Y)
-    value = -0.5 * (Y * alpha).sum() - Y.shape[1] * np.log(np.diag(factor[0])).sum()
-    return float(value), 0.5 * (alpha @ alpha.T - Y.shape[1] * cho_solve(factor, np.eye(len(K))))
+    factor = factorise(K, noise)
+    alpha = factor.solve(Y)
+    value = -0.5 * (Y * alpha).sum() - Y.shape[1] * factor.half_log_determinant()
+    return float(value), 0.5 * (alpha @ alpha.T - Y.shape[1] * factor.solve(np.eye(len(K))))
 
 
 def log_marginal_likelihood(
@@ -175,13 +203,13 @@ def log_marginal_likelihood(
 
     ``residual`` is the observations less the prior mean (Rasmussen and Williams 2006, eq. 5.9).
     """
-    L = _factor(kernel, theta, noise, X)
-    alpha = _solve(L, residual)
-    W = _inverse(L)
+    factor = factorise(kernel(theta, X, X), noise)
+    alpha = factor.solve(residual)
+    W = factor.inverse()
     W -= np.outer(alpha, alpha)
     W *= -0.5
     gradient = kernel.weighted_gradient(theta, X, W)
-    return _log_likelihood(L, alpha, residual), np.append(gradient, noise * np.trace(W))
+    return _log_likelihood(factor, alpha, residual), np.append(gradient, noise * np.trace(W))
 
 
 def fit(
@@ -191,7 +219,7 @@ def fit(
     *,
     noise: tuple[float, float] = (NOISE, NOISE),
     mean: Mean = zero_mean,
-    log_prior: LogPrior | None = None,
+    log_prior: LogDensity | None = None,
     starts: Array | None = None,
 ) -> GaussianProcess:
     """Return the process with the most likely hyperparameters within the kernel's bounds.
@@ -211,29 +239,56 @@ def fit(
     bounds = [*kernel.bounds(X.shape[1]), (float(np.log(noise[0])), float(np.log(noise[1])))]
     residual = y - mean(X)
 
-    def negative(parameters: Array) -> tuple[float, Array]:
-        theta, variance = parameters[:-1], float(np.exp(parameters[-1]))
-        try:
-            value, gradient = log_marginal_likelihood(kernel, theta, variance, X, residual)
-        except InputError:
-            return _IMPOSSIBLE, np.zeros_like(parameters)
-        if log_prior is not None:
-            prior, prior_gradient = log_prior(parameters)
-            value, gradient = value + prior, gradient + prior_gradient
-        return -value, -gradient
+    def log_density(parameters: Array) -> tuple[float, Array]:
+        noise_variance = float(np.exp(parameters[-1]))
+        value, gradient = log_marginal_likelihood(kernel, parameters[:-1], noise_variance, X, residual)
+        if log_prior is None:
+            return value, gradient
+        prior, prior_gradient = log_prior(parameters)
+        return value + prior, gradient + prior_gradient
 
     starts = _default_starts(bounds) if starts is None else starts
-    if len(X) > _MANY:
-        starts = starts[[np.argmin([negative(start)[0] for start in starts])]]
-    options: Any = {"maxiter": 50, "ftol": 1e-7}
-    climbs = [
-        minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options) for start in starts
-    ]
-    best = min(climbs, key=lambda climb: float(climb.fun)).x
+    many = len(X) > _MANY
+    best = most_likely(log_density, starts, bounds, best_start=many, iterations=_ITERATIONS, tolerance=_TOLERANCE)
     return condition(kernel, best[:-1], X, y, noise=float(np.exp(best[-1])), mean=mean)
 
 
-def _default_starts(bounds: list[tuple[float, float]]) -> Array:
+def most_likely(
+    log_density: LogDensity,
+    starts: Array,
+    bounds: Bounds,
+    *,
+    best_start: bool = False,
+    iterations: int = 60,
+    tolerance: float | None = None,
+) -> Array:
+    """Return the hyperparameters with the largest density that climbs with L-BFGS-B find within bounds.
+
+    Args:
+        log_density: raises an InputError if the covariance matrix of hyperparameters is not positive definite; they
+            count as impossible.
+        starts: shape ``(s, k)``.
+        bounds: of each of the k hyperparameters.
+        best_start: whether only the most likely start is climbed from, instead of all.
+        iterations: the most of one climb.
+        tolerance: relative change of the log density at which a climb ends; the default of L-BFGS-B if None.
+    """
+
+    def negative(parameters: Array) -> tuple[float, Array]:
+        try:
+            value, gradient = log_density(parameters)
+        except InputError:
+            return _IMPOSSIBLE, np.zeros_like(parameters)
+        return -value, -gradient
+
+    if best_start:
+        starts = starts[[np.argmin([negative(start)[0] for start in starts])]]
+    options: Any = {"maxiter": iterations, **({} if tolerance is None else {"ftol": tolerance})}
+    found = [minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options) for start in starts]
+    return np.asarray(min(found, key=lambda one: float(one.fun)).x)
+
+
+def _default_starts(bounds: Bounds) -> Array:
     """Return starts for rough, middling and smooth functions of middling variance."""
     low, high = np.array(bounds).T
     starts = np.tile(0.5 * (low + high), (len(_SMOOTHNESS), 1))

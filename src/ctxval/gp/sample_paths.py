@@ -10,16 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve
-from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array
+from ctxval._util.boxes import climb, moves_to_bounds
 from ctxval.gp.hyperposterior import EXACT, Conditioned
 
 WAVES = 512
 """Frequencies of a prior path: its covariance errs by about ``1 / sqrt(2 WAVES)``, a path's maximum by much less."""
 
 _STARTS = 4
+"""Points from which each path is climbed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +112,7 @@ def draw_paths(conditioned: Conditioned, X: Array, count: int, rng: np.random.Ge
     noise = np.exp(hyperparameters.log_noise)
     errors = np.zeros((n, count)) if noise <= EXACT else np.sqrt(noise) * rng.normal(size=(n, count))
     gaps = (conditioned.y[:, None] - means) / scales - _waves(X, frequencies) @ amplitudes - errors
-    corrections = cho_solve((conditioned.L, True), gaps, check_finite=False)
+    corrections = conditioned.factor.solve(gaps)
     return Paths(conditioned, X, frequencies, amplitudes, corrections, means, scales)
 
 
@@ -155,25 +155,21 @@ def _highest(paths: Paths, points: Array) -> Array:
 
 
 def _climb(paths: Paths, starts: Array, steps: int) -> Array:
-    """Climb from all starts at once: their sum is separable, so one quasi-Newton search serves them all."""
-    units = paths.scales[:, None]
+    """Return the points ``(s, q, d)`` that climbs of so many iterations reach, each path in units of its sigma."""
+    units, d = paths.scales[:, None], starts.shape[-1]
 
-    def negative(flat: Array) -> tuple[float, Array]:
-        values, gradients = paths.own_with_gradient(flat.reshape(starts.shape))
-        return -float((values / units).sum()), -(gradients / units[..., None]).ravel()
+    def sloped(points: Array) -> tuple[Array, Array]:
+        values, gradients = paths.own_with_gradient(points)
+        return values / units, gradients / units[..., None]
 
-    bounds = [(0.0, 1.0)] * starts.size
-    result = minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps})
-    return np.asarray(np.clip(result.x, 0.0, 1.0).reshape(starts.shape))
+    return climb(sloped, starts, np.zeros(d), np.ones(d), iterations=steps)[0]
 
 
 def _polish(paths: Paths, tops: Array, where: Array) -> tuple[Array, Array]:
     """Move one coordinate at a time to a bound, the best one first."""
     s, d = where.shape
     for _ in range(d):
-        moved = np.repeat(where[:, None, :], 2 * d, axis=1)
-        axes = np.arange(d)
-        moved[:, axes, axes], moved[:, d + axes, axes] = 0.0, 1.0
+        moved = moves_to_bounds(where, np.zeros(d), np.ones(d))
         heights = paths.own(moved)
         best = heights.argmax(axis=1)
         rows = np.arange(s)

@@ -1,4 +1,4 @@
-"""What a surrogate keeps of a history that is too long for exact regression."""
+"""Few rows of many data that stand for all of them, where exact regression on all would take too long."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Rows
+from ctxval._util.boxes import farthest_rows
+from ctxval.gp.kernels import Kernel
 
 LONG = 1000
 """Points from which on a history is too long: below, all of it is kept."""
@@ -23,16 +25,31 @@ def kept_rows(points: Array, values: Array, count: int) -> Rows:
     largest = np.argsort(-np.nan_to_num(values, nan=-np.inf), kind="stable")[: count // 4]
     latest = np.arange(len(values) - count // 4, len(values))
     chosen = np.unique(np.concatenate([largest, latest]))
-    return np.sort(np.concatenate([chosen, _far_from(points, chosen, count - len(chosen))]))
-
-
-def _far_from(points: Array, chosen: Rows, count: int) -> Rows:
-    """Return so many rows, each farthest from all that are chosen before it (Gonzalez 1985)."""
     gaps = cdist(points, points[chosen], "sqeuclidean").min(axis=1)
-    gaps[chosen] = -np.inf  # also among copies of one point no row is taken twice
-    rows = np.empty(count, dtype=np.intp)
-    for i in range(count):
-        rows[i] = gaps.argmax()
-        gaps = np.minimum(gaps, ((points - points[rows[i]]) ** 2).sum(axis=1))
-        gaps[rows[i]] = -np.inf
-    return rows
+    gaps[chosen] = -np.inf
+    others = farthest_rows(points, gaps, count - len(chosen), squared=True)
+    return np.sort(np.concatenate([chosen, np.array(others, dtype=np.intp)]))
+
+
+def pivoted_rows(kernel: Kernel, theta: Array, X: Array, count: int, least: float) -> Rows:
+    """Return the rows of pivoted Cholesky: each is the point of which those before it leave the largest variance.
+
+    Args:
+        kernel, theta: the covariance and the logarithms of its hyperparameters.
+        X: points ``(n, d)``.
+        count: how many rows there may be.
+        least: the choice ends where no point has a larger variance left.
+    """
+    left = kernel.diagonal(theta, X)
+    columns = np.zeros((min(count, len(X)), len(X)))
+    chosen: list[int] = []
+    for k in range(len(columns)):
+        pivot = int(np.argmax(left))
+        if left[pivot] <= least:
+            break
+        row = kernel(theta, X[pivot : pivot + 1], X)[0] - columns[:k, pivot] @ columns[:k]
+        columns[k] = row / np.sqrt(left[pivot])
+        left = left - columns[k] ** 2
+        left[pivot] = 0.0
+        chosen.append(pivot)
+    return np.array(chosen, dtype=np.intp)

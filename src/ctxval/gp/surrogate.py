@@ -9,23 +9,29 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import record
 from ctxval.errors import InputError
-from ctxval.gp import regression as gp
 from ctxval.gp.hyperposterior import Warp
 from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
+from ctxval.gp.regression import NOISE, GaussianProcess, Mean, condition, fit, zero_mean
 
 _KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())
-_LENGTH_SCALE, _SPREAD, _ARD_SPREAD = 0.4, 0.5, 0.3
-"""Median of the length-scales, times the square root of the dimension; deviation of the mean of their logarithms, and
-of each from that mean: few values say how smooth a function is, and many which dimensions matter."""
-_VARIANCE, _LINEAR = 1.0, 0.3
-"""Medians of the variances of the Matern part and, averaged over the cube, of each linear one."""
-_VARIANCE_SPREAD = 1.5
+_LENGTH_SCALE = 0.4
+"""Prior median of the length-scales, divided by the square root of the dimension."""
+_COMMON_DEVIATION = 0.5
+"""Prior standard deviation of the mean of the length-scales' logarithms: few values tell how smooth a function is."""
+_ARD_DEVIATION = 0.3
+"""Prior standard deviation of each logarithm from that mean: many values are needed to tell which dimensions matter."""
+_VARIANCE = 1.0
+"""Prior median of the variance of the Matern kernel."""
+_LINEAR = 0.3
+"""Prior median of each variance of the linear kernel, averaged over the cube."""
+_VARIANCE_DEVIATION = 1.5
+"""Prior standard deviation of the logarithms of these variances."""
 _OFFSET = 0.1
-"""Of the logarithm, in means of the values, as in the prior of the certificates."""
+"""The c of ``log(d + c)``, in means of the values, as in the prior of the certificates."""
 _CLEARLY = 0.25
-"""By how much, for each value, its logarithmic density must be larger for the logarithm of the values to be taken."""
+"""By how much, for each value, the log density of the logarithms must be larger for them to be preferred."""
 _LEARNED_FROM = 300
-"""Values that the hyperparameters are learned from at most."""
+"""The most values that the hyperparameters are learned from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +43,7 @@ class Surrogate:
         shift, scale: the standardisation.
     """
 
-    process: gp.GaussianProcess
+    process: GaussianProcess
     shift: float
     scale: float
 
@@ -55,8 +61,8 @@ def fit_surrogate(
     values: Array,
     kernel: Kernel | None = None,
     *,
-    noise: tuple[float, float] = (gp.NOISE, gp.NOISE),
-    prior_mean: gp.Mean | None = None,
+    noise: tuple[float, float] = (NOISE, NOISE),
+    prior_mean: Mean | None = None,
 ) -> Surrogate:
     """Return the GP of most likely hyperparameters, given values ``(n,)`` at unit-cube points ``(n, d)``.
 
@@ -75,32 +81,32 @@ def fit_surrogate(
         raise InputError("the prior mean must return one finite value for each point.")
     shift = float(y.mean()) if prior_mean is None else 0.0
     scale = _scale(y - shift - prior)
-    mean = gp.zero_mean if prior_mean is None else _Scaled(prior_mean, scale)
-    process = gp.fit(Matern(1.5) if kernel is None else kernel, X, (y - shift) / scale, noise=noise, mean=mean)
+    mean = zero_mean if prior_mean is None else _Scaled(prior_mean, scale)
+    process = fit(Matern(1.5) if kernel is None else kernel, X, (y - shift) / scale, noise=noise, mean=mean)
     return Surrogate(_with_believed(process, points[~known]), shift, scale)
 
 
 def _scale(residual: Array) -> float:
-    """Return the residual's root mean square, or 1 where it vanishes."""
-    spread = float(np.sqrt((residual**2).mean()))
-    return spread if spread > 1e-12 else 1.0
+    """Return the residual's root mean square, or 1 if it vanishes."""
+    size = float(np.sqrt((residual**2).mean()))
+    return size if size > 1e-12 else 1.0
 
 
 @dataclass(frozen=True)
 class _Scaled:
-    mean: gp.Mean
+    mean: Mean
     scale: float
 
     def __call__(self, X: Array) -> Array:
         return np.asarray(self.mean(X), dtype=np.float64) / self.scale
 
 
-def _with_believed(process: gp.GaussianProcess, points: Array) -> gp.GaussianProcess:
+def _with_believed(process: GaussianProcess, points: Array) -> GaussianProcess:
     if not len(points):
         return process
     believed, _ = process.predict(points)
     X, y = np.concatenate([process.X, points]), np.concatenate([process.y, believed])
-    return gp.condition(process.kernel, process.theta, X, y, noise=process.noise, mean=process.mean)
+    return condition(process.kernel, process.theta, X, y, noise=process.noise, mean=process.mean)
 
 
 # For a search in many dimensions
@@ -108,7 +114,7 @@ def _with_believed(process: gp.GaussianProcess, points: Array) -> gp.GaussianPro
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """What values say of a Gaussian process of theirs: it is conditioned on more of them without learning anew.
+    """Hyperparameters learned from some values, with which a process is conditioned on these and on later ones.
 
     Attributes:
         theta: logarithms of the hyperparameters of a Matern 3/2 kernel, a length-scale for each dimension, and a
@@ -126,10 +132,10 @@ class Learned:
         """Return values ``(n,)`` in the process's units."""
         return np.asarray((self.warp.forward(values) - self.shift) / self.scale)
 
-    def condition(self, points: Array, values: Array) -> gp.GaussianProcess:
+    def condition(self, points: Array, values: Array) -> GaussianProcess:
         """Return the process given values ``(n,)``, NaN where pending or failed: there it believes what it predicts."""
         known = np.isfinite(values)
-        process = gp.condition(_KERNEL, self.theta, points[known], self.standardised(values[known]))
+        process = condition(_KERNEL, self.theta, points[known], self.standardised(values[known]))
         return _with_believed(process, points[~known])
 
     def __repr__(self) -> str:
@@ -158,17 +164,17 @@ def _telling(values: Array) -> Rows:
     """Return the rows of the largest values and of others evenly spread over the history."""
     order = np.argsort(-values, kind="stable")
     largest, others = order[: _LEARNED_FROM // 2], np.sort(order[_LEARNED_FROM // 2 :])
-    spread = others[np.linspace(0, len(others) - 1, _LEARNED_FROM - len(largest)).astype(int)]
-    return np.sort(np.concatenate([largest, spread]))
+    evenly = others[np.linspace(0, len(others) - 1, _LEARNED_FROM - len(largest)).astype(int)]
+    return np.sort(np.concatenate([largest, evenly]))
 
 
 def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, Learned]:
-    """Return how well each value is predicted from all others on a scale, and what was learned there."""
+    """Return the log density of each value given all others, on one scale, and what was learned there."""
     warped = warp.forward(values)
     shift = float(warped.mean())
     scale = _scale(warped - shift)
     y = (warped - shift) / scale
-    process = gp.fit(_KERNEL, points, y, log_prior=_LogPrior(points.shape[1]), starts=_starts(points.shape[1]))
+    process = fit(_KERNEL, points, y, log_prior=_LogPrior(points.shape[1]), starts=_starts(points.shape[1]))
     mean, variance = process.left_out()
     score = -0.5 * (np.log(variance) + (y - mean) ** 2 / variance).sum() - len(y) * np.log(scale)
     return float(score) + warp.log_slope(values), Learned(process.theta, warp, shift, scale)
@@ -177,7 +183,7 @@ def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, Learned]
 def _centre(dimension: int) -> Array:
     """Return the medians' logarithms, of theta and of the noise, which is fixed."""
     scales = [_LENGTH_SCALE * np.sqrt(dimension)] * dimension
-    return np.asarray(np.log([_VARIANCE, *scales, _LINEAR, 12 * _LINEAR / dimension, gp.NOISE]))
+    return np.asarray(np.log([_VARIANCE, *scales, _LINEAR, 12 * _LINEAR / dimension, NOISE]))
 
 
 def _starts(dimension: int) -> Array:
@@ -201,7 +207,9 @@ class _LogPrior:
         """Return the log density at (theta, log noise), up to a constant, and its gradient."""
         scales = slice(1, self.dimension + 1)
         away = parameters - _centre(self.dimension)
-        gradient = -away / _VARIANCE_SPREAD**2
+        gradient = -away / _VARIANCE_DEVIATION**2
         common = away[scales].mean()
-        gradient[scales] = -common / (self.dimension * _SPREAD**2) - (away[scales] - common) / _ARD_SPREAD**2
+        gradient[scales] = (
+            -common / (self.dimension * _COMMON_DEVIATION**2) - (away[scales] - common) / _ARD_DEVIATION**2
+        )
         return 0.5 * float(away @ gradient), gradient  # the density is quadratic

@@ -11,8 +11,6 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
-from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Rows, single_threaded
@@ -20,25 +18,31 @@ from ctxval._util.representation import call
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.gp import kernels
-from ctxval.gp.regression import log_likelihood_of_outputs
-from ctxval.models.scaling import spread, standardised_pairs
+from ctxval.gp.cholesky import tenfold
+from ctxval.gp.regression import MultiOutputProcess, log_likelihood_of_outputs, most_likely
+from ctxval.gp.subset import pivoted_rows
+from ctxval.models.scaling import standard_deviations, standardised_pairs
 
 _CENTRES = 450
-"""Transitions that the residual is conditioned on at most."""
+"""The most transitions that the residual is conditioned on."""
 _LEARNED_FROM = 120
-"""Transitions that its hyperparameters are learned from."""
+"""The most transitions that its hyperparameters are learned from."""
+_START = 3.0
+"""Length-scale, in standard deviations of the inputs, from which the hyperparameters are sought."""
 _MUCH_BETTER = 0.7
-"""What is learned without M must have this share of the error, at most, to be preferred."""
+"""What is learned without M is preferred if its error is below this share of the error with M."""
 _NEGLIGIBLE = 1e-7
 """A residual below this share of the state's typical change is rounding."""
 _ABSURD = 1e100
-"""What is larger has diverged, and squares of it would not be finite."""
+"""Larger numbers have diverged, and their squares would not be finite."""
 _REACH = 5.0
-"""No residual is believed beyond this many times the largest one recorded."""
+"""Predicted residuals are bounded by this many times the largest one recorded."""
 _LOOKS = 12
-"""Moments of a predicted trajectory at which its familiarity is judged."""
+"""Steps of a predicted trajectory from which its unfamiliarity is computed."""
 _NOISE = (1e-9, 0.1)
 """Bounds of the noise variance, as a share of the residual's mean square; the least keeps the Cholesky factor safe."""
+_PIVOT = 0.1
+"""Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
 _KERNEL = kernels.Sum(
     kernels.Matern(2.5, ard=True, length_scale=(0.2, 200.0), variance=(1e-6, 1e4)),
     kernels.Linear(centre=0.0, variance=(1e-6, 1e4)),
@@ -76,29 +80,18 @@ class Residual:
     spare: tuple[Array, Array, Rows] | None = None
 
     @functools.cached_property
-    def _factor(self) -> Array:
-        covariance = _KERNEL(self.theta, self.centres, self.centres)
-        noise = self.noise
-        while True:
-            try:
-                return np.asarray(cho_factor(covariance + noise * np.eye(len(covariance)), lower=True)[0])
-            except LinAlgError:  # centres too much alike for so little noise
-                noise *= 10
-
-    @functools.cached_property
-    def _inverse_factor(self) -> Array:
-        return np.asarray(solve_triangular(self._factor, np.eye(len(self.centres)), lower=True))
-
-    @functools.cached_property
-    def _weights(self) -> Array:
-        return np.asarray(cho_solve((self._factor, True), self.outputs))
+    def process(self) -> MultiOutputProcess:
+        """The Gaussian processes of the standardised residuals."""
+        # Centres may be too much alike for so little noise.
+        return MultiOutputProcess(_KERNEL, self.theta, self.centres, self.outputs, tuple(tenfold(self.noise)))
 
     @functools.cached_property
     def _scaled(self) -> tuple[Array, Array, Array]:
         """What every evaluation needs: centres over length-scales, weights of the Matern and of the linear part."""
         variance, scales, constant, slope = _parts(self.theta)
-        linear = np.vstack([constant * self._weights.sum(axis=0), slope * (self.centres.T @ self._weights)])
-        return self.centres / scales, variance * self._weights, linear
+        weights = self.process.weights
+        linear = np.vstack([constant * weights.sum(axis=0), slope * (self.centres.T @ weights)])
+        return self.centres / scales, variance * weights, linear
 
     def inputs(self, x: Array, u: Array) -> Array:
         """Return standardised pairs ``(..., n + m)``."""
@@ -118,7 +111,8 @@ class Residual:
         """Return the posterior variance of the standardised residual, ``(...)``."""
         z = self.inputs(x, u)
         rows = z.reshape(-1, z.shape[-1])
-        half = self._inverse_factor @ _KERNEL(self.theta, self.centres, rows)
+        # For many rows a product with the inverse factor is several times as fast as substitution.
+        half = self.process.factor.inverse_factor @ _KERNEL(self.theta, self.centres, rows)
         variance = _KERNEL.diagonal(self.theta, rows) - np.einsum("ij,ij->j", half, half)
         return np.asarray(np.maximum(variance, 0.0).reshape(z.shape[:-1]))
 
@@ -129,12 +123,9 @@ class Residual:
         return np.asarray(self.unit * np.sqrt(variance.mean(axis=-1)))
 
     def typical_error(self) -> float:
-        """Return the error of a step, median over the centres, each left out: a share of a typical step.
-
-        Rasmussen and Williams 2006, eq. 5.12.
-        """
-        left_out = self._weights / (self._inverse_factor**2).sum(axis=0)[:, None]
-        return self.unit * float(np.median(np.sqrt((left_out**2).mean(axis=1))))
+        """Return the median leave-one-out error of a step over the centres, as a share of a typical step."""
+        errors = self.process.factor.left_out_errors(self.process.weights)
+        return self.unit * float(np.median(np.sqrt((errors**2).mean(axis=1))))
 
     def without(self, sources: Collection[int]) -> Residual:
         """Return the residual as it is without some executions."""
@@ -163,13 +154,15 @@ def _matern(r: Array) -> Array:
 
 
 def learn_residual(model: Model, transitions: Transitions, sources: Rows, centres: int = _CENTRES) -> Residual | None:
-    """Learn ``r(x, u) = x' - M(x, u)`` from recorded transitions; None where there is nothing to be learned.
+    """Learn ``r(x, u) = x' - M(x, u)`` from recorded transitions.
+
+    Returns None if fewer than two transitions are usable, or if M explains all of them.
 
     Args:
         model: M.
         transitions: of the system, N of them.
-        sources: which execution each is of, shape ``(N,)``.
-        centres: how many transitions it is conditioned on at most.
+        sources: the execution of each transition; -1 for data that the model came with, shape ``(N,)``.
+        centres: the most transitions that it is conditioned on.
     """
     with np.errstate(all="ignore"):
         residuals = transitions.x_next - model.step(transitions.x, transitions.u)
@@ -178,79 +171,50 @@ def learn_residual(model: Model, transitions: Transitions, sources: Rows, centre
     usable = (np.abs(np.concatenate([pairs, residuals, steps], axis=1)) < _ABSURD).all(axis=1)
     if usable.sum() < 2:
         return None
-    pairs, residuals, sources, steps = pairs[usable], residuals[usable], sources[usable], spread(steps[usable])
+    pairs, residuals, sources = pairs[usable], residuals[usable], sources[usable]
+    typical = standard_deviations(steps[usable])
     sizes = np.sqrt((residuals**2).mean(axis=0))
-    learned = sizes > _NEGLIGIBLE * steps
+    learned = sizes > _NEGLIGIBLE * typical
     if not learned.any():
         return None
-    shift, scale = pairs.mean(axis=0), spread(pairs)
+    shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
     Z, Y = (pairs - shift) / scale, residuals / np.where(learned, sizes, np.inf)
     with single_threaded():
         theta, noise = _most_likely(Z, Y[:, learned])
-        chosen = _well_spread(theta, noise, Z, centres)
+        chosen = pivoted_rows(_KERNEL, theta, Z, centres, least=_PIVOT * noise)
         others = np.setdiff1d(np.arange(len(Z)), chosen)
-        spare = others[_well_spread(theta, noise, Z[others], centres // 3)]
+        spare = others[pivoted_rows(_KERNEL, theta, Z[others], centres // 3, least=_PIVOT * noise)]
     return Residual(
         *(theta, noise, Z[chosen], Y[chosen], sources[chosen], shift, scale),
         scale_out=np.where(learned, sizes, 0.0),
         limit=_REACH * np.abs(Y).max(axis=0),
-        unit=float(np.sqrt(((sizes / steps)[learned] ** 2).mean())),
+        unit=float(np.sqrt(((sizes / typical)[learned] ** 2).mean())),
         spare=(Z[spare], Y[spare], sources[spare]),
     )
 
 
 def _most_likely(Z: Array, Y: Array) -> tuple[Array, float]:
     """Return the hyperparameters and the noise that make outputs ``(N, n)`` of well-spread inputs most likely."""
-    start = np.log([1.0, *[3.0] * Z.shape[1], 0.1, 0.1, 1e-6])
-    rows = _well_spread(start[:-1], _NOISE[0], Z, _LEARNED_FROM)
-    Z, Y = Z[rows], Y[rows]
-
-    def negative(theta: Array) -> tuple[float, Array]:
-        try:
-            value, gradient = log_likelihood(theta, Z, Y)
-        except LinAlgError:
-            return 1e25, np.zeros_like(theta)
-        return -value, -gradient
-
+    start = np.log([1.0, *[_START] * Z.shape[1], 0.1, 0.1, 1e-6])
+    rows = pivoted_rows(_KERNEL, start[:-1], Z, _LEARNED_FROM, least=_PIVOT * _NOISE[0])
     bounds = [*_KERNEL.bounds(Z.shape[1]), (float(np.log(_NOISE[0])), float(np.log(_NOISE[1])))]
-    found = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
-    return np.asarray(found.x[:-1]), float(np.exp(found.x[-1]))
+    Z, Y = Z[rows], Y[rows]
+    found = most_likely(lambda theta: log_likelihood(theta, Z, Y), start[None], bounds)
+    return found[:-1], float(np.exp(found[-1]))
 
 
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
-    """Return ``sum_o log p(Y[:, o] | Z, theta)``, but for a constant, and its gradient (Rasmussen and Williams, 5.9).
+    """Return ``sum_o log p(Y[:, o] | Z, theta)`` up to a constant, and its gradient (Rasmussen and Williams, 5.9).
 
     The last of theta is the logarithm of the noise variance.
     """
-    K = _KERNEL(theta[:-1], Z, Z)
     noise = float(np.exp(theta[-1]))
-    K[np.diag_indices_from(K)] += noise
-    value, W = log_likelihood_of_outputs(K, Y)
+    value, W = log_likelihood_of_outputs(_KERNEL(theta[:-1], Z, Z), noise, Y)
     return value, np.append(_KERNEL.weighted_gradient(theta[:-1], Z, W), noise * np.trace(W))
 
 
-def _well_spread(theta: Array, noise: float, Z: Array, count: int) -> Rows:
-    """Return the rows that tell most of all others: those of pivoted Cholesky, each the least certain of what is left.
-
-    Fewer than ``count`` where the rest adds nothing.
-    """
-    left = _KERNEL.diagonal(theta, Z)
-    columns = np.zeros((min(count, len(Z)), len(Z)))
-    chosen: list[int] = []
-    for k in range(len(columns)):
-        pivot = int(np.argmax(left))
-        if left[pivot] <= 0.1 * noise:
-            break
-        row = _KERNEL(theta, Z[pivot : pivot + 1], Z)[0] - columns[:k, pivot] @ columns[:k]
-        columns[k] = row / np.sqrt(left[pivot])
-        left = left - columns[k] ** 2
-        left[pivot] = 0.0
-        chosen.append(pivot)
-    return np.array(chosen, dtype=np.intp)
-
-
-class Staying:
-    """The model ``x_next = x``: what is left to be learned are the system's own steps."""
+class Identity:
+    """The model ``x_next = x``, whose residual is the system's own steps."""
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the state itself."""
@@ -278,15 +242,16 @@ class CorrectedModel:
 
 
 def learn_corrected(model: Model, transitions: Transitions, sources: Rows, centres: int) -> CorrectedModel | None:
-    """Return the corrected model, learned around M or, where that predicts much better, from nothing; None without any.
+    """Return the corrected model: M plus its residual or, if that predicts much better, the system's steps without M.
 
     Around a model that is rougher than the system, such as a small network, all its kinks would have to be learned.
+    Returns None if there is no residual to be learned.
     """
     of_model = learn_residual(model, transitions, sources, centres)
     if of_model is None:
         return None
-    of_steps = learn_residual(Staying(), transitions, sources, centres)
+    of_steps = learn_residual(Identity(), transitions, sources, centres)
     with single_threaded():
         if of_steps is not None and of_steps.typical_error() < _MUCH_BETTER * of_model.typical_error():
-            return CorrectedModel(Staying(), of_steps)
+            return CorrectedModel(Identity(), of_steps)
     return CorrectedModel(model, of_model)

@@ -22,7 +22,7 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.learning.dynamics import CorrectedModel, learn_corrected
 from ctxval.learning.vector import predict_composed
-from ctxval.models.scaling import spread
+from ctxval.models.scaling import standard_deviations
 from ctxval.searches import Prediction
 
 _CENTRES, _WORK = (100, 450), 30_000
@@ -126,7 +126,7 @@ def _nearest(data: Transitions, loops: Trajectory) -> Transitions:
     here = np.concatenate([data.x, data.u], axis=1)
     if not len(there):
         return data
-    scale = spread(here)
+    scale = standard_deviations(here)
     kept = np.sort(np.argsort(cdist(here / scale, there / scale).min(axis=1), kind="stable")[:_DATA])
     return Transitions(data.x[kept], data.u[kept], data.x_next[kept])
 

@@ -6,22 +6,24 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
 from ctxval._util.registry import part
 from ctxval._util.representation import call, record
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
-from ctxval.gp.regression import log_likelihood_of_outputs
+from ctxval.gp.cholesky import factorise
+from ctxval.gp.regression import log_likelihood_of_outputs, most_likely
 from ctxval.models.scaling import IncrementScaling
 
 _BLOCK = 2048
 """Points in one matrix of covariances: enough to be fast, few enough for the cache."""
-
-# Where the hyperparameters are searched, for standardised inputs and increments.
-_VARIANCE, _NOISE, _LENGTH_SCALE = (1e-2, 1e4), (1e-6, 1.0), (0.1, 100.0)
+_VARIANCE = (1e-2, 1e4)
+"""Bounds of the variance, for standardised increments."""
+_NOISE = (1e-6, 1.0)
+"""Bounds of the noise variance, for standardised increments."""
+_LENGTH_SCALE = (0.1, 100.0)
+"""Bounds of the length-scales, for standardised inputs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,11 +129,7 @@ class GaussianProcessModel:
         Raises:
             InputError: the covariance matrix is not positive definite.
         """
-        try:
-            factor = cho_factor(covariance(Z, Z) + noise * np.eye(len(Z)), lower=True)
-        except np.linalg.LinAlgError:
-            raise InputError(f"the covariance of {len(Z)} points is not positive definite; raise the noise.") from None
-        return cls(covariance, Z, cho_solve(factor, Y), scaling, data)
+        return cls(covariance, Z, factorise(covariance(Z, Z), noise).solve(Y), scaling, data)
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
@@ -177,20 +175,13 @@ def _most_likely(Z: Array, Y: Array, iterations: int) -> tuple[SquaredExponentia
     bounds = [(float(np.log(low)), float(np.log(high))) for low, high in boxes]
     start = np.log([1.0, 1e-3, *[3.0] * Z.shape[1]])
 
-    def negative(theta: Array) -> tuple[float, Array]:
-        try:
-            value, gradient = log_likelihood(theta, Z, Y)
-        except np.linalg.LinAlgError:
-            return 1e25, np.zeros_like(theta)
-        return -value, -gradient
-
-    found = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations})
-    variance, noise, *length_scales = np.exp(found.x).tolist()
+    found = most_likely(lambda theta: log_likelihood(theta, Z, Y), start[None], bounds, iterations=iterations)
+    variance, noise, *length_scales = np.exp(found).tolist()
     return SquaredExponential(variance, np.array(length_scales)), noise
 
 
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
-    """Return ``sum_o log p(Y[:, o] | Z, theta)``, but for a constant, and its gradient (eqs. 5.8 and 5.9).
+    """Return ``sum_o log p(Y[:, o] | Z, theta)`` up to a constant, and its gradient (eqs. 5.8 and 5.9).
 
     Args:
         theta: logarithms of (variance, noise, length-scales).
@@ -200,7 +191,7 @@ def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
     variance, noise, *length_scales = np.exp(theta)
     covariance = SquaredExponential(float(variance), np.array(length_scales))
     K = covariance(Z, Z)
-    value, W = log_likelihood_of_outputs(K + noise * np.eye(len(Z)), Y)
+    value, W = log_likelihood_of_outputs(K, float(noise), Y)
     G = W * K
     S = Z / covariance.length_scales
     by_scales = 2 * ((G.sum(axis=1)[:, None] * S**2).sum(axis=0) - (S * (G @ S)).sum(axis=0))

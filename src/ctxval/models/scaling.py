@@ -1,4 +1,4 @@
-"""Standardised inputs and increments: what a learned regressor of the dynamics sees."""
+"""Standardised inputs and increments of learned regressors of the dynamics."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ class IncrementScaling:
         if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
             raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
         pairs, increments = np.concatenate([data.x, data.u], axis=1), data.x_next - data.x
-        return cls(pairs.mean(axis=0), spread(pairs), increments.mean(axis=0), spread(increments))
+        shift_in, shift_out = pairs.mean(axis=0), increments.mean(axis=0)
+        return cls(shift_in, standard_deviations(pairs), shift_out, standard_deviations(increments))
 
     @property
     def mean_pair(self) -> tuple[Array, Array]:
@@ -76,7 +77,7 @@ def standardised_pairs(x: Array, u: Array, shift: Array, scale: Array) -> Array:
     return (z - shift) / scale
 
 
-def spread(columns: Array) -> Array:
+def standard_deviations(columns: Array) -> Array:
     """Return the standard deviations, and 1 for a column that does not vary."""
     deviations = columns.std(axis=0)
     return np.where(deviations > 1e-12 * np.maximum(1.0, np.abs(columns).max(axis=0)), deviations, 1.0)

@@ -1,0 +1,102 @@
+"""Maximising functions over boxes: the steps that every search for a maximum has in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import minimize
+
+from ctxval._util.arrays import Array
+
+Sloped = Callable[[Array], tuple[Array, Array]]
+"""Points ``(..., d)`` -> values ``(...)`` and gradients ``(..., d)``."""
+
+
+def climb(
+    function: Sloped,
+    starts: Array,
+    low: Array,
+    high: Array,
+    *,
+    scale: float = 1.0,
+    iterations: int | None = None,
+    evaluations: int | None = None,
+) -> tuple[Array, float]:
+    """Climb from all starts at once with L-BFGS-B; return the points reached and the sum of their values.
+
+    The sum of the values is separable, so one quasi-Newton search serves all starts.
+
+    Args:
+        function: what to maximise.
+        starts: shape ``(..., d)``, which is the shape of the points that the function is asked about.
+        low, high: the box, shapes ``(d,)``.
+        scale: the size of the sum, to which the tolerances of L-BFGS-B refer.
+        iterations: the most of L-BFGS-B; its default if None.
+        evaluations: the most calls of the function; the default of L-BFGS-B if None.
+    """
+
+    def negative(flat: Array) -> tuple[float, Array]:
+        values, gradients = function(flat.reshape(starts.shape))
+        return -float(values.sum()) / scale, -gradients.ravel() / scale
+
+    count = starts.size // len(low)
+    bounds = list(zip(np.tile(low, count), np.tile(high, count), strict=True))
+    limits = {"maxiter": iterations, "maxfun": evaluations}
+    options = {key: value for key, value in limits.items() if value is not None}
+    found = minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return np.asarray(np.clip(found.x.reshape(starts.shape), low, high)), -float(found.fun) * scale
+
+
+def moves_to_bounds(points: Array, low: Array, high: Array) -> Array:
+    """Return each point ``(..., d)`` with one coordinate moved to a bound, shape ``(..., 2 d, d)``.
+
+    The d moves to lower bounds come first.
+    """
+    d = len(low)
+    moves = np.tile(np.eye(d, dtype=bool), (2, 1))
+    ends = np.repeat([low, high], d, axis=0)
+    return np.where(moves, ends, points[..., None, :])
+
+
+def separated_rows(points: Array, reach: float, count: int) -> list[int]:
+    """Return the first rows of points ``(n, d)`` that are farther than ``reach`` from every row chosen before them.
+
+    Of points that are sorted by their values, these are the best ones that are not neighbours of a better one.
+
+    Args:
+        points: only the first 200 are looked at.
+        reach: the least distance.
+        count: how many rows are wanted.
+    """
+    chosen: list[int] = []
+    for row, point in enumerate(points[:200]):
+        if len(chosen) == count:
+            break
+        if all(np.linalg.norm(point - points[other]) > reach for other in chosen):
+            chosen.append(row)
+    return chosen
+
+
+def farthest_rows(
+    points: Array, gaps: Array, count: int, *, squared: bool = False, reach: float = -np.inf
+) -> list[int]:
+    """Return rows of points ``(n, d)``, each farthest from all points chosen before it (Gonzalez 1985).
+
+    Args:
+        points: what is chosen from.
+        gaps: the distance of each point to the nearest one that is chosen already, shape ``(n,)``; minus infinity if
+            the point is one of them, so that no row is taken twice even among copies of one point.
+        count: how many rows are wanted.
+        squared: whether ``gaps`` are squared distances.
+        reach: the choice ends where no point is farther than this from the chosen ones.
+    """
+    left = np.array(gaps, dtype=np.float64)
+    rows: list[int] = []
+    while len(rows) < count and left.max() > reach:
+        row = int(left.argmax())
+        distances = ((points - points[row]) ** 2).sum(axis=1)
+        left = np.minimum(left, distances if squared else np.sqrt(distances))
+        left[row] = -np.inf
+        rows.append(row)
+    return rows

@@ -1,0 +1,97 @@
+"""The Cholesky factor of a covariance matrix, and what Gaussian-process regression computes with it.
+
+Everything that conditions a Gaussian process on data factorises its covariance matrix here. LAPACK is called directly,
+without the checks of :mod:`scipy.linalg`, which cost more than a small solve.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
+
+from ctxval._util.arrays import Array
+from ctxval.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class CholeskyFactor:
+    """The factor L of a positive definite matrix ``K = L L'``; make one with :func:`factorise`.
+
+    Attributes:
+        L: lower triangular, with zeros above its diagonal, shape ``(n, n)``.
+    """
+
+    L: Array
+
+    def solve(self, right: Array) -> Array:
+        """Return ``K^-1 right``, shape ``(n,)`` or ``(n, k)`` as that of ``right``."""
+        return np.asarray(dpotrs(self.L, right, lower=1)[0])
+
+    def whiten(self, right: Array) -> Array:
+        """Return ``L^-1 right``, whose columns are uncorrelated where those of ``right`` have covariance K."""
+        return np.asarray(dtrtrs(self.L, right, lower=1)[0])
+
+    def inverse(self) -> Array:
+        """Return ``K^-1``, shape ``(n, n)``."""
+        lower = dpotri(self.L, lower=1)[0]  # L is zero above its diagonal, and stays so
+        inverse = lower + lower.T
+        inverse[np.diag_indices_from(inverse)] *= 0.5
+        return np.asarray(inverse)
+
+    @functools.cached_property
+    def inverse_factor(self) -> Array:
+        """``L^-1``, shape ``(n, n)``."""
+        return self.whiten(np.eye(len(self.L)))
+
+    @functools.cached_property
+    def precisions(self) -> Array:
+        """The diagonal of ``K^-1``, shape ``(n,)``: inverse variances of each observation given all others."""
+        return np.asarray((self.inverse_factor**2).sum(axis=0))
+
+    def half_log_determinant(self) -> float:
+        """Return ``log(det K) / 2``."""
+        return float(np.log(np.diag(self.L)).sum())
+
+    def left_out_errors(self, weights: Array) -> Array:
+        """Return by how much each observation exceeds its prediction from all others.
+
+        Args:
+            weights: ``K^-1 y`` of observations y, shape ``(n,)`` or ``(n, k)``.
+
+        Source:
+            Rasmussen and Williams 2006, eq. 5.12.
+        """
+        return weights / (self.precisions if weights.ndim == 1 else self.precisions[:, None])
+
+
+def factorise(covariance: Array, noises: float | Iterable[float]) -> CholeskyFactor:
+    """Return the Cholesky factor of ``covariance + noise I``.
+
+    Args:
+        covariance: of noise-free observations, shape ``(n, n)``; it is not changed.
+        noises: the noise variance, or several of them, which are tried one after the other.
+
+    Raises:
+        InputError: the matrix is not positive definite for any of these noise variances.
+    """
+    tried = [noises] if isinstance(noises, float) else noises
+    for noise in tried:
+        noisy = np.array(covariance, order="F")
+        noisy[np.diag_indices_from(noisy)] += noise
+        L, info = dpotrf(noisy, lower=1, clean=1, overwrite_a=1)
+        if not info and not np.isnan(np.trace(L)):  # some LAPACKs let NaN pass
+            return CholeskyFactor(np.asarray(L))
+    raise InputError(
+        f"the covariance of {len(covariance)} observations is not positive definite; raise the noise variance."
+    )
+
+
+def tenfold(noise: float) -> Iterator[float]:
+    """Yield a noise variance, then ten times as much, and so on, up to 1e30 times."""
+    for _ in range(31):
+        yield noise
+        noise *= 10
