@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import sys
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -235,6 +238,49 @@ def test_a_store_of_version_0_1_0_of_another_model_is_refused(old: Path) -> None
     experiment.validation.model = models.Linear([[1.0, 0.05], [0.0, 0.99]], [[0.0], [0.05]])
     with pytest.raises(StoreMismatchError, match=r"model\.A\[1\]\[1\] was 1.0 and is now 0.99"):
         settings.campaign(experiment, old / "cart-0.1.0.sqlite")
+
+
+# Stores that have older names of searches
+
+
+class Own(searches.Scalar):
+    """A user's search on the older name of another, which the description of its code has."""
+
+    def propose(self, rng: np.random.Generator) -> Array:
+        return searches.Scalar.propose(self, rng)
+
+
+def with_older_names(path: Path) -> str:
+    """Rewrite what a store says of its search as versions before the renaming wrote it; return that."""
+    with closing(sqlite3.connect(path)) as connection:
+        (text,) = connection.execute("SELECT value FROM experiment WHERE key = 'search'").fetchone()
+        for present, old in (("BayesianOptimisation", "Scalar"), ("TrustRegion", "Climbs")):
+            text = text.replace(f'"{present}"', f'"{old}"').replace(f'"ctxval.{present}', f'"ctxval.{old}')
+        connection.execute("UPDATE experiment SET value = ? WHERE key = 'search'", (text,))
+        connection.commit()
+    return str(text)
+
+
+@pytest.mark.parametrize(
+    ("make", "old"),
+    [
+        (searches.BayesianOptimisation, '"type": "Scalar"'),
+        (searches.TrustRegion, '"type": "Climbs"'),
+        (lambda: searches.Repeated(searches.Scalar(), 2), '{"type": "Scalar"'),
+        (Own, '"ctxval.Scalar'),
+    ],
+)
+def test_a_store_with_the_older_name_of_a_search_goes_on(
+    tmp_path: Path, make: Callable[[], searches.Search], old: str
+) -> None:
+    path, whole = tmp_path / "a.sqlite", Campaign(make_validation(), search=make(), seed=2).run(6)
+    Campaign(make_validation(), search=make(), store=path, seed=2).run(4)
+    assert old in with_older_names(path)
+    resumed = Campaign(make_validation(), search=make(), store=path, seed=2).run(6)
+    assert [trial.distance for trial in resumed.trials] == [trial.distance for trial in whole.trials]
+    assert not resumed.store.history()
+    with pytest.raises(StoreMismatchError, match=r"search\.type was .* use another store"):
+        Campaign(make_validation(), search=searches.CMAES(), store=path, seed=2)
 
 
 # Changed while it is open

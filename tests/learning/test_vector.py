@@ -6,7 +6,7 @@ import pytest
 from ctxval._util.arrays import Array
 from ctxval.errors import ShapeError
 from ctxval.learning.vector import _log_likelihood, predict_composed
-from ctxval.searches import Climbs
+from ctxval.searches import TrustRegion
 
 C = np.random.default_rng(3).normal(size=(4, 8))
 
@@ -103,7 +103,7 @@ def test_the_gradient_of_the_likelihood_agrees_with_finite_differences() -> None
 @pytest.mark.parametrize("seed", range(3))
 def test_climbs_on_it_find_the_largest_norm_soon(seed: int) -> None:
     corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * 8, indexing="ij"), axis=-1).reshape(-1, 8)
-    search = Climbs()
+    search = TrustRegion()
     search.reset(8, seed)
     for _ in range(14):
         search.use_prediction(predict_composed(search.points, linear(search.points), norm))

@@ -8,7 +8,7 @@ import pytest
 
 from ctxval._util.arrays import Array
 from ctxval.errors import InputError
-from ctxval.searches import Random, Scalar, Search, by_name
+from ctxval.searches import BayesianOptimisation, Random, Search, by_name
 from ctxval.testing import check_search
 
 Function = Callable[[Array], Array]
@@ -51,24 +51,24 @@ def run(search: Search, function: Function, budget: int, dimension: int = 2, see
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("dimension", "budget"), [(1, 12), (2, 20), (6, 40)])
 def test_it_finds_the_top_of_a_hill(dimension: int, budget: int, seed: int) -> None:
-    assert run(Scalar(), peak, budget, dimension, seed).max() > 0.98
+    assert run(BayesianOptimisation(), peak, budget, dimension, seed).max() > 0.98
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_it_finds_the_highest_corner_of_a_folded_plane(seed: int) -> None:
-    values = run(Scalar(), fold, 40, 8, seed)
+    values = run(BayesianOptimisation(), fold, 40, 8, seed)
     assert values.max() > 0.98 * corner(np.empty((0, 8)))
     assert values.max() > run(Random(), fold, 400, 8, seed).max()
 
 
 def test_it_leaves_a_wide_basin_for_a_higher_one_that_is_hidden() -> None:
-    found = [run(Scalar(), trap, 40, 3, seed).max() for seed in range(4)]
+    found = [run(BayesianOptimisation(), trap, 40, 3, seed).max() for seed in range(4)]
     assert min(found) > 0.7
     assert np.median(found) > 0.9
 
 
 def test_a_search_that_stagnates_branches_across_the_coordinate_that_it_has_crossed_least() -> None:
-    search = Scalar()
+    search = BayesianOptimisation()
     run(search, lambda X: 1 - X[:, 0] + 0.01 * X[:, 1], 30, 3)
     branches = [note["branch"] for note in search.notes if note is not None and note.get("branch") is not None]
     assert branches[0] == [0, True]
@@ -80,7 +80,7 @@ def test_a_search_that_stagnates_branches_across_the_coordinate_that_it_has_cros
 
 
 def test_acquisition_functions_take_turns() -> None:
-    search = Scalar()
+    search = BayesianOptimisation()
     run(search, peak, 12, 4)
     hows = [note["how"] for note in search.notes if note is not None]
     assert hows[:3] == ["initial"] * 3
@@ -89,7 +89,7 @@ def test_acquisition_functions_take_turns() -> None:
 
 @pytest.mark.parametrize("dimension", [1, 2])
 def test_in_few_dimensions_a_share_of_the_points_fills_the_space(dimension: int) -> None:
-    search = Scalar()
+    search = BayesianOptimisation()
     run(search, lambda X: -((X - 0.5) ** 2).sum(axis=1), 24, dimension)
     assert sum(note is not None and note["how"] == "filling" for note in search.notes) == 5
     grid = np.stack(np.meshgrid(*[np.linspace(0, 1, 41)] * dimension), axis=-1).reshape(-1, dimension)
@@ -98,7 +98,7 @@ def test_in_few_dimensions_a_share_of_the_points_fills_the_space(dimension: int)
 
 
 def test_its_choices_do_not_depend_on_the_units_of_the_values() -> None:
-    search, scaled = Scalar(), Scalar()
+    search, scaled = BayesianOptimisation(), BayesianOptimisation()
     run(search, peak, 9)
     run(scaled, lambda X: 1e3 * peak(X), 9)
     np.testing.assert_allclose(scaled.points, search.points, atol=1e-3)
@@ -106,7 +106,7 @@ def test_its_choices_do_not_depend_on_the_units_of_the_values() -> None:
 
 def test_values_that_are_all_the_same_and_negative_ones_do_no_harm() -> None:
     for function in (lambda X: np.zeros(len(X)), lambda X: -peak(X)):
-        search = Scalar()
+        search = BayesianOptimisation()
         run(search, function, 16, 3)
         assert len(np.unique(search.points, axis=0)) == 16
         assert ((search.points >= 0) & (search.points <= 1)).all()
@@ -118,7 +118,7 @@ def test_values_that_are_all_the_same_and_negative_ones_do_no_harm() -> None:
 @pytest.mark.parametrize("dimension", [1, 2, 5, 20])
 @pytest.mark.parametrize("told", [0, 6, 20])
 def test_a_batch_of_questions_is_diverse(told: int, dimension: int) -> None:
-    search = Scalar()
+    search = BayesianOptimisation()
     if told:
         run(search, peak, told, dimension)
     else:
@@ -131,7 +131,7 @@ def test_a_batch_of_questions_is_diverse(told: int, dimension: int) -> None:
 
 
 def test_batches_find_the_top_in_hardly_more_executions() -> None:
-    search = Scalar()
+    search = BayesianOptimisation()
     search.reset(2, 0)
     best = -np.inf
     for _ in range(8):
@@ -146,7 +146,7 @@ def test_what_failed_is_not_asked_again_and_does_not_stop_the_search() -> None:
     def holed(X: Array) -> Array:
         return np.where(np.linalg.norm(X - [0.3, 0.8], axis=1) < 0.1, np.nan, peak(X))
 
-    search = Scalar()
+    search = BayesianOptimisation()
     values = run(search, holed, 24)
     assert np.nanmax(values) > 0.93
     gaps = np.abs(search.points[:, None] - search.points[None]).max(axis=2) + np.eye(24)
@@ -158,22 +158,22 @@ def test_what_failed_is_not_asked_again_and_does_not_stop_the_search() -> None:
 
 
 def test_it_keeps_the_contract_of_a_search() -> None:
-    check_search(Scalar())
-    check_search(Scalar(initial=1), dimension=5, budget=30)
-    assert type(by_name("scalar", beta=1.0)) is Scalar
+    check_search(BayesianOptimisation())
+    check_search(BayesianOptimisation(initial=1), dimension=5, budget=30)
+    assert type(by_name("scalar", beta=1.0)) is BayesianOptimisation
 
 
 @pytest.mark.parametrize("told", [1, 21, 30, 43])
 def test_told_its_history_late_and_in_another_order_it_asks_for_the_same_point(told: int) -> None:
-    whole = Scalar()
+    whole = BayesianOptimisation()
     values = run(whole, fold, 44, 5)
-    fresh = Scalar()
+    fresh = BayesianOptimisation()
     fresh.reset(5, 0)
     fresh.tell(whole.points[:told], np.full(told, np.nan))
     fresh.ask(1)  # whatever it learns from half of the history must not stay
     for k in reversed(range(told)):
         fresh.tell(whole.points[k : k + 1], values[k : k + 1])
-    again = Scalar()
+    again = BayesianOptimisation()
     again.reset(5, 0)
     again.tell(whole.points[:told], values[:told])
     np.testing.assert_array_equal(again.ask(1)[0], whole.points[told])
@@ -183,7 +183,7 @@ def test_told_its_history_late_and_in_another_order_it_asks_for_the_same_point(t
 
 
 def test_a_suggestion_after_a_thousand_values_takes_seconds_at_most() -> None:
-    search = Scalar()
+    search = BayesianOptimisation()
     search.reset(20, 0)
     X = np.random.default_rng(0).random((1000, 20))
     search.tell(X, fold(X))
@@ -197,4 +197,4 @@ def test_a_suggestion_after_a_thousand_values_takes_seconds_at_most() -> None:
 )
 def test_options_that_cannot_be_are_refused_by_value(options: dict[str, float], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        Scalar(**options)  # type: ignore[arg-type]
+        BayesianOptimisation(**options)  # type: ignore[arg-type]

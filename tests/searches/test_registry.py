@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 
+from ctxval import searches
 from ctxval.errors import InputError, UnknownNameError
 from ctxval.searches import GPUCB, NAMES, Random, SamplingDiscarding, Search, by_name
 
@@ -18,6 +19,13 @@ def test_names_stand_for_their_classes() -> None:
     assert type(by_name("gp-ucb")) is GPUCB
     assert type(by_name("random")) is Random
     assert type(by_name("sampling-discarding")) is SamplingDiscarding
+
+
+@pytest.mark.parametrize(("old", "present"), [("scalar", "bayesian-optimisation"), ("climbs", "trust-region")])
+def test_older_names_stand_for_the_same_searches(old: str, present: str) -> None:
+    assert type(by_name(old)) is type(by_name(present))
+    assert searches.Scalar is searches.BayesianOptimisation
+    assert searches.Climbs is searches.TrustRegion
 
 
 def test_options_reach_the_search() -> None:

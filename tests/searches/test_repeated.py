@@ -8,7 +8,7 @@ from ctxval import Campaign, Task, Trajectory
 from ctxval._util.arrays import Array
 from ctxval.core.controller import Controller
 from ctxval.errors import InputError
-from ctxval.searches import GPUCB, Auto, Prediction, Random, Repeated, Scalar, by_name
+from ctxval.searches import GPUCB, Auto, BayesianOptimisation, Prediction, Random, Repeated, by_name
 from ctxval.testing import check_search
 
 
@@ -16,7 +16,7 @@ def peak(Z: Array) -> Array:
     return np.exp(-8 * ((Z - 0.7) ** 2).sum(axis=1))
 
 
-@pytest.mark.parametrize("inner", [Random(), GPUCB(), Scalar(), Auto()])
+@pytest.mark.parametrize("inner", [Random(), GPUCB(), BayesianOptimisation(), Auto()])
 def test_it_is_a_search(inner: object) -> None:
     check_search(Repeated(inner, 2))  # type: ignore[arg-type]
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from ctxval._util.arrays import Array, Rows
+from ctxval._util.describe import describe
 from ctxval.errors import InputError, ShapeError
-from ctxval.searches import Auto, Climbs, Prediction, Random, Scalar
+from ctxval.searches import Auto, BayesianOptimisation, Prediction, Random, TrustRegion, TrustRegionSettings
 from ctxval.searches.base import Note
 from ctxval.testing import check_search
 
@@ -31,7 +32,9 @@ def predicting(guess: Function, doubt: Function | None = None, known: Array | No
     return Prediction(expected, left_out, budget=600)
 
 
-def run(search: Climbs, function: Function, guess: Function, budget: int, dimension: int = 2, seed: int = 0) -> Array:
+def run(
+    search: TrustRegion, function: Function, guess: Function, budget: int, dimension: int = 2, seed: int = 0
+) -> Array:
     search.reset(dimension, seed)
     for _ in range(budget):
         known = search.points[np.isfinite(search.values)]
@@ -43,15 +46,15 @@ def run(search: Climbs, function: Function, guess: Function, budget: int, dimens
 
 @pytest.mark.parametrize("dimension", [1, 2, 6])
 def test_a_right_prediction_leads_straight_to_the_top(dimension: int) -> None:
-    assert run(Climbs(), hill, hill, 2, dimension)[0] > 0.99
+    assert run(TrustRegion(), hill, hill, 2, dimension)[0] > 0.99
 
 
 def test_a_prediction_that_is_too_small_by_a_factor_does_as_well() -> None:
-    assert run(Climbs(), hill, lambda X: 0.3 * hill(X), 2)[0] > 0.99
+    assert run(TrustRegion(), hill, lambda X: 0.3 * hill(X), 2)[0] > 0.99
 
 
 def test_a_wrong_prediction_does_not_keep_the_top_hidden() -> None:
-    search = Climbs()
+    search = TrustRegion()
     assert run(search, hill, lambda X: 1.0 - 0.9 * hill(X), 25).max() > 0.97
     fallen = [note for note in search.notes if note is not None and note["engine"] == "scalar"]
     assert fallen
@@ -59,17 +62,17 @@ def test_a_wrong_prediction_does_not_keep_the_top_hidden() -> None:
 
 
 def test_without_a_prediction_the_scalar_search_goes_on_and_says_so() -> None:
-    search, random = Climbs(), Random()
+    search, random = TrustRegion(), Random()
     search.reset(2, 5)
     random.reset(2, 5)
     np.testing.assert_array_equal(search.ask(1), random.ask(1))
     assert search.note() == {"engine": "scalar", "how": "initial", "why": "there is no prediction"}
-    check_search(Climbs())
+    check_search(TrustRegion())
     check_search(Auto())
 
 
 def test_a_prediction_of_nothing_is_none() -> None:
-    search = Climbs()
+    search = TrustRegion()
     search.reset(2, 0)
     search.use_prediction(predicting(lambda X: np.full(len(X), np.nan)))
     assert np.isfinite(search.ask(1)).all()
@@ -80,14 +83,14 @@ def test_doubt_draws_the_search_to_what_was_not_seen() -> None:
     def doubt(X: Array) -> Array:
         return np.where(X[:, 0] > 0.9, 5.0, 0.0)
 
-    search = Climbs()
+    search = TrustRegion()
     search.reset(2, 0)
     search.use_prediction(predicting(lambda X: 1.0 + 0.1 * X[:, 1], doubt))
     assert search.ask(1)[0, 0] > 0.9
 
 
 def test_a_wrong_prediction_shrinks_the_box_and_misses_end_the_climb() -> None:
-    search = Climbs(misses=2)
+    search = TrustRegion(misses=2)
     run(search, lambda X: 0.1 + 1e-6 * X[:, 0], lambda X: 1.0 + X[:, 0], 5)
     notes = [note for note in search.notes if note is not None and note["engine"] == "climb"]
     assert notes[0]["radius"] == notes[1]["radius"] == 1.0
@@ -99,7 +102,7 @@ def test_no_point_is_asked_twice_and_what_failed_is_kept_away_from() -> None:
     def holed(X: Array) -> Array:
         return np.where(np.linalg.norm(X - [0.3, 0.8], axis=1) < 0.1, np.nan, hill(X))
 
-    search = Climbs()
+    search = TrustRegion()
     run(search, holed, hill, 15)
     gaps = np.abs(search.points[:, None] - search.points[None]).max(axis=2) + np.eye(15)
     assert gaps.min() > 1e-6
@@ -112,7 +115,7 @@ def test_no_point_is_asked_twice_and_what_failed_is_kept_away_from() -> None:
 
 
 def test_a_batch_of_questions_spreads() -> None:
-    search = Climbs()
+    search = TrustRegion()
     search.reset(2, 0)
     search.use_prediction(predicting(hill))
     asked = search.ask(4)
@@ -121,7 +124,7 @@ def test_a_batch_of_questions_spreads() -> None:
 
 
 def test_without_any_prediction_it_goes_on_as_the_scalar_search_does() -> None:
-    search, scalar = Climbs(), Scalar(initial=1)
+    search, scalar = TrustRegion(), BayesianOptimisation(initial=1)
     for each in (search, scalar):
         each.reset(3, 4)
         for _ in range(6):
@@ -140,7 +143,7 @@ def test_a_prediction_that_is_no_good_is_replaced_by_the_one_it_names() -> None:
 
         return replace(predicting(lambda X: 1.0 - 0.9 * hill(X), known=known), otherwise=otherwise)
 
-    search = Climbs()
+    search = TrustRegion()
     search.reset(2, 0)
     for _ in range(10):
         search.use_prediction(wrong(search.points))
@@ -154,9 +157,9 @@ def test_a_prediction_that_is_no_good_is_replaced_by_the_one_it_names() -> None:
 
 @pytest.mark.parametrize("told", [1, 3, 6])
 def test_told_its_history_with_its_notes_it_asks_for_the_same_point(told: int) -> None:
-    whole = Climbs()
+    whole = TrustRegion()
     run(whole, hill, lambda X: 0.5 * hill(X - 0.1), 7)
-    fresh = Climbs()
+    fresh = TrustRegion()
     fresh.reset(2, 0)
     fresh.tell(whole.points[:told], whole.values[:told])
     stored: list[Note | None] = json.loads(json.dumps(whole.notes[:told]))
@@ -167,14 +170,14 @@ def test_told_its_history_with_its_notes_it_asks_for_the_same_point(told: int) -
 
 
 def test_notes_must_fit_the_history() -> None:
-    search = Climbs()
+    search = TrustRegion()
     search.reset(2, 0)
     with pytest.raises(ShapeError, match="one note for each of 0 points, got 1"):
         search.remember([None])
 
 
 def test_a_reset_forgets_the_prediction() -> None:
-    search = Climbs()
+    search = TrustRegion()
     run(search, hill, hill, 2)
     search.reset(2, 0)
     search.ask(1)
@@ -186,4 +189,39 @@ def test_a_reset_forgets_the_prediction() -> None:
 )
 def test_options_that_cannot_be_are_refused_by_value(options: dict[str, float], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        Climbs(**options)  # type: ignore[arg-type]
+        TrustRegion(**options)  # type: ignore[arg-type]
+
+
+def test_settings_leave_parts_of_the_search_out() -> None:
+    def wrong(X: Array) -> Array:
+        return 1.0 - 0.9 * hill(X)
+
+    def engines(settings: TrustRegionSettings) -> set[str]:
+        search = TrustRegion(settings=settings)
+        run(search, hill, wrong, 12)
+        return {note["engine"] for note in search.notes if note is not None}
+
+    def regions(settings: TrustRegionSettings) -> set[tuple[int, float]]:
+        search = TrustRegion(settings=settings)
+        run(search, hill, lambda X: 0.8 * hill(X), 6)
+        return {(note["climb"], note["radius"]) for note in search.notes if note is not None and "climb" in note}
+
+    assert engines(TrustRegionSettings()) == {"climb", "scalar"}
+    assert engines(TrustRegionSettings(compare_with_surrogate=False)) == {"climb"}
+    assert len(regions(TrustRegionSettings())) > 1
+    assert regions(TrustRegionSettings(restrict=False)) == {(0, 1.0)}
+
+
+def test_without_its_correction_a_prediction_is_taken_as_it_is() -> None:
+    found = []
+    for correct in (True, False):
+        search = TrustRegion(settings=TrustRegionSettings(correct_discrepancy=correct))
+        found.append(run(search, hill, lambda X: hill(X) * (0.2 + X[:, 0]), 5))
+    assert not np.array_equal(found[0], found[1])
+
+
+def test_a_store_has_the_settings_if_they_are_not_the_usual_ones() -> None:
+    assert describe(TrustRegion()) == {"type": "TrustRegion", "optimism": 2.0, "misses": 3}
+    assert describe(Auto()) == {"type": "Auto", "optimism": 2.0, "misses": 3, "designs": None}
+    other = describe(TrustRegion(settings=TrustRegionSettings(first_radius=0.3)))
+    assert other["settings"]["first_radius"] == 0.3

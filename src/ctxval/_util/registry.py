@@ -28,6 +28,7 @@ class Declaration:
         files: arguments that are paths of files.
         folder: the argument that is a folder, which is the experiment's by default; None if there is none.
         functions: arguments that are functions, each with its form, such as ``(x, u) -> x_next``.
+        aliases: older names by which the part is found too; they are not listed.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Declaration:
     files: tuple[str, ...] = ()
     folder: str | None = None
     functions: Mapping[str, str] = field(default_factory=dict)
+    aliases: tuple[str, ...] = ()
 
 
 _declarations: dict[Any, Declaration] = {}
@@ -47,6 +49,7 @@ def part(
     files: tuple[str, ...] = (),
     folder: str | None = None,
     functions: Mapping[str, str] | None = None,
+    aliases: tuple[str, ...] = (),
 ) -> Callable[[Part], Part]:
     """Declare a class, or a function that makes an object, as a part that is found by name.
 
@@ -54,12 +57,12 @@ def part(
 
     Args:
         name: by which the part is found; the name of the class by default.
-        runs_code, files, folder, functions: see :class:`Declaration`.
+        runs_code, files, folder, functions, aliases: see :class:`Declaration`.
     """
 
     def declare(made: Part) -> Part:
         called = made.__name__ if name is None else name
-        _declarations[made] = Declaration(called, runs_code, files, folder, functions or {})
+        _declarations[made] = Declaration(called, runs_code, files, folder, functions or {}, aliases)
         return made
 
     return declare
@@ -84,6 +87,9 @@ class Registry(Mapping[str, Any]):
         package: the package that exports the parts; the group of the entry points has the same name.
         method: the method that each part has; None if parts are plain functions.
         modules: built-in parts that are imported when they are asked for: name -> ``module:attr``.
+
+    Attributes:
+        aliases: older names of built-in parts, each with the present name.
     """
 
     def __init__(
@@ -94,6 +100,7 @@ class Registry(Mapping[str, Any]):
         found = [exported[name] for name in exported["__all__"] if declaration_of(exported.get(name)) is not None]
         self._built_in: dict[str, Any] = {_declarations[one].name: one for one in found}
         self._modules = dict(modules or {})
+        self.aliases = {alias: _declarations[one].name for one in found for alias in _declarations[one].aliases}
 
     @property
     def built_in(self) -> tuple[str, ...]:
@@ -104,7 +111,7 @@ class Registry(Mapping[str, Any]):
     def installed(self) -> tuple[str, ...]:
         """The names of the parts that other installed packages add, sorted; none if their metadata is damaged."""
         try:
-            return tuple(sorted({point.name for point in self._entry_points()} - set(self.built_in)))
+            return tuple(sorted({point.name for point in self._entry_points()} - {*self.built_in, *self.aliases}))
         except InputError:
             return ()
 
@@ -113,9 +120,12 @@ class Registry(Mapping[str, Any]):
 
         No package is looked at, and nothing is imported.
         """
-        if not isinstance(name, str) or name not in self.built_in:
+        if not isinstance(name, str):
             return False
-        declared = declaration_of(self._built_in.get(name))
+        present = self.aliases.get(name, name)
+        if present not in self.built_in:
+            return False
+        declared = declaration_of(self._built_in.get(present))
         return declared is None or not declared.runs_code
 
     def find(self, name: str) -> Any:
@@ -125,8 +135,9 @@ class Registry(Mapping[str, Any]):
             UnknownNameError: nothing has the name; the message has the nearest name.
             InputError: it belongs to an installed package and cannot be loaded, or two packages have it.
         """
-        if name in self._built_in:
-            return self._built_in[name]
+        present = self.aliases.get(name, name)
+        if present in self._built_in:
+            return self._built_in[present]
         if name in self._modules:
             module, _, attribute = self._modules[name].partition(":")
             return getattr(importlib.import_module(module), attribute)
@@ -181,7 +192,7 @@ class Registry(Mapping[str, Any]):
         return len(self.built_in) + len(self.installed)
 
     def __contains__(self, name: object) -> bool:
-        return name in self.built_in or name in self.installed
+        return name in self.built_in or name in self.aliases or name in self.installed
 
     def __repr__(self) -> str:
         return f"Registry({self.kind}: {', '.join(self)})"

@@ -68,7 +68,7 @@ def identify(
     """
     if accept is not None and not accept.strip():
         raise InputError('accepting a change needs a reason, such as "gripper replaced".')
-    stored = store.describe_first(description)
+    stored = _with_present_names(store.describe_first(description))
     present = description if "version" in stored else _as_before(description, stored)
     found = list(differences(stored, present))
     asked = [sentence for path, sentence in found if path.startswith(_QUESTION)]
@@ -189,7 +189,30 @@ def _changed_distance(store: Store, validation: Validation, trials: Sequence[Tri
     return None
 
 
-# Descriptions of version 0.1.0
+# Descriptions of older versions
+
+_RENAMED = {"Scalar": "BayesianOptimisation", "Climbs": "TrustRegion"}
+"""Classes of searches by the names that older stores have, and their present names."""
+
+
+def _with_present_names(stored: dict[str, Any]) -> dict[str, Any]:
+    """Return a stored description in which classes of searches have their present names; the store keeps the old ones.
+
+    A search may stand inside another, such as ``Repeated``, or in what the code of a user's search uses.
+    """
+
+    def renamed(value: Any, key: str = "") -> Any:
+        if isinstance(value, dict):
+            return {name: renamed(item, name) for name, item in value.items()}
+        if isinstance(value, list):
+            return [renamed(item) for item in value]
+        if not isinstance(value, str):
+            return value
+        start = "ctxval." if value.startswith("ctxval.") else ""
+        old = value.removeprefix(start)
+        return start + _RENAMED[old] if old in _RENAMED and (start or key == "type") else value
+
+    return {**stored, "search": renamed(stored["search"])} if "search" in stored else stored
 
 
 def _as_before(present: dict[str, Any], stored: dict[str, Any]) -> dict[str, Any]:

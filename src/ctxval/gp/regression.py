@@ -97,6 +97,9 @@ class GaussianProcess:
         """Return log p(y | X, theta)."""
         return _log_likelihood(self.factor, self.alpha, self.y - self.mean(self.X))
 
+    def __repr__(self) -> str:
+        return call(self, self.kernel, points=len(self.X), dimension=self.X.shape[1], noise=self.noise)
+
 
 @dataclass(frozen=True, eq=False)
 class MultiOutputProcess:
@@ -140,7 +143,7 @@ class MultiOutputProcess:
         return self.Y - self.factor.left_out_errors(self.weights)
 
     def __repr__(self) -> str:
-        return call(self, self.kernel, points=len(self.X), dimension=self.X.shape[1], noise=self.noise)
+        return call(self, self.kernel, points=len(self.X), dimension=self.X.shape[1], outputs=self.Y.shape[1])
 
 
 def _mean_gradient(mean: Mean, X: Array) -> Array:

@@ -9,12 +9,12 @@ from ctxval.errors import InputError
 from ctxval.searches.annealing import Annealing
 from ctxval.searches.auto import Auto
 from ctxval.searches.base import Note, Prediction, Search, SequentialSearch
-from ctxval.searches.bayesian_optimisation import Scalar
+from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 from ctxval.searches.cma_es import CMAES
 from ctxval.searches.gp_ucb import GPUCB
 from ctxval.searches.random import Random, SamplingDiscarding
 from ctxval.searches.repeated import Repeated
-from ctxval.searches.trust_region import Climbs
+from ctxval.searches.trust_region import TrustRegion, TrustRegionSettings
 
 __all__ = [
     "CMAES",
@@ -23,6 +23,7 @@ __all__ = [
     "REGISTRY",
     "Annealing",
     "Auto",
+    "BayesianOptimisation",
     "Climbs",
     "Note",
     "Prediction",
@@ -32,14 +33,21 @@ __all__ = [
     "Scalar",
     "Search",
     "SequentialSearch",
+    "TrustRegion",
+    "TrustRegionSettings",
     "by_name",
 ]
+
+Scalar = BayesianOptimisation
+"""The older name of :class:`BayesianOptimisation`."""
+Climbs = TrustRegion
+"""The older name of :class:`TrustRegion`."""
 
 REGISTRY = Registry("search", __name__, method="ask")
 """The searches that are found by name: those of this package, and those that installed packages add."""
 
-NAMES: dict[str, type[Any]] = {name: REGISTRY.find(name) for name in sorted(REGISTRY.built_in)}
-"""The searches of this package, by name."""
+NAMES: dict[str, type[Any]] = {name: REGISTRY.find(name) for name in sorted((*REGISTRY.built_in, *REGISTRY.aliases))}
+"""The searches of this package, by name; ``climbs`` and ``scalar`` are older names."""
 
 
 def by_name(name: str, *, repeats: int = 1, **options: Any) -> Search:

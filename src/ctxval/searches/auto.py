@@ -7,17 +7,17 @@ from dataclasses import replace
 from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.searches.base import Prediction
-from ctxval.searches.trust_region import Climbs
+from ctxval.searches.trust_region import TrustRegion
 
 
 @part("auto")
-class Auto(Climbs):
-    """Climbs on the distance that executed trajectories predict; the scalar search where there are none.
+class Auto(TrustRegion):
+    """Trust-region search on the distance that executed trajectories predict; Bayesian optimisation without them.
 
     Args:
-        designs: controllers that one choice may design at most, where they take long; by default 2,000 where they are
-            designed in batches, and 150 where one after the other.
-        optimism, misses: as of :class:`Climbs`.
+        designs: the most controllers that may be designed for one suggestion; by default 2,000 if they are designed in
+            batches, and 150 if one after the other.
+        optimism, misses: as for :class:`TrustRegion`.
 
     Raises:
         InputError: a value cannot be used.
@@ -30,7 +30,7 @@ class Auto(Climbs):
         self.designs = designs
 
     def use_prediction(self, prediction: Prediction | None) -> None:
-        """Take what is expected before the next question; None where nothing is."""
+        """Take the prediction for the next question; None if there is none."""
         super().use_prediction(prediction if prediction is None else self._afforded(prediction))
 
     def _afforded(self, prediction: Prediction) -> Prediction:

@@ -1,10 +1,12 @@
-"""Bayesian optimisation where nothing is known but the values: two acquisition functions, and branches out of basins.
+"""Bayesian optimisation from values alone: two acquisition functions, and branches that lead out of basins.
 
 The surrogate is that of :func:`ctxval.gp.surrogate.learn`. Its expected improvement or, every third time, its upper
-confidence bound is maximised over the cube. After some executions without improvement the search branches: of all
-coordinates it takes the one across which, seen from the best point, it has been least often, and stays in that half of
-the cube. There it starts where the bound is largest, and then improves on what this branch has found itself, not on
-the best of all, as a wide basin that is not the highest is left only through what is lower.
+confidence bound is maximised over the cube.
+
+After several executions without improvement the search branches: it restricts itself to one half of the cube. Of the
+halves that do not contain the best point it takes the one with the fewest executions. A branch starts where the upper
+confidence bound is largest. From then on it improves on the largest value found in the branch, not on the largest of
+all, because the way out of a wide basin leads through lower values.
 """
 
 from __future__ import annotations
@@ -17,28 +19,34 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.registry import part
 from ctxval.errors import InputError
-from ctxval.gp import regression as gp
 from ctxval.gp.acquisition import Acquisition, Box, LogExpectedImprovement, UpperConfidenceBound, maximise
+from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.subset import kept_rows
 from ctxval.gp.surrogate import Learned, learn
 from ctxval.searches.base import Note, SequentialSearch, best_first
 
 _WORTH = 0.005
 """The least improvement worth an execution, as a share of what the best value is above the median."""
-_PATIENCE, _BRANCH_PATIENCE = 8, 6
-"""Executions without improvement after which the search branches, and after which it leaves a branch for another."""
+_PATIENCE = 8
+"""Executions without improvement after which the search branches."""
+_BRANCH_PATIENCE = 6
+"""Executions without improvement after which it leaves a branch for another."""
 _EVERYWHERE = 4
-"""Every so many executions are chosen for the whole cube whatever the branch; in few dimensions they fill the space."""
+"""One of so many executions is chosen from the whole cube, also in a branch; in few dimensions it fills the space."""
 _BOUND = 3
-"""Every so many executions maximise the upper confidence bound."""
+"""One of so many executions maximises the upper confidence bound."""
 _BOLD = 100.0
-"""The confidence parameter of the bound where a branch starts."""
-_FEW, _FILLERS = 2, 512
-"""Dimensions up to which a share of the executions fills the space, and candidates for each of these."""
+"""The confidence parameter of the bound at the start of a branch."""
+_FEW = 2
+"""Dimensions up to which some of the executions fill the space."""
+_FILLERS = 512
+"""Candidates for each of these."""
 _EACH = 20
-"""Up to so many values the hyperparameters are learned with each new one, up to twice as many with each second ..."""
+"""Up to so many values, hyperparameters are learned at each new one; up to twice as many, at each second one; ..."""
 _KEPT = 1000
 """Points of a long history that the surrogate is conditioned on."""
+_ENGINE = "scalar"
+"""The name of this search in notes. Stores have it, so it stays although the class has another name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,15 +76,15 @@ class _Branch:
         return low, high
 
 
-@part("scalar")
-class Scalar(SequentialSearch):
-    """The search where only values are known: expected improvement and upper bounds, with branches out of basins.
+@part("bayesian-optimisation", aliases=("scalar",))
+class BayesianOptimisation(SequentialSearch):
+    """Bayesian optimisation from values alone: expected improvement and upper confidence bounds, with branches.
 
     From 1,000 points on the surrogate is conditioned on 1,000 of them: the largest values, the latest, and well-spread
     ones.
 
     Args:
-        initial: how many random points come first; in one and two dimensions all but one are far from each other.
+        initial: how many random points come first; in one and two dimensions they are far from each other.
         beta: the confidence parameter of the upper bounds.
 
     Raises:
@@ -85,7 +93,7 @@ class Scalar(SequentialSearch):
 
     def __init__(self, initial: int = 3, beta: float = 4.0) -> None:
         if initial < 1:
-            raise InputError(f"the scalar search needs at least one initial point, got {initial}.")
+            raise InputError(f"Bayesian optimisation needs at least one initial point, got {initial}.")
         if not 0 <= beta < float("inf"):
             raise InputError(f"beta must not be negative or infinite, got {beta!r}.")
         self.initial = initial
@@ -111,9 +119,9 @@ class Scalar(SequentialSearch):
         few = self.dimension <= _FEW
         if len(values) < self.initial or np.isfinite(values).sum() < 2:
             point = _filling(points, rng) if few and len(points) else rng.random(self.dimension)
-            return point, {"engine": "scalar", "how": "initial"}
+            return point, {"engine": _ENGINE, "how": "initial"}
         if few and len(values) % _EVERYWHERE == 0:
-            return _filling(points, rng), {"engine": "scalar", "how": "filling"}
+            return _filling(points, rng), {"engine": _ENGINE, "how": "filling"}
         with single_threaded():
             return self._most_worth(points, values, rng)
 
@@ -129,14 +137,14 @@ class Scalar(SequentialSearch):
         known_first, away = best_first(points, values), points[~known]
         point = maximise(acquisition, self.dimension, known_first, rng, box=box, corners=True, away=away)
         return point, {
-            "engine": "scalar",
+            "engine": _ENGINE,
             "how": "bound" if isinstance(acquisition, UpperConfidenceBound) else "improvement",
             "branch": None if branch is None else [branch.coordinate, branch.upper],
             "logarithm": bool(np.isfinite(learned.warp.offset)),
         }
 
     def _acquisition(
-        self, learned: Learned, process: gp.GaussianProcess, values: Array, branch: _Branch | None, believed: float
+        self, learned: Learned, process: GaussianProcess, values: Array, branch: _Branch | None, believed: float
     ) -> Acquisition:
         if branch is not None and not np.isfinite(branch.best):
             # Far from the flank of the basin that was left: there the branch would only lead back to it.

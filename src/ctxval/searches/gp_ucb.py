@@ -7,9 +7,9 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.registry import part
 from ctxval.errors import InputError
-from ctxval.gp import regression as gp
 from ctxval.gp.acquisition import Uncertainty, UpperConfidenceBound, maximise
 from ctxval.gp.kernels import Kernel, Matern
+from ctxval.gp.regression import NOISE, Mean
 from ctxval.gp.subset import kept_rows
 from ctxval.gp.surrogate import Surrogate, fit_surrogate
 from ctxval.searches.base import SequentialSearch, best_first
@@ -45,8 +45,8 @@ class GPUCB(SequentialSearch):
         initial: int = 5,
         *,
         kernel: Kernel | None = None,
-        noise: tuple[float, float] = (gp.NOISE, gp.NOISE),
-        prior_mean: gp.Mean | None = None,
+        noise: tuple[float, float] = (NOISE, NOISE),
+        prior_mean: Mean | None = None,
     ) -> None:
         if not 0 <= beta < float("inf"):
             raise InputError(f"beta must not be negative or infinite, got {beta!r}.")
