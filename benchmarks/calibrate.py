@@ -65,7 +65,7 @@ def from_prior(d: int, rng: np.random.Generator, prior: Prior | None = None, wav
 
 def kinks(d: int, rng: np.random.Generator) -> Values:
     """Return the size of a difference that changes sign: smooth, but for kinks at its zeros and at a hinge."""
-    smooth = from_prior(d, rng, Prior(smoothness=(2.5,), length_scale=0.5, spread=0.3))
+    smooth = from_prior(d, rng, Prior(smoothness=(2.5,), length_scale=0.5, deviation=0.3))
     normal, offset = rng.normal(size=d), rng.uniform(0.3, 0.7, d)
 
     def values(Z: Array) -> Array:
@@ -89,13 +89,13 @@ def narrow_peaks(d: int, rng: np.random.Generator) -> Values:
 
 def heavy_tails(d: int, rng: np.random.Generator) -> Values:
     """Return the exponential of a path: its peaks are far above the rest."""
-    path = from_prior(d, rng, Prior(length_scale=0.4, spread=0.3))
+    path = from_prior(d, rng, Prior(length_scale=0.4, deviation=0.3))
     return lambda Z: np.exp(1.5 * path(Z))
 
 
 def bifurcation(d: int, rng: np.random.Generator) -> Values:
     """Return a path that jumps across a plane, as a distance does where a controller takes another way."""
-    prior = Prior(smoothness=(2.5,), length_scale=0.5, spread=0.3)
+    prior = Prior(smoothness=(2.5,), length_scale=0.5, deviation=0.3)
     one, other, jump = from_prior(d, rng, prior), from_prior(d, rng, prior), rng.uniform(0.5, 2.0)
     normal, centre = rng.normal(size=d), rng.uniform(0.3, 0.7, d)
 

@@ -23,7 +23,7 @@ DIMENSIONS = (1, 2, 3)
 
 
 def _background(d: int, rng: np.random.Generator) -> Values:
-    return from_prior(d, rng, Prior(smoothness=(2.5,), length_scale=0.5, spread=0.2), waves=256)
+    return from_prior(d, rng, Prior(smoothness=(2.5,), length_scale=0.5, deviation=0.2), waves=256)
 
 
 def _waves(d: int, rng: np.random.Generator) -> Values:
@@ -93,7 +93,7 @@ def chirp(d: int, rng: np.random.Generator) -> Values:
 
 def saturated(d: int, rng: np.random.Generator) -> Values:
     """Return a path that is cut off between half and nine tenths of its range."""
-    path = from_prior(d, rng, Prior(length_scale=0.35, spread=0.3), waves=256)
+    path = from_prior(d, rng, Prior(length_scale=0.35, deviation=0.3), waves=256)
     sample = path(np.random.default_rng(0).random((2000, d)))
     cap = sample.min() + rng.uniform(0.5, 0.9) * np.ptp(sample)
     return lambda Z: np.minimum(path(Z), cap)

@@ -11,50 +11,27 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 import misleading
 import study_auto
 from ctxval import Experiment, searches
-from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
-from ctxval.gp import regression as gp
-from ctxval.searches import Climbs, Prediction, Scalar
-from ctxval.searches import trust_region as climbs
+from ctxval.searches import BayesianOptimisation, TrustRegion, TrustRegionSettings
 from study_auto import Result, add_options, campaign, print_table, results_of, stored
 
 CASES = ("pendulum-no-data", "linear-5", "dubins-basin", "arm-fnn", *misleading.CASES)
 
 
-class NoDiscrepancy(Climbs):
-    """Climbs that take the predicted distance as it is, however wrong it was at known points."""
-
-    def _discrepancy(self, prediction: Prediction) -> gp.GaussianProcess | None:
-        return None
+def trust_region(**settings: bool) -> TrustRegion:
+    """Return the search with other settings than the usual ones."""
+    return TrustRegion(settings=TrustRegionSettings(**settings))
 
 
-class NoTrustScore(Climbs):
-    """Climbs that use the prediction however bad leaving executions out shows it to be."""
-
-    def _why_not(self, prediction: Prediction) -> str | None:
-        return None
-
-
-class NoClimbs(Climbs):
-    """The most promising point of the whole cube each time: no trust region, and no restarts elsewhere."""
-
-    def _climb(self, prediction: Prediction, rng: np.random.Generator) -> Array | None:
-        promise = climbs._Promise(prediction, self._discrepancy(prediction), self._calibrated())
-        point = self._best(promise, climbs._Climb(), prediction.budget, rng)
-        return None if point is None else self._noted(prediction, point, climbs._Climb())
-
-
-# A scalar search that starts as the climbs do, with one random point, is all of it but the residual.
+# Bayesian optimisation that starts as the trust region does, with one random point, is all of it but the residual.
 ABLATIONS: dict[str, Callable[[], searches.Search]] = {
-    "no residual": partial(Scalar, initial=1),
-    "no discrepancy": NoDiscrepancy,
-    "no trust score": NoTrustScore,
-    "no climbs": NoClimbs,
+    "no residual": partial(BayesianOptimisation, initial=1),
+    "no discrepancy": partial(trust_region, correct_discrepancy=False),
+    "no trust score": partial(trust_region, compare_with_surrogate=False),
+    "no climbs": partial(trust_region, restrict=False),
 }
 """What is left out -> the search without it."""
 

@@ -42,7 +42,7 @@ def suggest_by_value(name: str, validation: Validation, seed: int) -> Callable[[
 
 
 def suggest_by_vector(validation: Validation, seed: int) -> Callable[[list[Array], list[float]], Array]:
-    distance, search = validation.distance, searches.Climbs()
+    distance, search = validation.distance, searches.TrustRegion()
     assert isinstance(distance, ComposedDistance), "this case's distance is not composed of a vector"
     search.reset(validation.space.dimension, seed)
     vectors: list[Array] = []

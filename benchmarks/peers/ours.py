@@ -38,7 +38,7 @@ def auto_without_data(values: Recorder, dimension: int, budget: int, seed: int) 
 
 def vector(values: Recorder, dimension: int, budget: int, seed: int) -> None:
     """Maximise with the vectors that the distances are composed of."""
-    search, distance = searches.Climbs(), values.function.validation.distance
+    search, distance = searches.TrustRegion(), values.function.validation.distance
     assert isinstance(distance, ComposedDistance), "this distance is not composed of a vector"
     search.reset(dimension, seed)
     vectors: list[Array] = []

@@ -48,7 +48,7 @@ def quadrature(prior: Prior, X: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, 
                 -0.5 * np.linalg.slogdet(K)[1]
                 - 0.5 * np.log(precision)
                 - 0.5 * (len(y) - 1) * np.log(rest @ inverse @ rest)
-                + norm(np.log(prior.length_scale), prior.spread).logpdf(value)
+                + norm(np.log(prior.length_scale), prior.deviation).logpdf(value)
             )
     weights = np.exp(logs - logs.max())
     return grid, weights / weights.sum()
@@ -168,7 +168,7 @@ def test_a_length_scale_is_drawn_from_its_posterior() -> None:
 def test_where_the_data_say_nothing_the_draws_are_the_prior() -> None:
     # Length-scales far below the gaps: whatever they are, the values are uncorrelated.
     X, y = np.array([[0.1, 0.9], [0.5, 0.5], [0.9, 0.1], [0.2, 0.2]]), np.array([0.3, -1.0, 0.4, 2.0])
-    prior = Prior(length_scale=1e-4, spread=0.5, noise=(1e-4, 1e-2))
+    prior = Prior(length_scale=1e-4, deviation=0.5, noise=(1e-4, 1e-2))
     draws = draw_hyperparameters(X, y, 700, np.random.default_rng(2), prior)
     centre = np.log(1e-4 * np.sqrt(2))
     for column in log_scales(draws)[::3].T:
@@ -184,7 +184,7 @@ def test_where_the_data_say_nothing_the_draws_are_the_prior() -> None:
 def test_the_prior_draws_what_it_says() -> None:
     prior, rng = Prior(noise=(1e-4, 1e-2)), np.random.default_rng(3)
     draws = [prior.draw(3, rng) for _ in range(2000)]
-    scales = (np.array([draw.log_scales for draw in draws]) - np.log(0.3 * np.sqrt(3))) / prior.spread
+    scales = (np.array([draw.log_scales for draw in draws]) - np.log(0.3 * np.sqrt(3))) / prior.deviation
     assert kstest(scales.ravel(), "norm").pvalue > 1e-3
     assert kstest((np.array([d.log_noise for d in draws]) - np.log(1e-4)) / np.log(100), "uniform").pvalue > 1e-3
     assert abs(np.mean([draw.nu == 2.5 for draw in draws]) - 0.5) < 4 * 0.5 / np.sqrt(2000)

@@ -1,1 +1,52 @@
-"""Gaussian processes; they know numbers alone."""
+"""Gaussian processes: kernels, regression, draws of hyperparameters and sample paths, acquisition functions.
+
+Nothing here knows of control: points are those of the unit cube or of any other space, values are numbers.
+"""
+
+from __future__ import annotations
+
+from ctxval.gp.acquisition import (
+    Acquisition,
+    LogExpectedImprovement,
+    Uncertainty,
+    UpperConfidenceBound,
+    maximise,
+)
+from ctxval.gp.ascent import Ascent
+from ctxval.gp.cholesky import CholeskyFactor, factorise
+from ctxval.gp.hyperposterior import Conditioned, Hyperparameters, Prior, draw_hyperparameters
+from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
+from ctxval.gp.regression import GaussianProcess, MultiOutputProcess, condition, fit
+from ctxval.gp.sample_paths import Paths, draw_paths, maxima
+from ctxval.gp.subset import kept_rows, pivoted_rows
+from ctxval.gp.surrogate import Surrogate, fit_surrogate
+
+__all__ = [
+    "Acquisition",
+    "Ascent",
+    "CholeskyFactor",
+    "Conditioned",
+    "GaussianProcess",
+    "Hyperparameters",
+    "Kernel",
+    "Linear",
+    "LogExpectedImprovement",
+    "Matern",
+    "MultiOutputProcess",
+    "Paths",
+    "Prior",
+    "Sum",
+    "Surrogate",
+    "Uncertainty",
+    "UpperConfidenceBound",
+    "condition",
+    "draw_hyperparameters",
+    "draw_paths",
+    "factorise",
+    "fit",
+    "fit_surrogate",
+    "kept_rows",
+    "maxima",
+    "maximise",
+    "pivoted_rows",
+]

@@ -60,7 +60,7 @@ class Ascent:
         if len(self._low) <= _FEW:
             self._zoom(rng)
         elif self._left() > 2 * (len(self._low) + 1):
-            self._climb(self._spread_best())
+            self._climb(self._separated_best())
         while self._left() > 0 and self._polish(rng):
             pass
         return self._found()
@@ -87,7 +87,7 @@ class Ascent:
         snapped = rng.random(points.shape) < np.where(np.arange(count) % 2, rng.random(count), 0.0)[:, None]
         return np.where(snapped, ends, points)
 
-    def _spread_best(self) -> Array:
+    def _separated_best(self) -> Array:
         """Return some of the best points, none a neighbour of a better one."""
         points, values = self._found()
         finite = points[np.isfinite(values)]
@@ -98,7 +98,7 @@ class Ascent:
         """Sample ever closer around the best points: cheaper than slopes in few dimensions, and kinks do no harm."""
         count = int(0.8 * self._left()) // len(_ZOOMS)
         for share in _ZOOMS:
-            best = self._spread_best()
+            best = self._separated_best()
             if not len(best) or not count:
                 return
             moves = share * (self._high - self._low) * rng.normal(size=(count, len(self._low)))

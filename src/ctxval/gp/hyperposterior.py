@@ -1,4 +1,4 @@
-"""What the data say of a Gaussian process's hyperparameters: draws from their posterior instead of one best guess.
+"""Draws of a Gaussian process's hyperparameters from their posterior, instead of one best guess.
 
 The process is ``f = mu + sigma g``, g with unit variance and a Matern kernel with one length-scale for each dimension,
 or, for values that cannot be negative, the logarithm of the values is.
@@ -73,25 +73,25 @@ _LARGEST = 700.0
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed of the hyperparameters before the data.
+    """The prior of the hyperparameters.
 
     Attributes:
-        smoothness: those of the Matern kernels that are averaged over, equally likely.
+        smoothness: values of nu of the Matern kernel, equally likely.
         length_scale: median of the log-normal length-scales in the unit cube, times the square root of the dimension.
-        spread: standard deviation of their logarithms.
+        deviation: standard deviation of their logarithms.
         noise: bounds of the noise variance relative to sigma^2, log-uniform between; equal bounds fix it.
         offset: of the logarithm, in means of the values; the logarithm is as likely as the values themselves, where
             none is negative. None leaves it out.
-        spread_share: share of the data, those spread best, that are asked apart from the others. A search crowds its
-            points where the values are smooth and high, and there they speak for smoothness everywhere. Each draw
-            given all data is made as rough as one given these alone, where that one is rougher. With 1 there is
-            none of this: then bounds are exact on draws of the prior, and too low on kinks, jumps and heavy tails
-            (docs/calibration.md).
+        spread_share: share of the data, the best spread over the cube, from which hyperparameters are drawn a second
+            time. A search crowds its points where the values are smooth and high, and these points speak for
+            smoothness everywhere. Each draw from all data is made as rough as one from the well-spread data, if that
+            one is rougher. With 1 this is left out: then bounds are exact on draws of the prior, and too low on
+            kinks, jumps and heavy tails (docs/calibration.md).
     """
 
     smoothness: tuple[float, ...] = (1.5, 2.5)
     length_scale: float = 0.3
-    spread: float = 1.0
+    deviation: float = 1.0
     noise: tuple[float, float] = (EXACT, EXACT)
     offset: float | None = 0.1
     spread_share: float = 0.5
@@ -106,14 +106,14 @@ class Prior:
     def log_density(self, log_scales: Array) -> float:
         """Return the log density of the length-scales' logarithms ``(d,)``, up to a constant."""
         centre = np.log(self.length_scale) + 0.5 * np.log(len(log_scales))
-        return float(-0.5 * (((log_scales - centre) / self.spread) ** 2).sum())
+        return float(-0.5 * (((log_scales - centre) / self.deviation) ** 2).sum())
 
     def draw(self, dimension: int, rng: np.random.Generator) -> Hyperparameters:
         """Return hyperparameters from the prior."""
         centre = np.log(self.length_scale) + 0.5 * np.log(dimension)
         log_noise = rng.uniform(*np.log(self.noise))
         return Hyperparameters(
-            float(rng.choice(self.smoothness)), rng.normal(centre, self.spread, dimension), log_noise
+            float(rng.choice(self.smoothness)), rng.normal(centre, self.deviation, dimension), log_noise
         )
 
 
@@ -149,7 +149,7 @@ class Hyperparameters:
 
 @dataclass(frozen=True, eq=False)
 class Conditioned:
-    """The data as one draw of hyperparameters sees them.
+    """A Gaussian process with one draw of hyperparameters, conditioned on data.
 
     Attributes:
         hyperparameters: the draw.
@@ -181,7 +181,7 @@ class Conditioned:
 
 
 def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: Warp | None = None) -> Conditioned:
-    """Return what the data ``(n, d)``, ``(n,)`` say under these hyperparameters, on the values' own scale by default.
+    """Condition on data ``(n, d)``, ``(n,)`` with these hyperparameters, on the values' own scale by default.
 
     Raises:
         InputError: the correlations are not positive definite.

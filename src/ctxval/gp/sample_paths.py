@@ -27,7 +27,7 @@ class Paths:
     """Paths under one draw of hyperparameters, as functions on the unit cube.
 
     Attributes:
-        conditioned: the hyperparameters, and what they say of the data.
+        conditioned: the hyperparameters, conditioned on the data.
         X: the data's points ``(n, d)``.
         frequencies: of the waves ``(F, d)``.
         amplitudes: of cosines and sines, shape ``(2 F, s)``.
@@ -52,7 +52,7 @@ class Paths:
         return np.asarray(self.means + self.scales * (waves + self._correlations(Z) @ self.corrections))
 
     def roughly(self, Z: Array) -> Array:
-        """Return what a call returns, its waves to six digits and ten times as fast: enough to choose candidates."""
+        """Return the values of a call, waves in single precision: ten times as fast, enough to choose candidates."""
         single = np.float32
         waves = _waves(Z.astype(single), self.frequencies.astype(single)) @ self.amplitudes.astype(single)
         # The corrections are sums of large terms that cancel: single precision would not do.
@@ -100,12 +100,12 @@ def draw_paths(conditioned: Conditioned, X: Array, count: int, rng: np.random.Ge
         conditioned: the data under one draw of hyperparameters.
         X: the data's points.
         count: how many paths.
-        rng: where everything random comes from.
+        rng: of all random numbers.
     """
     hyperparameters, (n, d) = conditioned.hyperparameters, X.shape
     # The spectrum of a Matern kernel is a multivariate t with 2 nu degrees of freedom.
-    spread = np.sqrt(2 * hyperparameters.nu / rng.chisquare(2 * hyperparameters.nu, (WAVES, 1)))
-    frequencies = rng.normal(size=(WAVES, d)) * spread / np.exp(hyperparameters.log_scales)
+    tails = np.sqrt(2 * hyperparameters.nu / rng.chisquare(2 * hyperparameters.nu, (WAVES, 1)))
+    frequencies = rng.normal(size=(WAVES, d)) * tails / np.exp(hyperparameters.log_scales)
     amplitudes = rng.normal(size=(2 * WAVES, count))
     scales = np.sqrt(conditioned.scale2 * (n - 1) / rng.chisquare(n - 1, count))
     means = rng.normal(conditioned.mean, scales * np.sqrt(conditioned.mean_variance))
@@ -119,9 +119,9 @@ def draw_paths(conditioned: Conditioned, X: Array, count: int, rng: np.random.Ge
 def maxima(paths: Paths, known: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return the largest value of each path over the unit cube, shape ``(s,)``, and where it is, ``(s, d)``.
 
-    Candidates that are uniform, near ``known`` points (best first) and at corners; climbs from the best of several
-    lots of them. Beyond two dimensions there are more lots, only the highest of them climb all the way, and then
-    coordinates are moved to their bounds one by one, as long as that pays.
+    Candidates are uniform, near ``known`` points (best first) and at corners. They are divided into several lots, and
+    the best of each lot is climbed from. Beyond two dimensions there are more lots, only the highest climb all the way,
+    and in the end coordinates are moved to their bounds one by one, as long as that pays.
     """
     d = paths.X.shape[1]
     candidates = _candidates(known, d, rng)
@@ -144,7 +144,7 @@ def _candidates(known: Array, d: int, rng: np.random.Generator) -> Array:
 
 
 def _starts(candidates: Array, values: Array, many: int) -> Array:
-    """Return the best candidates of many lots for each path, shape ``(s, many, d)``: they are spread, yet good."""
+    """Return the best candidates of many lots for each path, shape ``(s, many, d)``: they are far apart, yet good."""
     return np.stack([candidates[lot::many][values[lot::many].argmax(axis=0)] for lot in range(many)], axis=1)
 
 

@@ -14,6 +14,7 @@ from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
 from ctxval.gp.regression import NOISE, GaussianProcess, Mean, condition, fit, zero_mean
 
 _KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())
+"""Of :class:`Learned`."""
 _LENGTH_SCALE = 0.4
 """Prior median of the length-scales, divided by the square root of the dimension."""
 _COMMON_DEVIATION = 0.5
@@ -133,7 +134,7 @@ class Learned:
         return np.asarray((self.warp.forward(values) - self.shift) / self.scale)
 
     def condition(self, points: Array, values: Array) -> GaussianProcess:
-        """Return the process given values ``(n,)``, NaN where pending or failed: there it believes what it predicts."""
+        """Return the process given values ``(n,)``, NaN where pending or failed: its own predictions stand in there."""
         known = np.isfinite(values)
         process = condition(_KERNEL, self.theta, points[known], self.standardised(values[known]))
         return _with_believed(process, points[~known])
@@ -146,7 +147,7 @@ def learn(points: Array, values: Array) -> Learned:
     """Return the most likely hyperparameters given known values ``(n,)`` at unit-cube points ``(n, d)``.
 
     Length-scales have a log-normal prior that grows with the root of the dimension (Hvarfner, Hellsten and Nardi
-    2024). The process is one of the values or, where none is negative and that predicts each value clearly better
+    2024). The process is one of the values or, if none is negative and that predicts each value clearly better
     from all others, of their logarithms.
     """
     if len(values) > _LEARNED_FROM:

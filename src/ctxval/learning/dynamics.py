@@ -59,12 +59,12 @@ class Residual:
         noise: variance of the outputs' noise.
         centres: standardised state-input pairs that it is conditioned on, shape ``(M, n + m)``.
         outputs: standardised residuals there, shape ``(M, n)``.
-        sources: which execution each is of; -1 for data that the model came with, shape ``(M,)``.
+        sources: the execution of each pair; -1 for data that the model came with, shape ``(M,)``.
         shift_in, scale_in: of the state-input pair, shapes ``(n + m,)``.
         scale_out: of the residual, shape ``(n,)``.
         limit: the largest standardised residual believed, shape ``(n,)``.
         unit: a standardised residual of 1 as a share of a typical step of the system.
-        spare: more pairs, outputs and sources, which stand in where an execution is left out; None where one is.
+        spare: more pairs, outputs and sources, which replace those of executions that are left out; None after that.
     """
 
     theta: Array
@@ -117,7 +117,7 @@ class Residual:
         return np.asarray(np.maximum(variance, 0.0).reshape(z.shape[:-1]))
 
     def unfamiliarity(self, trajectory: Trajectory) -> Array:
-        """Return how uncertain a step along trajectories is, as a share of a typical step, ``(...)``."""
+        """Return the standard deviation of r along trajectories, as a share of a typical step, ``(...)``."""
         at = np.linspace(0, trajectory.horizon - 1, min(_LOOKS, trajectory.horizon)).astype(int)
         variance = self.variance(trajectory.states[..., at, :], trajectory.inputs[..., at, :])
         return np.asarray(self.unit * np.sqrt(variance.mean(axis=-1)))
@@ -128,7 +128,7 @@ class Residual:
         return self.unit * float(np.median(np.sqrt((errors**2).mean(axis=1))))
 
     def without(self, sources: Collection[int]) -> Residual:
-        """Return the residual as it is without some executions."""
+        """Return the residual conditioned without some executions; its hyperparameters stay."""
         spare = () if self.spare is None else (self.spare,)
         parts = zip((self.centres, self.outputs, self.sources), *spare, strict=True)
         centres, outputs, of = (np.concatenate(part) for part in parts)

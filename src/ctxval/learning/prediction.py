@@ -1,7 +1,7 @@
-"""The distance that executions predict, with M corrected by what they showed.
+"""Predictions of the distance from the dynamics that executions have shown.
 
-The corrected model wrapped as a simulated system is a system again. So the predicted distance at p is the ordinary
-validation of M against M_hat, which designs the controller at every p and sees where that jumps.
+The corrected model ``M_hat = M + r`` can stand in for the system. So the distance predicted at p is the ordinary
+validation of M against M_hat, with the controller designed at p: jumps of the design are predicted too.
 """
 
 from __future__ import annotations
@@ -25,24 +25,34 @@ from ctxval.learning.vector import predict_composed
 from ctxval.models.scaling import standard_deviations
 from ctxval.searches import Prediction
 
-_CENTRES, _WORK = (100, 450), 30_000
-"""Transitions that the residual is conditioned on, and their number times the horizon at most: the time of a loop."""
-_POOL, _DATA = 3000, 600
-"""Transitions of executions that these are chosen from, and of the model's own data: those nearest to the tasks."""
-_LOOPS, _SLOW_LOOPS = 64, 3
-"""Closed loops on M that show which transitions the tasks need, and how often one is tried where batches fail."""
-_DESIGNS, _SLOW_DESIGNS = 2000, 150
-"""Designs for one suggestion, where the synthesizer takes batches and where not."""
+_CENTRES = (100, 450)
+"""The fewest and the most transitions that the residual is conditioned on."""
+_WORK = 30_000
+"""Their number times the horizon is about this, which bounds the time of a closed loop."""
+_POOL = 3000
+"""The most transitions of executions that these are chosen from."""
+_DATA = 600
+"""The most transitions of the model's own data among them: those nearest to the tasks."""
+_LOOPS = 64
+"""Closed loops on M that show which transitions the tasks need."""
+_SLOW_LOOPS = 3
+"""Tasks that are tried one by one, if loops cannot be computed in a batch."""
+_DESIGNS = 2000
+"""Designs for one suggestion, if the synthesizer takes batches."""
+_SLOW_DESIGNS = 150
+"""Designs for one suggestion, if it takes one task at a time."""
 _SLOW = 0.02
-"""Seconds of a closed loop on M from which on they are spread over the cores, where there can be no batch of them."""
+"""Seconds of a single closed loop on M from which on closed loops are distributed over the cores."""
 
 
 def predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
-    """Return what the executions so far, and the data that the model came with, let one expect of d at other points.
+    """Return a prediction of d at other points from the executions so far and the data that the model came with.
 
-    None where nothing was recorded, where M is not wrong in it, or where no task can be planned. Where the distance is
-    composed of a short vector, such as the error of the final state, the prediction names another to turn to, that of
-    the vectors as functions of p: what no function of state and input explains may still be one of p.
+    Returns None if there are no recorded transitions, if M already explains them, or if no task can be planned.
+
+    If the distance is composed of a short vector, such as the error of the final state, the prediction offers another
+    one to turn to (``otherwise``), which models the vectors as functions of p: what no function of state and input
+    explains may still be a function of p.
 
     Args:
         validation: the map p -> d(p).
@@ -55,7 +65,7 @@ def predict_distance(validation: Validation, executed: Sequence[tuple[Array, Tra
 
 
 def _predict_vectors(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
-    """Return what the vectors that distances are composed of let one expect; None where they are not."""
+    """Return the prediction from the vectors that distances are composed of; None if they are not, or cannot be had."""
     distance = validation.distance
     if not isinstance(distance, ComposedDistance) or len(executed) < 2:
         return None
@@ -96,12 +106,17 @@ def _predict_distance(validation: Validation, executed: Sequence[tuple[Array, Tr
     if corrected is None:
         return None
     batched = bool(loops.batch_shape)
-    forecast = _Forecast(validation, corrected, batched, executed, spread_out=not batched and seconds > _SLOW)
-    return Prediction(forecast, forecast.left_out, _DESIGNS if batched else _SLOW_DESIGNS)
+    predicted = _PredictedDistance(
+        validation, corrected, batched, executed, in_parallel=not batched and seconds > _SLOW
+    )
+    return Prediction(predicted, predicted.left_out, _DESIGNS if batched else _SLOW_DESIGNS)
 
 
 def _closed_loops_on_model(validation: Validation) -> Trajectory | None:
-    """Return what M promises for some tasks: a batch, or one task where there can be no batch; None for none at all."""
+    """Return closed loops on M for random tasks: a batch, or one task if there can be no batch.
+
+    Returns None if no task can be planned.
+    """
     space = validation.space
     points = space.from_unit(np.random.default_rng(0).random((_LOOPS, space.dimension)))
     batches = [points] if getattr(validation.synthesizer, "batched", False) else []
@@ -132,7 +147,7 @@ def _nearest(data: Transitions, loops: Trajectory) -> Transitions:
 
 
 @dataclass(frozen=True, eq=False)
-class _Forecast:
+class _PredictedDistance:
     """The validation of M against M_hat, in the unit cube.
 
     Attributes:
@@ -140,19 +155,19 @@ class _Forecast:
         corrected: M_hat.
         batched: whether controllers are designed in batches.
         executed: points with the trajectories that M_hat was learned from.
-        spread_out: whether closed loops are spread over the cores; they come out the same.
+        in_parallel: whether closed loops are distributed over the cores; their results are the same.
     """
 
     validation: Validation
     corrected: CorrectedModel
     batched: bool
     executed: Sequence[tuple[Array, Trajectory]]
-    spread_out: bool
+    in_parallel: bool
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Return the predicted distances ``(m,)`` and how little of the predicted trajectories was seen, ``(m,)``."""
+        """Return the predicted distances ``(m,)``, and the doubt in the predicted trajectories ``(m,)``."""
         with single_threaded():
-            if not self.spread_out:
+            if not self.in_parallel:
                 return self._looped(points, self.corrected)
             parts = on_all_cores(functools.partial(self._looped, corrected=self.corrected), list(points[:, None, :]))
             return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
@@ -168,7 +183,7 @@ class _Forecast:
         return CorrectedModel(self.corrected.model, self.corrected.residual.without(there))
 
     def _looped(self, points: Array, corrected: CorrectedModel) -> tuple[Array, Array]:
-        """Halve what fails, so that a task without a prediction, NaN, costs the others nothing."""
+        """Return distances and doubts; a batch that fails is halved, so that one bad task, NaN, spares the others."""
         if self.batched or len(points) == 1:
             try:
                 return self._closed_loops(points, corrected)

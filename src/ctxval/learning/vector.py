@@ -72,7 +72,7 @@ class _ComposedPosterior:
 def predict_composed(points: Array, vectors: Array, compose: Compose) -> Prediction | None:
     """Return a prediction of values from the vectors of which they are composed at known points.
 
-    Returns None if fewer than two vectors are known, or if all are zero.
+    Returns None if fewer than two vectors are known, or if all of them are zero.
 
     Args:
         points: of the unit cube, ``(n, d)``.

@@ -110,7 +110,7 @@ class BayesianOptimisation(SequentialSearch):
         return point
 
     def choose(self, points: Array, values: Array, rng: np.random.Generator) -> tuple[Array, Note]:
-        """Return the point ``(d,)`` worth most after this history, whoever asked for it, and what was thought.
+        """Return the point ``(d,)`` worth most after this history, whoever chose its points, and a note on the choice.
 
         Args:
             points, values: ``(n, d)`` and ``(n,)``, NaN where pending or failed.
@@ -188,7 +188,7 @@ def _filling(points: Array, rng: np.random.Generator) -> Array:
 
 
 def _branch(points: Array, values: Array) -> _Branch | None:
-    """Return the branch in which these known values leave the search, in their order; None for the whole cube."""
+    """Return the branch that the search is in after these known values, in their order; None for the whole cube."""
     branch, misses, best, place = None, 0, -np.inf, points[0]
     ordered: list[float] = []
     for count, (point, value) in enumerate(zip(points, values.tolist(), strict=True), start=1):

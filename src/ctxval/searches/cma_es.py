@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from cmaes import CMA
 
 _SMALLEST_POPULATION = 4
+"""The fewest points in a generation."""
 _POINT = 1e-4
-"""A generation that spans less than this of the cube on every axis has nothing left to find."""
+"""A run has converged if a generation spans less than this share of the cube on every axis."""
 
 
 @part("cma-es")
@@ -53,7 +54,7 @@ class CMAES(SequentialSearch):
         self._learned = np.empty(0)
 
     def propose(self, rng: np.random.Generator) -> Array:
-        """Return a draw from the distribution that the whole generations so far have shaped."""
+        """Return a draw from the distribution after all complete generations."""
         with single_threaded():
             self._learn_generations(self.points, self.values)
             self._distribution.reseed_rng(int(rng.integers(2**32)))
@@ -79,7 +80,7 @@ class CMAES(SequentialSearch):
 
 
 def _learn(distribution: CMA, points: Array, values: Array) -> None:
-    """Tell one generation; its failures rank behind its worst value, and a generation of failures teaches nothing."""
+    """Tell one generation; failures rank behind its worst value, and a generation of failures is left out."""
     known = np.isfinite(values)
     if not known.any():
         return

@@ -1,4 +1,4 @@
-"""GP-UCB as the paper has it: the reproduction baseline."""
+"""GP-UCB, the search of the paper."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class GPUCB(SequentialSearch):
             bound = UpperConfidenceBound(process, self.beta)
             point = maximise(bound, self.dimension, known, rng)
             if bound(point[None])[0] - process.y.max() <= _NEGLIGIBLE:
-                # Converged: the bound promises nothing more, so what is left of the budget goes where least is known.
+                # Converged: the bound promises nothing more, so the rest of the budget explores.
                 point = maximise(Uncertainty(process), self.dimension, known, rng)
             return point
 
