@@ -156,14 +156,15 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "Verdict": lambda: Verdict("falsified", 0.5, "trial 3 was executed.", FAILED, CERTIFICATE),
     "searches.Annealing": searches.Annealing,
     "searches.Auto": searches.Auto,
+    "searches.BayesianOptimisation": searches.BayesianOptimisation,
     "searches.CMAES": searches.CMAES,
-    "searches.Climbs": searches.Climbs,
     "searches.GPUCB": searches.GPUCB,
     "searches.Prediction": lambda: searches.Prediction(lambda points: (points, points), lambda rows: rows, 150),
     "searches.Random": searches.Random,
     "searches.Repeated": lambda: searches.Repeated(searches.Random(), 3),
     "searches.SamplingDiscarding": searches.SamplingDiscarding,
-    "searches.Scalar": searches.Scalar,
+    "searches.TrustRegion": searches.TrustRegion,
+    "searches.TrustRegionSettings": searches.TrustRegionSettings,
     "systems.FMU": fmu,
     "systems.Function": lambda: systems.Function(no_execution),
     "systems.Gymnasium": gymnasium,
@@ -226,7 +227,12 @@ def public_classes() -> Iterator[tuple[str, type]]:
         module = importlib.import_module(f"ctxval{package}")
         for name in getattr(module, "__all__", [name for name in vars(module) if name[0] != "_"]):
             found = getattr(module, name)
-            own = inspect.isclass(found) and (hasattr(module, "__all__") or found.__module__ == module.__name__)
+            alias = inspect.isclass(found) and found.__name__ != name
+            own = (
+                inspect.isclass(found)
+                and not alias
+                and (hasattr(module, "__all__") or found.__module__ == module.__name__)
+            )
             if own and not (getattr(found, "_is_protocol", False) or inspect.isabstract(found)):
                 yield f"{package}.{name}".lstrip("."), found
 
