@@ -20,8 +20,7 @@ from calibration_functions import DEVELOPMENT, REPORTING, generator
 from ctxval import Campaign, Trial, cases, searches
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
-from ctxval.certificates import RESOLUTION, covering
-from ctxval.certificates.stopping import standing
+from ctxval.certificates import RESOLUTION, StoppingRule, covering
 from ctxval.certificates.verdict import counterexample
 from ctxval.reproduce.jobs import Job, Results
 
@@ -106,21 +105,22 @@ def _of_function(one: Decision) -> dict[str, Any]:
     threshold, budget = one.share * (maximum(values, one.dimension) - lowest), BUDGETS[one.dimension]
     search = searches.by_name(one.search)
     search.reset(one.dimension, one.seed)
+    rule = StoppingRule(threshold)
     trials: list[Trial] = []
     while len(trials) < budget:
         if one.dimension in ENDED_EARLY and _is_out_of_reach(trials, budget):
             return _summary(trials, threshold, decided=False)
-        now = standing(trials, threshold, budget - len(trials))
+        now = rule.decide(trials, budget - len(trials))
         if now.decided:
             return _summary(trials, threshold, decided=True)
-        points = search.ask() if now.uncovered is None else _lot(trials, now.uncovered, budget)
+        points = search.ask() if now.next_point is None else _lot(trials, now.next_point, budget)
         for point in points:
             distance = max(0.0, float(values(point[None])[0]) - lowest)
             search.tell(point[None], [distance])
-            trials.append(_trial(len(trials), "acquisition" if now.uncovered is None else "covering", point, distance))
+            trials.append(_trial(len(trials), "acquisition" if now.next_point is None else "covering", point, distance))
             if distance > threshold:
                 break
-    return _summary(trials, threshold, decided=standing(trials, threshold, 0).decided)
+    return _summary(trials, threshold, decided=rule.decide(trials, 0).decided)
 
 
 def _is_out_of_reach(trials: list[Trial], budget: int) -> bool:
@@ -145,7 +145,9 @@ def _of_system(one: Decision) -> dict[str, Any]:
     threshold, budget = one.share * best_known, BUDGETS[one.dimension]
     campaign = Campaign(experiment.validation, search=searches.by_name(one.search), seed=one.seed)
     campaign.run_until_decided(threshold, budget)
-    return _summary(list(campaign.trials), threshold, decided=standing(campaign.trials, threshold, 0).decided)
+    return _summary(
+        list(campaign.trials), threshold, decided=StoppingRule(threshold).decide(campaign.trials, 0).decided
+    )
 
 
 def _summary(trials: list[Trial], threshold: float, *, decided: bool) -> dict[str, Any]:

@@ -85,5 +85,5 @@ def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
         return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
 
-    for module in ("ctxval.certificates.stopping", "ctxval.certificates.posterior"):
-        monkeypatch.setattr(f"{module}.draw_maxima", fewer)
+    for module in ("stopping", "posterior", "maxima"):
+        monkeypatch.setattr(f"ctxval.certificates.{module}.draw_maxima", fewer)

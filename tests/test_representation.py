@@ -138,6 +138,8 @@ def diagnosis() -> certificates.Diagnosis:
     return certificates.Diagnosis(0.5, 4, 1.1, 0.2, None)
 
 
+BY_POSTERIOR = certificates.CertificateOptions.posterior()
+
 EXAMPLES: dict[str, Callable[[], object]] = {
     "Campaign": campaign,
     "Experiment": lambda: Experiment("pendulum", make_validation(), threshold=0.5, units="rad"),
@@ -198,13 +200,26 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "distances.GoalError": distances.GoalError,
     "distances.MeanDeviation": distances.MeanDeviation,
     "distances.WholeTrajectory": distances.WholeTrajectory,
+    "certificates.Assessment": lambda: certificates.assess(campaign().trials, BY_POSTERIOR),
+    "certificates.Audit": certificates.Audit,
     "certificates.Certificate": lambda: CERTIFICATE,
+    "certificates.CertificateOptions": certificates.CertificateOptions.posterior,
+    "certificates.Convergence": certificates.Convergence,
+    "certificates.Posterior": certificates.Posterior,
+    "certificates.Provenance": lambda: certificates.Provenance(remarks=("fuse replaced",)),
+    "certificates.SamplingDiscarding": lambda: certificates.SamplingDiscarding(2),
+    "certificates.Scenario": certificates.Scenario,
+    "certificates.StoppingDecision": lambda: certificates.StoppingDecision(next_point=np.zeros(3)),
+    "certificates.StoppingRule": lambda: certificates.StoppingRule(0.5, BY_POSTERIOR),
     "certificates.Diagnosis": diagnosis,
     "certificates.Forecast": lambda: certificates.Forecast(12, 0.75, 0.25),
     "certificates.MadeGood": lambda: certificates.MadeGood(3, 7, "fuse replaced"),
     "certificates.Maxima": lambda: certificates.draw_maxima(sample(), draws=12, paths=4),
     "certificates.Options": certificates.Options,
     "certificates.Sample": sample,
+    "certificates.Verdict": lambda: certificates.judge(
+        campaign().trials, 0.01, certificates.CertificateOptions.posterior()
+    ),
     "certificates.TheoremConstants": lambda: certificates.TheoremConstants(1.0, 0.01, 1.0, 1.0, 1.0),
     "testing.FaultyRig": lambda: testing.FaultyRig(systems.Simulated(LINEAR), {3: "raise"}),
 }

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from ctxval import Trial
-from ctxval.certificates.stopping import standing
+from ctxval.certificates import Audit, CertificateOptions
+from ctxval.certificates.stopping import Screening, StoppingRule
 from ctxval.certificates.verdict import judge
+from ctxval.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("few_draws")
 
@@ -18,15 +20,15 @@ def trial(number: int, x: float, distance: float) -> Trial:
 
 def test_a_corner_that_a_trial_is_only_near_to_is_executed_before_anything_is_validated() -> None:
     known = [trial(k, x, 0.1 * np.sin(3 * x)) for k, x in enumerate(np.linspace(0.0, 0.95, 9).tolist())]
-    now = standing(known, 0.9, left=5)
+    now = StoppingRule(0.9).decide(known, left=5)
     assert not now.decided
-    assert now.uncovered is not None
-    assert now.uncovered.tolist() == [1.0]
+    assert now.next_point is not None
+    assert now.next_point.tolist() == [1.0]
     verdict = judge(known, 0.9)
     assert verdict.answer == "undecided"
     assert "1 of the 2 ends of the task parameter's range" in verdict.reason
     # What rises towards the end, and nowhere else, is found there.
-    assert standing([*known, trial(9, 1.0, 1.0)], 0.9, left=4).decided
+    assert StoppingRule(0.9).decide([*known, trial(9, 1.0, 1.0)], left=4).decided
     assert judge([*known, trial(9, 1.0, 1.0)], 0.9).answer == "falsified"
     assert judge([*known, trial(9, 1.0, 0.01)], 0.9).answer == "validated"
 
@@ -36,26 +38,43 @@ def test_corners_of_two_parameters_come_first() -> None:
     known = [replace(trial(k, 0.0, 0.1 * k), unit_point=np.array(point)) for k, point in enumerate(points)]
     asked = []
     while len(known) < 10:
-        now = standing(known, 1e3, left=60)
-        assert now.uncovered is not None
-        asked.append(now.uncovered.tolist())
-        known.append(replace(trial(len(known), 0.0, 0.3), unit_point=now.uncovered))
+        now = StoppingRule(1e3).decide(known, left=60)
+        assert now.next_point is not None
+        asked.append(now.next_point.tolist())
+        known.append(replace(trial(len(known), 0.0, 0.3), unit_point=now.next_point))
     assert sorted(asked) == [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]
 
 
 def test_a_bound_is_put_to_the_test_twice_before_it_decides() -> None:
     known = [trial(k, x, 0.5 + 0.3 * np.sin(9 * x)) for k, x in enumerate([0.0, 0.2, 0.42, 0.6, 0.8, 1.0])]
     for _ in range(2):
-        now = standing(known, 50.0, left=5)
+        now = StoppingRule(50.0).decide(known, left=5)
         assert not now.decided
-        assert now.uncovered is not None
-        x = float(now.uncovered[0])
+        assert now.next_point is not None
+        x = float(now.next_point[0])
         assert min(abs(x - one.unit_point[0]) for one in known) > 0.01
         known.append(trial(len(known), x, 0.5 + 0.3 * np.sin(9 * x)))
-    assert standing(known, 50.0, left=3).decided
+    assert StoppingRule(50.0).decide(known, left=3).decided
     # Without a budget for that, the verdict is what the bound makes it.
-    assert standing(known[:-1], 50.0, left=0).decided
+    assert StoppingRule(50.0).decide(known[:-1], left=0).decided
     # A test that lifts the bound above the threshold leaves it undecided.
     lifted = [*known[:-1], replace(known[-1], distance=49.0)]
-    now = standing(lifted, 50.0, left=3)
+    now = StoppingRule(50.0).decide(lifted, left=3)
     assert not now.decided
+
+
+def test_a_study_can_vary_how_often_a_bound_is_put_to_the_test() -> None:
+    known = [trial(k, x, 0.5 + 0.3 * np.sin(9 * x)) for k, x in enumerate([0.0, 0.2, 0.42, 0.6, 0.8, 1.0])]
+    assert not StoppingRule(50.0).decide(known, left=5).decided
+    assert StoppingRule(50.0, confirmations=0).decide(known, left=5).decided
+
+
+def test_screening_alone_keeps_a_bound_from_being_asked_for() -> None:
+    known = [trial(k, x, 0.5 + 0.3 * np.sin(9 * x)) for k, x in enumerate([0.0, 0.2, 0.42, 0.6, 0.8, 1.0])]
+    never = StoppingRule(50.0, screenings=(Screening(8, -1.0),), confirmations=0)
+    assert not never.decide(known, left=5).decided
+
+
+def test_the_rule_stops_by_the_posterior_bound_alone() -> None:
+    with pytest.raises(InputError, match="needs the posterior bound, got 'audit'"):
+        StoppingRule(50.0, CertificateOptions(Audit()))

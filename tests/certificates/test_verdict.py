@@ -8,20 +8,23 @@ import pytest
 from ctxval import TaskSpace, Trial
 from ctxval.certificates import (
     Certificate,
+    CertificateOptions,
+    Provenance,
     Sample,
     certify_audit,
     certify_posterior,
     certify_scenario,
 )
 from ctxval.certificates.covering import resolved_volume
-from ctxval.certificates.stopping import standing
-from ctxval.certificates.verdict import counterexample, judge, judge_by, remarks_on, require_threshold
-from ctxval.core.trial import Change, Origin, State
+from ctxval.certificates.stopping import StoppingRule
+from ctxval.certificates.verdict import counterexample, judge, judge_by, require_threshold
+from ctxval.core.trial import Origin, State
 from ctxval.errors import CertificateError, InputError
 
 pytestmark = pytest.mark.usefixtures("few_draws")
 
 WORST = 1.0
+posterior = CertificateOptions.posterior
 
 
 def trial(
@@ -66,7 +69,7 @@ def test_a_distance_at_the_threshold_is_no_counterexample_and_neither_is_a_failu
 def test_a_threshold_is_a_positive_number(threshold: object) -> None:
     with pytest.raises(InputError, match="positive number"):
         require_threshold(threshold)  # type: ignore[arg-type]
-    for function in (counterexample, judge, lambda known, tau: standing(known, tau, 0)):
+    for function in (counterexample, judge, lambda known, tau: StoppingRule(tau).decide(known, 0)):
         with pytest.raises(InputError, match="positive number"):
             function(trials(), threshold)  # type: ignore[operator]
 
@@ -133,7 +136,7 @@ def test_the_posterior_bound_validates_what_is_far_above_it() -> None:
 def test_a_counterexample_needs_no_certificate_and_no_model() -> None:
     known = [*trials(3), trial(3, 0.7, None), trial(4, 0.8, None, state="open")]
     assert judge(known, 0.5).answer == "falsified"
-    assert standing(known, 0.5, 0).decided
+    assert StoppingRule(0.5).decide(known, 0).decided
 
 
 def test_undecided_says_what_more_would_take() -> None:
@@ -145,7 +148,7 @@ def test_undecided_says_what_more_would_take() -> None:
     assert verdict.expected is not None
     assert verdict.expected.executions is None or verdict.expected.executions >= 1
     assert "more executions are expected to decide" in verdict.reason
-    assert not standing(known, tau, 0).decided
+    assert not StoppingRule(tau).decide(known, 0).decided
 
 
 def test_a_bound_that_is_withdrawn_is_not_forecast() -> None:
@@ -154,7 +157,7 @@ def test_a_bound_that_is_withdrawn_is_not_forecast() -> None:
     assert verdict.answer == "undecided"
     assert "withdrawn" in verdict.reason
     assert verdict.expected is None
-    assert not standing(known, 1e6, 0).decided
+    assert not StoppingRule(1e6).decide(known, 0).decided
 
 
 @pytest.mark.parametrize(
@@ -171,18 +174,18 @@ def test_where_nothing_can_be_certified_the_verdict_is_open_and_says_why(known: 
     verdict = judge(known, 5.0)
     assert verdict.answer == "undecided"
     assert sentence in verdict.reason
-    assert sentence == "are open" or not standing(known, 5.0, 0).decided
+    assert sentence == "are open" or not StoppingRule(5.0).decide(known, 0).decided
 
 
 def test_a_confidence_beyond_the_draws_is_undecided_and_one_that_is_none_is_refused() -> None:
-    verdict = judge(trials(), 50.0, confidence=1 - 1e-9)
+    verdict = judge(trials(), 50.0, posterior(1 - 1e-9))
     assert verdict.answer == "undecided"
     assert "needs more than" in verdict.reason
     for tau, confidence in ((50.0, 1.5), (0.5, 0.0)):
         with pytest.raises(CertificateError, match="strictly between 0 and 1"):
-            judge(trials(), tau, confidence=confidence)
+            judge(trials(), tau, posterior(confidence))
         with pytest.raises(CertificateError, match="strictly between 0 and 1"):
-            standing(trials(), tau, 0, confidence=confidence)
+            StoppingRule(tau, posterior(confidence)).decide(trials(), 0)
 
 
 @pytest.mark.parametrize("stochastic", [False, True])
@@ -191,25 +194,27 @@ def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> No
     upper = certify_posterior(Sample.of(known), 0.95, stochastic=stochastic).upper_bound
     best = max(t.distance or 0.0 for t in known)
     for threshold in (0.9 * best, 1.02 * upper, best + 0.2 * (upper - best)):
-        verdict = judge(known, threshold, stochastic=stochastic)
-        assert standing(known, threshold, 0, stochastic=stochastic).decided == (verdict.answer != "undecided")
+        verdict = judge(known, threshold, posterior(stochastic=stochastic))
+        assert StoppingRule(threshold, posterior(stochastic=stochastic)).decide(known, 0).decided == (
+            verdict.answer != "undecided"
+        )
 
 
 def test_what_nothing_came_near_to_is_missing_where_the_bound_keeps_the_threshold() -> None:
     known = [one for one in trials(9) if not 0.3 < one.unit_point[0] < 0.7]
-    now = standing(known, 50.0, left=1)
+    now = StoppingRule(50.0).decide(known, left=1)
     assert not now.decided
-    assert now.uncovered is not None
-    assert now.uncovered[0] == pytest.approx(0.5, abs=0.01)
+    assert now.next_point is not None
+    assert now.next_point[0] == pytest.approx(0.5, abs=0.01)
     assert "1 more executions would come near" in judge(known, 50.0).reason
     # Being executed is as good as covered.
     pending = [*known, trial(9, 0.5, None, state="open")]
-    challenged = standing(pending, 50.0, left=1)
-    assert challenged.uncovered is not None
-    assert abs(challenged.uncovered[0] - 0.5) > 0.01
+    challenged = StoppingRule(50.0).decide(pending, left=1)
+    assert challenged.next_point is not None
+    assert abs(challenged.next_point[0] - 0.5) > 0.01
     # Neither where the budget does not suffice, nor where the bound is too high, is an execution spent on it.
-    assert standing(known, 50.0, left=0).uncovered is None
-    assert standing(known, max(t.distance or 0.0 for t in known) * 1.0001, left=1).uncovered is None
+    assert StoppingRule(50.0).decide(known, left=0).next_point is None
+    assert StoppingRule(max(t.distance or 0.0 for t in known) * 1.0001).decide(known, left=1).next_point is None
 
 
 def test_a_reason_does_not_round_its_comparison_away() -> None:
@@ -227,9 +232,9 @@ def test_a_reason_does_not_round_its_comparison_away() -> None:
 def test_a_resolution_that_is_no_positive_number_is_refused_before_anything_is_said(resolution: float) -> None:
     for trials_of in (trials(), [trial(0, 0.5, 9.0)]):  # a counterexample among them or not
         with pytest.raises(CertificateError, match="resolution must be a positive number"):
-            judge(trials_of, 1.0, resolution=resolution)
+            judge(trials_of, 1.0, posterior(resolution=resolution))
         with pytest.raises(CertificateError, match="resolution must be a positive number"):
-            standing(trials_of, 1.0, 5, resolution=resolution)
+            StoppingRule(1.0, posterior(resolution=resolution)).decide(trials_of, 5)
 
 
 def test_a_failure_that_was_made_good_counts_no_more() -> None:
@@ -264,9 +269,9 @@ def test_a_failed_draw_stays_one_whatever_came_later() -> None:
 @pytest.mark.parametrize("confidence", [0.1, 0.49])
 def test_a_confidence_below_a_half_is_refused(confidence: float) -> None:
     with pytest.raises(InputError, match="wrong more often than right"):
-        judge(trials(), 50.0, confidence)
+        judge(trials(), 50.0, posterior(confidence))
     with pytest.raises(InputError, match="wrong more often than right"):
-        standing(trials(), 50.0, 0, confidence)
+        StoppingRule(50.0, posterior(confidence)).decide(trials(), 0)
     with pytest.raises(InputError, match="wrong more often than right"):
         judge_by(replace(certificate(1.0), confidence=confidence), trials(), 50.0)
 
@@ -276,16 +281,19 @@ def test_a_volume_of_most_of_the_tasks_is_refused() -> None:
         judge_by(certificate(1.0, volume=0.05), trials(), 1.2, volume=0.99)
 
 
-SPACE = TaskSpace(goal=(0.0, 2.0, "rad"))
+IN_SPACE = Provenance(TaskSpace(goal=(0.0, 2.0, "rad")))
 
 
 def test_a_resolution_other_than_the_usual_one_stands_in_the_verdict_in_the_units_of_the_task() -> None:
-    usual = judge(trials(), 50.0, space=SPACE)
+    usual = judge(trials(), 50.0, provenance=IN_SPACE)
     assert "resolution" not in usual.reason
-    coarse = judge(trials(), 50.0, resolution=0.25, space=SPACE)
+    coarse = judge(trials(), 50.0, posterior(resolution=0.25), IN_SPACE)
     assert "to a resolution of 0.5 rad in goal, 50 % of the task space (0.25 diagonals; usual: 0.125)" in coarse.reason
-    assert "to a resolution of 0.25 of each parameter's range, 50 %" in judge(trials(), 50.0, resolution=0.25).reason
-    none = judge(trials(), 50.0, resolution=1, space=SPACE)
+    assert (
+        "to a resolution of 0.25 of each parameter's range, 50 %"
+        in judge(trials(), 50.0, posterior(resolution=0.25)).reason
+    )
+    none = judge(trials(), 50.0, posterior(resolution=1), IN_SPACE)
     assert "whole regions without a trial taken to be like the rest (1 diagonals; usual: 0.125)" in none.reason
 
 
@@ -297,13 +305,13 @@ def test_a_quarter_of_the_diagonal_is_39_percent_of_a_plane() -> None:
 
 
 def test_a_validation_names_what_it_rests_on() -> None:
-    verdict = judge(trials(), 50.0, space=SPACE)
+    verdict = judge(trials(), 50.0, provenance=IN_SPACE)
     assert verdict.rests_on == (
         "It rests on the distance being as smooth between the trials as at them, to a resolution of 0.25 rad in goal "
         "(a peak inside a gap of that radius, 25 % of the task space, may be missed); on each task having one "
         "distance, however often it is executed; on this campaign not being chosen among several."
     )
-    noisy = judge(trials(), 50.0, stochastic=True, space=SPACE)
+    noisy = judge(trials(), 50.0, posterior(stochastic=True), IN_SPACE)
     assert noisy.rests_on is not None
     assert "single executions may exceed it" in noisy.rests_on
     assert judge(trials(), 0.5).rests_on is None
@@ -326,27 +334,14 @@ def test_a_threshold_within_the_error_of_the_bound_is_undecided() -> None:
 
 
 def test_the_error_is_in_the_verdict_of_the_posterior() -> None:
-    verdict = judge(trials(5), 50.0, resolution=1)
+    verdict = judge(trials(5), 50.0, posterior(resolution=1))
     assert verdict.certificate is not None
     assert verdict.certificate.error > 0
     assert "±" in verdict.reason
 
 
 def test_remarks_are_among_the_assumptions() -> None:
-    verdict = judge(trials(), 50.0, remarks=["S was changed after trial 3: oil"])
+    verdict = judge(trials(), 50.0, provenance=Provenance(remarks=("S was changed after trial 3: oil",)))
     assert verdict.certificate is not None
     assert verdict.certificate.assumptions[-1] == "S was changed after trial 3: oil"
     assert any("several is wrong more often" in sentence for sentence in verdict.certificate.assumptions)
-
-
-def test_what_was_changed_in_a_store_is_remarked() -> None:
-    changes = [
-        Change("described anew", "made by an older version", {}),
-        Change("accepted", "gripper replaced", {"differences": ["x was 1 and is now 2", "y is new"], "trials": 7}),
-        Change("remeasured", "another norm", {"before": {}}),
-    ]
-    assert remarks_on(changes) == (
-        "what was changed after 7 trials makes no difference to them, as you state: 'gripper replaced' (x was 1 and is "
-        "now 2)",
-        "the distances are those measured anew: 'another norm'",
-    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -87,17 +87,25 @@ class Registry(Mapping[str, Any]):
         package: the package that exports the parts; the group of the entry points has the same name.
         method: the method that each part has; None if parts are plain functions.
         modules: built-in parts that are imported when they are asked for: name -> ``module:attr``.
+        parts: the built-in parts; by default those that the package exports and ``@part`` declares.
 
     Attributes:
         aliases: older names of built-in parts, each with the present name.
     """
 
     def __init__(
-        self, kind: str, package: str, *, method: str | None = None, modules: Mapping[str, str] | None = None
+        self,
+        kind: str,
+        package: str,
+        *,
+        method: str | None = None,
+        modules: Mapping[str, str] | None = None,
+        parts: Iterable[Any] | None = None,
     ) -> None:
         self.kind, self.group, self.method = kind, package, method
         exported = vars(sys.modules[package])
-        found = [exported[name] for name in exported["__all__"] if declaration_of(exported.get(name)) is not None]
+        named = (exported.get(name) for name in exported["__all__"]) if parts is None else parts
+        found = [one for one in named if declaration_of(one) is not None]
         self._built_in: dict[str, Any] = {_declarations[one].name: one for one in found}
         self._modules = dict(modules or {})
         self.aliases = {alias: _declarations[one].name for one in found for alias in _declarations[one].aliases}

@@ -6,7 +6,7 @@ import concurrent.futures as cf
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,9 +16,8 @@ from ctxval._util.texts import text_of
 from ctxval.campaign import display
 from ctxval.campaign.ledger import Ledger, OpenTrial
 from ctxval.campaign.workers import Crew, Ended, crew
-from ctxval.certificates import RESOLUTION
-from ctxval.certificates.stopping import standing
-from ctxval.certificates.verdict import CONFIDENCE, Verdict, judge, remarks_on, require_threshold
+from ctxval.certificates import RESOLUTION, CertificateOptions, Provenance, StoppingRule, Verdict, judge
+from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError, ExecutionError, InputError
@@ -85,22 +84,23 @@ class Campaign(Ledger):
         *,
         stochastic: bool = False,
         resolution: float = RESOLUTION,
+        certificate: CertificateOptions | None = None,
     ) -> Verdict:
         """Return whether M may be trusted up to a threshold tau, in the distance's units.
 
-        Falsified by an executed counterexample, validated by the posterior bound with this confidence, undecided
-        otherwise; then it says what is expected to decide.
+        Falsified by an executed counterexample, validated by a certificate with this confidence, undecided otherwise;
+        then it says what is expected to decide.
 
         Args:
             threshold: tau.
             confidence: of a validation.
             stochastic: whether two executions of one task may differ.
             resolution: how far from every trial a task may be, in diagonals of the task space, for a validation.
+            certificate: by which certificate, in place of the posterior bound with these options.
         """
-        space, said = self.validation.space, remarks_on(self.store.history())
-        return judge(
-            self.trials, threshold, confidence, stochastic=stochastic, resolution=resolution, space=space, remarks=said
-        )
+        chosen = certificate or CertificateOptions.posterior(confidence, stochastic=stochastic, resolution=resolution)
+        known = Provenance.of(self.store.description(), self.store.history())
+        return judge(self.trials, threshold, chosen, replace(known, space=self.validation.space))
 
     def surrogate(self) -> Surrogate:
         """Return the GP of the distance over the task space, whichever search chose the trials.
@@ -170,34 +170,37 @@ class Campaign(Ledger):
         confidence: float = CONFIDENCE,
         stochastic: bool = False,
         resolution: float = RESOLUTION,
+        certificate: CertificateOptions | None = None,
         workers: int | None = None,
         executor: cf.Executor | None = None,
         timeout: float | None = None,
     ) -> Campaign:
         """Execute until the verdict on a threshold is reached, or the budget is spent.
 
-        Where the posterior bound keeps the threshold, and only tasks that nothing came near to stand in the way, those
-        are executed, as long as the budget suffices for all of them; otherwise what the search chooses.
+        If the posterior bound keeps the threshold, and only tasks that nothing came near to stand in the way, those
+        are executed, as long as the budget suffices for all of them; otherwise the search chooses the next task.
 
         Args:
             threshold: tau, in the distance's units.
             budget: total number of executions of S, at most.
             on_trial: called with each trial that has ended.
-            confidence, stochastic, resolution: as in :meth:`verdict`.
+            confidence, stochastic, resolution, certificate: as in :meth:`verdict`; it must be the posterior bound.
             workers, executor, timeout: as in :meth:`run`.
 
         Raises:
             InputError, ModelError, DesignError, DistanceError, CampaignError: as :meth:`run` does.
             CertificateError: the confidence is not a probability.
         """
-        tau = require_threshold(threshold)
+        rule = StoppingRule(
+            threshold,
+            certificate or CertificateOptions.posterior(confidence, stochastic=stochastic, resolution=resolution),
+        )
 
         def chosen() -> OpenTrial | None:
-            left = budget - self.executions
-            now = standing(self.trials, tau, left, confidence, stochastic=stochastic, resolution=resolution)
+            now = rule.decide(self.trials, budget - self.executions)
             if now.decided:
                 return None
-            return self._open(None if now.uncovered is None else (now.uncovered, "covering"), attempts=1)
+            return self._open(None if now.next_point is None else (now.next_point, "covering"), attempts=1)
 
         hands = self._crew(workers, executor, timeout)
         return self._carry_out(self._within(budget, chosen, 0), hands, on_trial, _Patience())

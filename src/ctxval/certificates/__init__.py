@@ -1,7 +1,11 @@
-"""Certificates: statements on d*, each with its assumptions."""
+"""Certificates: statements on d*, each with its assumptions, and the verdicts that rest on them."""
 
-from ctxval.certificates.base import PLANNED, Certificate, MadeGood, Sample
-from ctxval.certificates.convergence import TheoremConstants, certify_convergence, rate
+from typing import TYPE_CHECKING, Any
+
+from ctxval.certificates.assessment import Assessment, assess
+from ctxval.certificates.audit import Audit, certify_audit
+from ctxval.certificates.base import Certificate, CertificateKind
+from ctxval.certificates.convergence import Convergence, TheoremConstants, certify_convergence, rate
 from ctxval.certificates.covering import (
     RESOLUTION,
     bare_corners,
@@ -12,23 +16,52 @@ from ctxval.certificates.covering import (
 )
 from ctxval.certificates.diagnostics import Diagnosis, diagnose
 from ctxval.certificates.forecast import Forecast, forecast
-from ctxval.certificates.named import KINDS, USES, Options, certify, require_possible, require_use
-from ctxval.certificates.posterior import Maxima, certify_posterior, draw_maxima, instantaneous_bound, settle_maxima
-from ctxval.certificates.scenario import certify_audit, certify_scenario, samples_needed, tail, volume_bound
+from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
+from ctxval.certificates.options import CertificateOptions
+from ctxval.certificates.posterior import Posterior, certify_posterior, instantaneous_bound
+from ctxval.certificates.provenance import Provenance
+from ctxval.certificates.registry import KINDS, Options, certify, require_possible, require_use
+from ctxval.certificates.sample import PLANNED, MadeGood, Sample
+from ctxval.certificates.scenario import (
+    SamplingDiscarding,
+    Scenario,
+    certify_scenario,
+    samples_needed,
+    tail,
+    volume_bound,
+)
+from ctxval.certificates.stopping import StoppingDecision, StoppingRule
+from ctxval.certificates.verdict import Verdict, judge, judge_by
+
+if TYPE_CHECKING:
+    USES: dict[str, tuple[str, ...]]
 
 __all__ = [
     "KINDS",
     "PLANNED",
     "RESOLUTION",
     "USES",
+    "Assessment",
+    "Audit",
     "Certificate",
+    "CertificateKind",
+    "CertificateOptions",
+    "Convergence",
     "Diagnosis",
     "Forecast",
     "MadeGood",
     "Maxima",
     "Options",
+    "Posterior",
+    "Provenance",
     "Sample",
+    "SamplingDiscarding",
+    "Scenario",
+    "StoppingDecision",
+    "StoppingRule",
     "TheoremConstants",
+    "Verdict",
+    "assess",
     "bare_corners",
     "certify",
     "certify_audit",
@@ -41,6 +74,8 @@ __all__ = [
     "farthest_task",
     "forecast",
     "instantaneous_bound",
+    "judge",
+    "judge_by",
     "most_contested",
     "rate",
     "require_possible",
@@ -51,3 +86,11 @@ __all__ = [
     "tail",
     "volume_bound",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Return ``USES``, which kinds have a use for each option: all kinds are imported for it."""
+    if name != "USES":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    options = [option for name in KINDS.imported for option in KINDS.find(name).options()]
+    return {option: KINDS.with_option(option) for option in options}

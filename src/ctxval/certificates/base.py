@@ -1,261 +1,44 @@
-"""What every certificate says of itself."""
+"""What every certificate says, and what every kind of certificate must be able to do."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-import numpy as np
-
-from ctxval._util.arrays import Array
 from ctxval._util.representation import Shown, call, line, lines, record, table
-from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
-from ctxval.errors import CertificateError
+from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
+from ctxval.certificates.sample import Sample
+from ctxval.core.space import TaskSpace
+from ctxval.core.trial import Origin
 from ctxval.version import VERSION
 
-PLANNED = "draws"
-"""What a note of an independent draw calls the number of draws that there were to be in all."""
+if TYPE_CHECKING:
+    from ctxval.certificates.forecast import Forecast
 
-_SAME_TASK = 1e-9
-"""How far points of the unit cube may be apart that are one task: parameters are scaled there and back."""
+ONE_CAMPAIGN = "this campaign was fixed beforehand: the best of several is wrong more often than stated"
+"""What every certificate assumes."""
 
-
-@dataclass(frozen=True)
-class MadeGood:
-    """A failure whose task was executed with success later.
-
-    Attributes:
-        trial: number of the trial that failed.
-        by: number of the one that succeeded.
-        because: what was changed on the system in between; None if nobody stated it.
-    """
-
-    trial: int
-    by: int
-    because: str | None
-
-    def __repr__(self) -> str:
-        return record(self)
+_INDENT = "\n  "
+"""Before further lines of a text, so that none looks like a line of the certificate."""
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """Executed trials, as far as a certificate may know of them: numbers and why they were chosen.
-
-    Attributes:
-        points: of the unit cube, shape ``(n, d)``.
-        distances: shape ``(n,)``; NaN where the execution failed.
-        origins: n reasons why a trial was chosen.
-        states: n states; open trials are refused by every certificate.
-        numbers: of the trials, for messages; 0, 1, ... by default.
-        planned: for each trial, how many independent draws there were to be in all when it was drawn; 0 if they were to
-            end with the verdict, None if that is not known.
-        made_good: failures that are left out, because their tasks were executed with success later.
-
-    Raises:
-        CertificateError: the parts do not fit together, or a trial is still open.
-    """
-
-    points: Array
-    distances: Array
-    origins: Sequence[Origin]
-    states: Sequence[State]
-    numbers: Sequence[int] = ()
-    planned: Sequence[int | None] = ()
-    made_good: tuple[MadeGood, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not len(self.numbers):
-            object.__setattr__(self, "numbers", range(len(self.points)))
-        if not len(self.planned):
-            object.__setattr__(self, "planned", [None] * len(self.points))
-        parts = (self.points, self.distances, self.origins, self.states, self.numbers, self.planned)
-        lengths = {len(part) for part in parts}
-        if len(lengths) != 1:
-            raise CertificateError(
-                f"points, distances, origins, states, numbers and planned must be equally many, got {sorted(lengths)}."
-            )
-        if "open" in self.states:
-            waiting = [str(n) for n, state in zip(self.numbers, self.states, strict=True) if state == "open"]
-            raise CertificateError(f"trials are open: {', '.join(waiting)}; tell how they ended before certifying.")
-
-    def __len__(self) -> int:
-        return len(self.distances)
-
-    @classmethod
-    def of(cls, trials: Sequence[Trial]) -> Sample:
-        """Return what a certificate may know of trials; a task that failed before its execution has failed as well.
-
-        A failure does not count if the same task was executed with success later, except for independent draws. Trials
-        that people chose or imported come in an order of no meaning, and are sorted by their tasks.
-
-        Raises:
-            CertificateError: there is none, or one is still open.
-        """
-        if not trials:
-            raise CertificateError("nothing was executed yet, so nothing can be certified.")
-        good = _made_good(trials)
-        left_out = {one.trial for one in good} | _measured_later(trials)
-        count = _in_order([trial for trial in trials if trial.number not in left_out])
-        return cls(
-            np.array([trial.unit_point for trial in count]),
-            np.array([np.nan if trial.distance is None else trial.distance for trial in count]),
-            [trial.origin for trial in count],
-            [trial.state for trial in count],
-            [trial.number for trial in count],
-            [_planned(trial) for trial in count],
-            good,
-        )
-
-    def only(self, origin: Origin) -> Sample:
-        """Return the trials of one origin."""
-        return self.rows([row for row, own in enumerate(self.origins) if own == origin])
-
-    def rows(self, rows: Sequence[int]) -> Sample:
-        """Return some of the trials."""
-        chosen = list(rows)
-        return Sample(
-            self.points[chosen],
-            self.distances[chosen],
-            [self.origins[row] for row in chosen],
-            [self.states[row] for row in chosen],
-            [self.numbers[row] for row in chosen],
-            [self.planned[row] for row in chosen],
-            self.made_good,
-        )
-
-    @property
-    def best(self) -> float:
-        """The largest distance; minus infinity where none is known."""
-        return float(np.nanmax(self.distances, initial=-np.inf))
-
-    @property
-    def failed(self) -> int:
-        """How many trials have no distance: they failed, or could not be measured."""
-        return int(np.isnan(self.distances).sum())
-
-    def numbers_of(self, state: State) -> list[int]:
-        """Return the numbers of the trials in a state."""
-        return [number for number, own in zip(self.numbers, self.states, strict=True) if own == state]
-
-    @property
-    def failures(self) -> dict[str, list[Any]]:
-        """What failed, what could not be measured and what was made good, ready for JSON."""
-        return {
-            "failed": self.numbers_of("failed"),
-            "unmeasured": self.numbers_of("unmeasured"),
-            "made_good": [asdict(one) for one in self.made_good],
-        }
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Sentences on what failed, what could not be measured and what was made good."""
-        failed, unmeasured = self.numbers_of("failed"), self.numbers_of("unmeasured")
-        found = [f"{listed(failed)} failed, and no distance is known there"] if failed else []
-        if unmeasured:
-            found.append(f"{listed(unmeasured)} {_was(unmeasured)} executed, but the distance could not be measured")
-        causes = dict.fromkeys((one.by, one.because) for one in self.made_good)
-        for by, because in causes:
-            which = listed([one.trial for one in self.made_good if one.by == by])
-            why = "nobody stated why" if because is None else f"you state why: {because!r}"
-            found.append(f"{which} failed, and trial {by} executed the same task with success; {why}")
-        return tuple(found)
-
-    def __repr__(self) -> str:
-        return call(self, len(self), best=self.best, failed=self.failed, points=self.points)
-
-
-_LISTED = 5
-"""Numbers of trials that a message has at most."""
-
-
-def listed(numbers: Sequence[int]) -> str:
-    """Return numbers of trials as text, the first few of many."""
-    first = ", ".join(map(str, numbers[:_LISTED])) + (", ..." if len(numbers) > _LISTED else "")
-    return f"trial {first}" if len(numbers) == 1 else f"{len(numbers)} trials ({first})"
-
-
-def remeasure(sample: Sample) -> str:
-    """Return what to do about trials that were executed but not measured, as a sentence after another one."""
-    unmeasured = sample.numbers_of("unmeasured")
-    if not unmeasured:
-        return ""
-    what = listed(unmeasured)
-    return (
-        f" {what[0].upper()}{what[1:]} {_was(unmeasured)} executed, but the distance could not be measured: mend the "
-        "distance, and `ctxval remeasure STORE` measures what was recorded; what was not is to be executed again."
-    )
-
-
-def _was(numbers: Sequence[int]) -> str:
-    return "was" if len(numbers) == 1 else "were"
-
-
-def _planned(trial: Trial) -> int | None:
-    """Return how many independent draws there were to be when a trial was drawn; 0 if the verdict was to end them."""
-    planned = (trial.note or {}).get(PLANNED) if trial.origin == "iid" else None
-    return planned if isinstance(planned, int) else None
-
-
-def _in_order(trials: list[Trial]) -> list[Trial]:
-    """Return trials with those of no meaningful order sorted, each in the place of another one of them."""
-    places = [place for place, trial in enumerate(trials) if trial.origin == "manual"]
-    ordered = sorted(
-        (trials[place] for place in places),
-        key=lambda trial: (trial.unit_point.tolist(), np.inf if trial.distance is None else trial.distance),
-    )
-    found = list(trials)
-    for place, trial in zip(places, ordered, strict=True):
-        found[place] = trial
-    return found
-
-
-def _measured_later(trials: Sequence[Trial]) -> set[int]:
-    """Return the trials whose distance was told alone, in another definition, and whose tasks were executed again."""
-    known = [trial.unit_point for trial in trials if trial.distance is not None]
-    waiting = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
-    if not known or not waiting:
-        return set()
-    gaps = (np.abs(np.array(known) - trial.unit_point).max(axis=1).min() for trial in waiting)
-    return {trial.number for trial, gap in zip(waiting, gaps, strict=True) if gap <= _SAME_TASK}
-
-
-def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
-    """Return the trials that failed, but whose tasks were executed with success later.
-
-    Of several successes that is one whose reason was stated, if there is one, or else the first.
-    """
-    known = [trial for trial in trials if trial.distance is not None]
-    failed = [trial for trial in trials if trial.state == "failed" and trial.origin != "iid"]
-    if not known or not failed:
-        return ()
-    points, numbers = np.array([trial.unit_point for trial in known]), np.array([trial.number for trial in known])
-    found = []
-    for trial in failed:
-        same = (np.abs(points - trial.unit_point).max(axis=1) <= _SAME_TASK) & (numbers > trial.number)
-        later = [known[row] for row in np.flatnonzero(same)]
-        if later:
-            by = next((one for one in later if one.because), later[0])
-            found.append(MadeGood(trial.number, by.number, by.because))
-    return tuple(found)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Certificate:
-    """A statement on d*, with everything it rests on.
+    """A statement on d*, with everything it rests on; as text, what the command line prints of it.
 
     Attributes:
-        kind: which theory.
+        kind: the name of its :class:`CertificateKind`.
         statement: what it says, in one sentence.
         upper_bound: h, in the distance's units.
         confidence: the probability of the statement, over what ``assumptions`` say is random.
-        volume: the share of the task space that the statement leaves out; 0 where it covers all of it.
+        volume: the share of the task space that the statement leaves out; 0 if it covers all of it.
         trials: n.
         assumptions: what must hold, in plain words.
         details: the numbers behind it.
-        doubt: why it is withdrawn, where the trials speak against what it assumes; a user must not believe it then.
-        error: standard error of ``upper_bound`` where it is computed from random draws, in the distance's units.
+        doubt: why it is withdrawn, if the trials speak against what it assumes; a user must not believe it then.
+        error: standard error of ``upper_bound`` if it is computed from random draws, in the distance's units.
         version: of ctxval.
     """
 
@@ -283,6 +66,24 @@ class Certificate:
         """Return everything, ready for JSON."""
         return asdict(self)
 
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """The numbers that are shown to people; failures are among the assumptions."""
+        shown = {name: value for name, value in self.details.items() if name != "failures"}
+        return {**shown, "trials": self.trials, "version": self.version}
+
+    def __str__(self) -> str:
+        return "\n".join(one.replace("\r\n", "\n").replace("\n", _INDENT) for one in self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        yield f"{self.kind}: {self.statement}"
+        if self.doubt is not None:
+            yield f"withdrawn: {self.doubt}."
+        yield "It assumes that"
+        yield from (f"- {assumption};" for assumption in self.assumptions)
+        width = max(map(len, self.numbers))
+        yield from (f"{name.replace('_', ' '):{width}}  {as_text(value)}" for name, value in self.numbers.items())
+
     def __repr__(self) -> str:
         bound, volume = Shown(with_error(self.upper_bound, self.error)), Shown(at_most(self.volume, 3))
         head = call(self, self.kind, upper_bound=bound, confidence=self.confidence, volume=volume, trials=self.trials)
@@ -305,44 +106,82 @@ class Certificate:
         )
 
 
-ERRORS = 2.0
-"""Standard errors of a computed bound by which it must keep a threshold."""
+@dataclass(frozen=True)
+class CertificateKind(ABC):
+    """A kind of certificate. Its fields are its options: what it must be told besides the trials and the confidence.
 
-ONE_CAMPAIGN = "this campaign was fixed beforehand: the best of several is wrong more often than stated"
-"""What every certificate assumes."""
-
-
-def with_error(upper: float, error: float) -> str:
-    """Return a bound and its standard error as text, both rounded up, with the digits that the error supports."""
-    if not error > 0 or not np.isfinite(error + upper):
-        return at_most(upper)
-    high, low = _place(upper or error), _place(error)
-    # Two digits of an error that starts with 1, and never more than four of the bound.
-    last = max(low - (error < 2 * 10.0**low), high - 3)
-    if error < 10.0**last:
-        return at_most(upper)
-    return f"{at_most(upper, max(high - last + 1, 1))} ± {at_most(error, max(low - last + 1, 1))}"
-
-
-def _place(value: float) -> int:
-    """Return the power of ten of a number's first digit."""
-    return int(np.floor(np.log10(abs(value))))
-
-
-def at_most(value: float, digits: int = 4) -> str:
-    """Return a bound as text, rounded up: what is printed must not be smaller than what holds."""
-    short = f"{value:.{digits}g}"
-    if float(short) >= value or not np.isfinite(value):
-        return short
-    return f"{value + 10.0 ** (np.floor(np.log10(abs(value))) - digits + 1):.{digits}g}"
-
-
-def require_probability(name: str, value: float) -> float:
-    """Return a probability strictly between 0 and 1.
-
-    Raises:
-        CertificateError: it is not.
+    A kind is a frozen dataclass with a name and a method that makes a certificate of trials. The other methods say what
+    a verdict by it rests on, and refuse what cannot succeed before it is paid for; their defaults suit a bound on d*
+    that is computed from the distances alone. A kind that needs numbers which the trials do not carry takes them as a
+    field; draws of d* under a learned model of the dynamics are such numbers.
     """
-    if not 0 < value < 1:
-        raise CertificateError(f"{name} must be strictly between 0 and 1, got {value!r}.")
-    return float(value)
+
+    name: ClassVar[str]
+    """What it is called in files, on the command line and on its certificates."""
+
+    bounds_maximum: ClassVar[bool] = True
+    """Whether it bounds d* itself. Otherwise it leaves out a volume of the task space, which a user must accept."""
+
+    @classmethod
+    def options(cls) -> tuple[str, ...]:
+        """Return the names of what may be stated for it: its fields, and ``volume`` if it leaves one out."""
+        own = tuple(one.name for one in fields(cls))
+        return own if cls.bounds_maximum else (*own, "volume")
+
+    @classmethod
+    def of(cls, stated: Mapping[str, Any]) -> Self:
+        """Return it with those of the options that are its own; what is None or missing has its default."""
+        return cls(**{one.name: stated[one.name] for one in fields(cls) if stated.get(one.name) is not None})
+
+    @abstractmethod
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return the certificate of trials.
+
+        Raises:
+            CertificateError: its theory does not allow these trials, or an option that it needs is missing.
+        """
+
+    def certify_against(
+        self, sample: Sample, threshold: float, confidence: float = 0.95
+    ) -> tuple[Certificate, Forecast | None]:
+        """Return the certificate as exact as a threshold asks for, and what is expected of further executions.
+
+        The forecast is None if the threshold is kept, or nothing can be foreseen.
+
+        Raises:
+            CertificateError: as :meth:`certify` does.
+        """
+        return self.certify(sample, confidence), None
+
+    def require_audit_helps(self, origins: Iterable[Origin]) -> None:  # noqa: B027 (most kinds can use draws)
+        """Make sure, before independent draws are executed, that this certificate could use them.
+
+        Args:
+            origins: of the trials that there are already.
+
+        Raises:
+            CertificateError: it could not, however they come out.
+        """
+
+    @classmethod
+    def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
+        """Return what a validation by its certificate rests on: ends of a sentence that begins with "It rests on".
+
+        Args:
+            certificate: one of this kind.
+            space: the tasks, to tell lengths in their units.
+        """
+        return ["what its certificate assumes"]
+
+    @classmethod
+    def qualification(cls, certificate: Certificate, space: TaskSpace | None = None) -> str:
+        """Return what a validation says of options that are not the usual ones: the end of a sentence, or nothing."""
+        return ""
+
+    @classmethod
+    def shortfall(cls, certificate: Certificate) -> str:
+        """Return why the volume left out is larger than it might be: the end of a sentence, or nothing."""
+        return ""
+
+    def __repr__(self) -> str:
+        return record(self)

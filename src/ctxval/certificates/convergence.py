@@ -13,13 +13,19 @@ gamma_n = O((log n)^(|P|+1)).
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Literal
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from typing import ClassVar, Literal
 
 import numpy as np
 
-from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, Sample, at_most, require_probability
-from ctxval.errors import CertificateError
+from ctxval._util.registry import part
+from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
+from ctxval.certificates.bounds import at_most, require_probability
+from ctxval.certificates.sample import Sample
+from ctxval.core.space import TaskSpace
+from ctxval.core.trial import Origin
+from ctxval.errors import CertificateError, InputError
 
 KernelName = Literal["matern-3/2", "matern-5/2", "squared-exponential"]
 
@@ -27,6 +33,7 @@ _FIXED = ("GPUCB",)
 """Searches with a fixed beta and with hyperparameters that are estimated."""
 
 _SMOOTHNESS: dict[str, float] = {"matern-3/2": 1.5, "matern-5/2": 2.5}
+"""nu of the kernels that have one."""
 
 
 def rate(n: int, dimension: int, kernel: KernelName = "matern-3/2") -> float:
@@ -67,6 +74,22 @@ class TheoremConstants:
             if not (value > 0 and np.isfinite(value)):
                 raise CertificateError(f"{name} of the theorem must be a positive number, got {value!r}.")
 
+    @classmethod
+    def parse(cls, text: str) -> TheoremConstants:
+        """Return the constants that a text has, in the order of the attributes, with commas in between.
+
+        Raises:
+            InputError: they are not five numbers.
+            CertificateError: one of them is not positive.
+        """
+        try:
+            numbers = [float(part) for part in text.split(",")]
+        except ValueError:
+            numbers = []
+        if len(numbers) != len(fields(cls)):
+            raise InputError(f"--theorem must be five numbers SCALE,NOISE,A,B,GAIN, got {text!r}.")
+        return cls(*numbers)
+
     def constant(self, n: int, dimension: int, confidence: float, kernel: KernelName = "matern-3/2") -> float:
         """Return the C with which ``r_n`` is the theorem's bound ``sqrt(C_1 beta_n gamma_n / n) + 2 / n`` on the gap.
 
@@ -80,6 +103,51 @@ class TheoremConstants:
         gain = self.gain * n * rate(n, dimension, kernel) ** 2 / dimension
         gap = np.sqrt(first * beta * gain / n) + 2 / n
         return float(self.scale * gap / rate(n, dimension, kernel))
+
+
+@part("convergence")
+@dataclass(frozen=True, repr=False)
+class Convergence(CertificateKind):
+    """The bound of Proposition 1 on d*.
+
+    Attributes:
+        constant: C, in the distance's units; a bound by it is withdrawn.
+        theorem: what C is computed from, in place of it.
+    """
+
+    name: ClassVar[str] = "convergence"
+
+    constant: float | None = None
+    theorem: TheoremConstants | None = None
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return :func:`certify_convergence` of the trials.
+
+        Raises:
+            CertificateError: C is missing, another search than GP-UCB chose the tasks, or the theory refuses them.
+        """
+        if sample.search not in (None, "GPUCB"):
+            raise CertificateError(f"Proposition 1 is about tasks that GP-UCB chose; {sample.search} chose these.")
+        constant = self.theorem if self.constant is None else self.constant
+        if constant is None:
+            raise CertificateError(
+                "Proposition 1 needs its constant C, which the paper does not give: state what it is computed from "
+                "(--theorem)."
+            )
+        return certify_convergence(sample, constant, confidence, search=sample.search)
+
+    def require_audit_helps(self, origins: Iterable[Origin]) -> None:
+        """Refuse an audit.
+
+        Raises:
+            CertificateError: always.
+        """
+        raise CertificateError("Proposition 1 is about tasks that GP-UCB chose: it has no use for an audit.")
+
+    @classmethod
+    def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
+        """Return what it needs of the theorem."""
+        return ["the theorem's assumptions, with the constants that you stated"]
 
 
 def certify_convergence(
@@ -106,13 +174,7 @@ def certify_convergence(
             is not positive.
     """
     require_probability("confidence", confidence)
-    if not isinstance(constant, TheoremConstants) and not (constant > 0 and np.isfinite(constant)):
-        raise CertificateError(f"the constant C of Proposition 1 must be a positive number, got {constant!r}.")
-    if sample.failed or not len(sample):
-        raise CertificateError(
-            f"Proposition 1 needs a distance from every execution, but {sample.failed} of {len(sample)} trials have "
-            "none."
-        )
+    _require_usable(sample, constant)
     n, dimension = require_iterations(sample), sample.points.shape[1]
     computed = isinstance(constant, TheoremConstants)
     C = constant.constant(n, dimension, confidence, kernel) if isinstance(constant, TheoremConstants) else constant
@@ -139,6 +201,21 @@ def certify_convergence(
         },
         doubt=_doubt(C, computed, search),
     )
+
+
+def _require_usable(sample: Sample, constant: float | TheoremConstants) -> None:
+    """Refuse a constant that is not positive, and trials without a distance.
+
+    Raises:
+        CertificateError: it is not, or there are some.
+    """
+    if not isinstance(constant, TheoremConstants) and not (constant > 0 and np.isfinite(constant)):
+        raise CertificateError(f"the constant C of Proposition 1 must be a positive number, got {constant!r}.")
+    if sample.failed or not len(sample):
+        raise CertificateError(
+            f"Proposition 1 needs a distance from every execution, but {sample.failed} of {len(sample)} trials have "
+            "none."
+        )
 
 
 def _doubt(constant: float, computed: bool, search: str | None) -> str | None:

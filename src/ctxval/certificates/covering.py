@@ -17,6 +17,7 @@ RESOLUTION = 0.125
 farther away may be unlike anything that was seen (docs/calibration.md)."""
 
 _PROBES = 8192
+"""Random tasks, and as many random corners, whose distances to the trials are looked at."""
 
 _BESIDE = 0.125
 """How far a corner may be from every trial, as a share of what any other task may be. A trial that is merely near to a

@@ -8,16 +8,21 @@ import numpy as np
 from scipy.linalg import cho_solve
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval.certificates.base import Sample
-from ctxval.certificates.posterior import Maxima
+from ctxval.certificates.maxima import Maxima
+from ctxval.certificates.sample import Sample
 from ctxval.gp.hyperposterior import Conditioned
 
 HORIZON = 200
 """Executions that are looked ahead at most."""
 
 _CANDIDATES = 400
+"""Random tasks of each future, besides maximisers of draws of d*."""
+
 _BETA = 2.0
+"""Of GP-UCB in each future."""
+
 _JITTER = 1e-9
+"""Added to variances, relative to the distance's, so that a covariance of near tasks can be factorised."""
 
 
 @dataclass(frozen=True)

@@ -12,18 +12,103 @@ already for k = 0 it would be empty, and claim that one draw bounds everything.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 from scipy.special import bdtr, betaincinv
 
-from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, Sample, at_most, listed, remeasure, require_probability
+from ctxval._util.registry import part
+from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
+from ctxval.certificates.bounds import at_most, require_probability
+from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
+from ctxval.core.space import TaskSpace
+from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
 
 _MOST_SAMPLES = 2**40
+"""Draws beyond which nobody is told how many are needed."""
 
-_UNSEEN = (
+UNSEEN = (
     "M was not learned from these tasks, nor chosen after seeing them: a model that is retrained on them needs a new "
     "store and fresh draws"
 )
+"""What every statement by independent draws assumes."""
+
+
+class _ByDraws(CertificateKind):
+    """A bound by independent draws alone."""
+
+    bounds_maximum: ClassVar[bool] = False
+
+    def require_audit_helps(self, origins: Iterable[Origin]) -> None:
+        """Refuse trials that were chosen otherwise.
+
+        Raises:
+            CertificateError: there are some.
+        """
+        if any(origin != "iid" for origin in origins):
+            raise CertificateError(
+                f"a {self.name} bound takes independent draws alone, and there are others; say --kind audit."
+            )
+
+    @classmethod
+    def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
+        """Return what it needs of the draws."""
+        return rests_on_draws(certificate)
+
+
+@part("scenario")
+@dataclass(frozen=True, repr=False)
+class Scenario(_ByDraws):
+    """The largest of all distances bounds all tasks but a volume (scenario optimisation)."""
+
+    name: ClassVar[str] = "scenario"
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return :func:`certify_scenario` of the trials."""
+        return certify_scenario(sample, confidence)
+
+
+@part("sampling-discarding")
+@dataclass(frozen=True, repr=False)
+class SamplingDiscarding(_ByDraws):
+    """The largest distance that is left after discarding bounds all tasks but a volume (sampling and discarding).
+
+    Attributes:
+        discard: how many of the largest distances are discarded, at least 1; chosen before they are known.
+    """
+
+    name: ClassVar[str] = "sampling-discarding"
+
+    discard: int | None = None
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return :func:`certify_scenario` of the trials."""
+        return certify_scenario(sample, confidence, self._require_discard())
+
+    def require_audit_helps(self, origins: Iterable[Origin]) -> None:
+        """Refuse trials that were chosen otherwise, and ask for the number to discard.
+
+        Raises:
+            CertificateError: there are some, or the number is missing.
+        """
+        self._require_discard()
+        super().require_audit_helps(origins)
+
+    def _require_discard(self) -> int:
+        if not self.discard:
+            raise CertificateError("sampling and discarding needs to be told how many to discard, at least 1.")
+        return self.discard
+
+
+def rests_on_draws(certificate: Certificate) -> list[str]:
+    """Return what a validation by independent draws rests on."""
+    return [
+        "tasks that were drawn independently, and from which M was not learned (how large the distance is in the "
+        f"{at_most(100 * certificate.volume, 3)} % that are left out is not known)"
+    ]
 
 
 def tail(n: int, discarded: int, volume: float) -> float:
@@ -89,7 +174,8 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
     _require_one_number(sample, _name(discarded))
     if sample.failed > discarded:
         raise CertificateError(
-            f"{_violations(sample)}, more than the {discarded} discarded; nothing bounds them.{remeasure(sample)}"
+            f"{violations(sample)}, more than the {discarded} discarded; nothing bounds them."
+            f"{advice_to_remeasure(sample)}"
         )
     ordered = np.sort(np.nan_to_num(sample.distances, nan=np.inf))
     h = float(ordered[len(sample) - 1 - discarded])
@@ -105,9 +191,9 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
         volume=volume,
         trials=len(sample),
         assumptions=(
-            f"the trials are independent and uniform over the task space, and {_number(sample, len(sample))}",
+            f"the trials are independent and uniform over the task space, and {when_planned(sample, len(sample))}",
             "the number discarded was chosen before the distances were known",
-            _UNSEEN,
+            UNSEEN,
             "each task has one distance: the system is deterministic",
             "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
             *sample.remarks,
@@ -117,82 +203,7 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
     )
 
 
-def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
-    """Bound the volume of the tasks that are worse than the worst one known, by the independent draws among the trials.
-
-    The volume above the largest of N independent draws is bounded whatever the distance is like, and that above the
-    largest of all trials, however chosen, is not larger. If the number of draws was raised after some were known, only
-    those that were decided on last count, as their number was chosen before they were executed.
-
-    Args:
-        sample: trials of any origin, some of them independent draws.
-        confidence: 1 - beta.
-
-    Raises:
-        CertificateError: there is no independent draw, their number depended on their distances, or an execution of
-            one failed.
-    """
-    beta = 1 - require_probability("confidence", confidence)
-    everything = sample.only("iid")
-    if not len(everything):
-        raise CertificateError("an audit needs independent draws of tasks, and there is none; run certify --audit N.")
-    drawn = _last_decided_on(everything)
-    if not len(drawn):
-        raise CertificateError(
-            f"the {len(everything)} independent draws ended with the verdict (--until-decided), so their number "
-            f"depended on their distances and none counts; certify --audit N draws until there are N in all, and "
-            f"counts those beyond the {len(everything)}."
-        )
-    if drawn.failed:
-        raise CertificateError(
-            f"{_violations(drawn)}; a new store of a task space without such tasks can be audited, and says nothing of "
-            f"them.{remeasure(drawn)}"
-        )
-    volume, h = volume_bound(len(drawn), 0, beta), sample.best
-    return Certificate(
-        kind="audit",
-        statement=(
-            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % of the task space "
-            f"has a distance above {at_most(h)}, the largest one found."
-        ),
-        upper_bound=h,
-        confidence=confidence,
-        volume=volume,
-        trials=len(drawn),
-        assumptions=(
-            f"the audited tasks are independent and uniform over the task space, and {_number(drawn, len(everything))}",
-            *_not_counted(everything, drawn),
-            _UNSEEN,
-            "each task has one distance: the system is deterministic",
-            "nothing is assumed of how the distance depends on the task",
-            "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
-            *sample.remarks,
-            ONE_CAMPAIGN,
-        ),
-        details={
-            **{"largest_found": h, **_against_the_search(sample, drawn)},
-            **{"not_counted": len(everything) - len(drawn), "failed": sample.failed, "failures": sample.failures},
-        },
-    )
-
-
-def _last_decided_on(drawn: Sample) -> Sample:
-    """Return the draws whose number was decided on last, without those that the verdict was to end."""
-    plans = [planned for planned in drawn.planned if planned != 0]
-    return drawn.rows([row for row, planned in enumerate(drawn.planned) if plans and planned == plans[-1]])
-
-
-def _not_counted(everything: Sample, drawn: Sample) -> tuple[str, ...]:
-    missing = len(everything) - len(drawn)
-    if not missing:
-        return ()
-    return (
-        f"{missing} other independent draws do not count: the number of draws was changed, or the verdict ended them, "
-        "after they were known",
-    )
-
-
-def _number(sample: Sample, drawn: int) -> str:
+def when_planned(sample: Sample, drawn: int) -> str:
     """Return what is known of when the number of draws was chosen, of which there are so many in all."""
     planned = sample.planned[-1] if len(sample) else None
     if planned is None:
@@ -221,25 +232,13 @@ def _require_one_number(sample: Sample, kind: str) -> None:
         )
 
 
-def _violations(sample: Sample) -> str:
+def violations(sample: Sample) -> str:
+    """Return that draws without a distance count as violations, and which ones they are."""
     numbers = [*sample.numbers_of("failed"), *sample.numbers_of("unmeasured")]
     return (
         f"{sample.failed} of {len(sample)} executions of independent draws have no distance and count as violations, "
         f"larger than any distance ({listed(numbers)})"
     )
-
-
-def _against_the_search(sample: Sample, drawn: Sample) -> dict[str, float | int | None]:
-    """Return the largest distances that were drawn and that were found otherwise, and how many draws exceed these."""
-    chosen = sample.distances[[origin != "iid" for origin in sample.origins]]
-    if not np.isfinite(chosen).any():
-        return {"largest_drawn": drawn.best, "largest_chosen": None, "exceeding": None}
-    largest = float(np.nanmax(chosen))
-    return {
-        "largest_drawn": drawn.best,
-        "largest_chosen": largest,
-        "exceeding": int((drawn.distances > largest).sum()),
-    }
 
 
 def _name(discarded: int) -> str:

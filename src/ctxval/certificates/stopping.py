@@ -1,123 +1,159 @@
-"""How far a campaign is from its verdict, and which task must be executed before it may be validated."""
+"""The stopping rule of a campaign that runs until its verdict is reached, and the tasks that it executes before that.
+
+An upper bound on d* that keeps the threshold is not believed at once: first the tasks are executed that nothing came
+near to, then those where the highest draws of d* are. docs/calibration.md has how often the verdict is false.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.certificates import (
-    RESOLUTION,
-    Maxima,
-    Sample,
-    certify_posterior,
-    covering,
-    draw_maxima,
-    instantaneous_bound,
-    most_contested,
-    require_resolution,
-    settle_maxima,
-)
-from ctxval.certificates.verdict import CONFIDENCE, counterexample, require_confidence
+from ctxval._util.representation import record
+from ctxval.certificates.covering import covering, most_contested
+from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
+from ctxval.certificates.options import CertificateOptions
+from ctxval.certificates.posterior import Posterior, certify_posterior, instantaneous_bound
+from ctxval.certificates.sample import Sample
+from ctxval.certificates.verdict import counterexample, require_threshold
 from ctxval.core.trial import Trial
-from ctxval.errors import CertificateError
-
-_GLANCES = ((8, 0.3), (32, 0.05))
-"""Draws of d* that tell whether all of them are worth their cost, and by how much their probability may be wrong."""
-
-_TESTS = 2
-"""Executions where the highest draws of d* are, after which the bound must still keep the threshold: they mostly find
-what made it too low (docs/calibration.md)."""
+from ctxval.errors import CertificateError, InputError
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
-    """How far a campaign is from its verdict.
+class StoppingDecision:
+    """What a campaign does next.
 
     Attributes:
-        decided: whether it is reached, or will be if what is being executed shows nothing new.
-        uncovered: the point of the unit cube ``(d,)`` to execute where the bound keeps the threshold: a task that
-            nothing came near to, then where the highest draws of d* are, so as to put the bound to the test.
+        decided: whether it stops: the verdict is reached, or will be if the open trials show nothing new.
+        next_point: the point of the unit cube ``(d,)`` whose execution the rule asks for before it stops; None if the
+            search chooses the next task.
     """
 
     decided: bool = False
-    uncovered: Array | None = None
+    next_point: Array | None = None
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
-def standing(
-    trials: Sequence[Trial],
-    threshold: float,
-    left: int,
-    confidence: float = CONFIDENCE,
-    *,
-    stochastic: bool = False,
-    resolution: float = RESOLUTION,
-) -> Standing:
-    """Return whether the verdict is reached, for less than it costs where it is far away, and what else is missing.
+@dataclass(frozen=True)
+class Screening:
+    """A cheap test of whether the bound is surely above the threshold.
 
-    Args:
-        trials: all of them; what is open is not waited for.
+    Attributes:
+        draws: of the hyperparameters.
+        margin: by how much the probability that d* keeps the threshold may be underestimated by so few draws.
+    """
+
+    draws: int
+    margin: float
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True)
+class StoppingRule:
+    """When a campaign may stop because its verdict on a threshold is reached.
+
+    Attributes:
         threshold: tau, in the distance's units.
-        left: how many more executions there can be.
-        confidence, stochastic, resolution: as of :func:`ctxval.certificates.verdict.judge`.
+        options: the certificate that the verdict is to be by; it must be the posterior bound.
+        screenings: tests that save the cost of the bound while it is far above the threshold.
+        confirmations: executions where the highest draws of d* are, after which the bound must still keep the
+            threshold: they mostly find what made it too low.
 
     Raises:
-        InputError: the threshold is not a positive number, or the confidence is below 0.5.
-        CertificateError: the confidence is not a probability, or the resolution not positive.
+        InputError: the threshold is not a positive number, or the certificate not the posterior bound.
     """
-    require_confidence(confidence)
-    require_resolution(resolution)
-    if counterexample(trials, threshold) is not None:
-        return Standing(decided=True)
-    try:
-        sample = Sample.of([trial for trial in trials if trial.state != "open"])
-        points = np.array([trial.unit_point for trial in trials])
-        missing = covering(points, resolution, left)
-        if missing is None or _surely_too_high(sample, threshold, confidence, stochastic):
-            return Standing()
+
+    threshold: float
+    options: CertificateOptions = field(default_factory=CertificateOptions)
+    screenings: tuple[Screening, ...] = (Screening(8, 0.3), Screening(32, 0.05))
+    confirmations: int = 2
+
+    def __post_init__(self) -> None:
+        require_threshold(self.threshold)
+        if not isinstance(self.options.kind, Posterior):
+            raise InputError(f"--until-decided needs the posterior bound, got {self.options.kind.name!r}.")
+
+    def decide(self, trials: Sequence[Trial], left: int) -> StoppingDecision:
+        """Return whether a campaign stops, and if not, which task must be executed first.
+
+        While the verdict is far away, this costs much less than the verdict.
+
+        Args:
+            trials: all of them; those that are open count as near to their tasks, and are not waited for.
+            left: how many more executions there can be.
+        """
+        if counterexample(trials, self.threshold) is not None:
+            return StoppingDecision(decided=True)
+        try:
+            return self._by_the_bound(trials, left)
+        except CertificateError:
+            return StoppingDecision()
+
+    def _by_the_bound(self, trials: Sequence[Trial], left: int) -> StoppingDecision:
+        sample, points = _ended(trials), _points(trials)
+        missing = covering(points, self._posterior.resolution, left)
+        if missing is None or self._is_surely_too_high(sample):
+            return StoppingDecision()
         if len(missing):
-            return Standing(uncovered=missing[0])
+            return StoppingDecision(next_point=missing[0])
         # The open trials count as near to their tasks, so coverage is no doubt here any more.
-        drawn, kept = _is_kept(sample, threshold, confidence, stochastic)
+        drawn, kept = self._is_kept(sample)
         if not kept:
-            return Standing()
+            return StoppingDecision()
         contested = None
-        if left and not _has_stood(trials[:-_TESTS], threshold, confidence, stochastic, resolution):
-            highest = drawn.points[-max(1, round((1 - confidence) * len(drawn.points))) :]
-            contested = most_contested(highest, points, resolution)
-        return Standing(decided=contested is None, uncovered=contested)
-    except CertificateError:
-        return Standing()
+        if left and not self._has_stood(trials[: -self.confirmations or None]):
+            highest = drawn.points[-max(1, round((1 - self.options.confidence) * len(drawn.points))) :]
+            contested = most_contested(highest, points, self._posterior.resolution)
+        return StoppingDecision(decided=contested is None, next_point=contested)
+
+    @property
+    def _posterior(self) -> Posterior:
+        return cast(Posterior, self.options.kind)
+
+    def _has_stood(self, trials: Sequence[Trial]) -> bool:
+        """Return whether the bound of the earlier trials kept the threshold already, near to every task."""
+        if not trials or covering(_points(trials), self._posterior.resolution, 0) is None:
+            return False
+        try:
+            return self._is_kept(_ended(trials))[1]
+        except CertificateError:
+            return False
+
+    def _is_kept(self, sample: Sample) -> tuple[Maxima, bool]:
+        """Return draws of d*, and whether the bound keeps the threshold wherever the trials came near to."""
+        stochastic, confidence = self._posterior.stochastic, self.options.confidence
+        drawn = settle_maxima(sample, self.threshold, confidence, stochastic=stochastic)
+        certificate = certify_posterior(sample, confidence, stochastic=stochastic, resolution=1.0, found=drawn)
+        return drawn, certificate.covers(self.threshold)
+
+    def _is_surely_too_high(self, sample: Sample) -> bool:
+        """Return whether the posterior bound is above the threshold, by what costs less and nearly always tells."""
+        stochastic = self._posterior.stochastic
+        instantaneous = None if stochastic else instantaneous_bound(sample)
+        if instantaneous is not None and instantaneous["max_ucb"] > self.threshold:
+            return True
+        return any(
+            draw_maxima(sample, draws=one.draws, stochastic=stochastic).probability(self.threshold)
+            < self.options.confidence - one.margin
+            for one in self.screenings
+        )
+
+    def __repr__(self) -> str:
+        return record(self)
 
 
-def _has_stood(
-    trials: Sequence[Trial], threshold: float, confidence: float, stochastic: bool, resolution: float
-) -> bool:
-    """Return whether the bound of the trials before the last ones kept the threshold already, near to every task."""
-    if not trials or covering(np.array([trial.unit_point for trial in trials]), resolution, 0) is None:
-        return False
-    try:
-        sample = Sample.of([trial for trial in trials if trial.state != "open"])
-        return _is_kept(sample, threshold, confidence, stochastic)[1]
-    except CertificateError:
-        return False
+def _ended(trials: Sequence[Trial]) -> Sample:
+    return Sample.of([trial for trial in trials if trial.state != "open"])
 
 
-def _is_kept(sample: Sample, threshold: float, confidence: float, stochastic: bool) -> tuple[Maxima, bool]:
-    """Return draws of d*, and whether the bound keeps the threshold wherever the trials came near to."""
-    drawn = settle_maxima(sample, threshold, confidence, stochastic=stochastic)
-    certificate = certify_posterior(sample, confidence, stochastic=stochastic, resolution=1.0, found=drawn)
-    return drawn, certificate.covers(threshold)
-
-
-def _surely_too_high(sample: Sample, threshold: float, confidence: float, stochastic: bool) -> bool:
-    """Return whether the posterior bound is above the threshold, by what costs less and nearly always tells."""
-    instantaneous = None if stochastic else instantaneous_bound(sample)
-    if instantaneous is not None and instantaneous["max_ucb"] > threshold:
-        return True
-    return any(
-        draw_maxima(sample, draws=draws, stochastic=stochastic).probability(threshold) < confidence - margin
-        for draws, margin in _GLANCES
-    )
+def _points(trials: Sequence[Trial]) -> Array:
+    return np.array([trial.unit_point for trial in trials])

@@ -2,42 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from ctxval._util.representation import call, line, lines, shown
-from ctxval.certificates import (
-    RESOLUTION,
-    Certificate,
-    Forecast,
-    Maxima,
-    Sample,
-    certify_posterior,
-    forecast,
-    require_resolution,
-    settle_maxima,
-)
-from ctxval.certificates.base import at_most, require_probability, with_error
+from ctxval.certificates.base import Certificate
+from ctxval.certificates.bounds import at_most, with_error
+from ctxval.certificates.forecast import Forecast
+from ctxval.certificates.options import CertificateOptions, require_confidence, require_volume
+from ctxval.certificates.provenance import Provenance
+from ctxval.certificates.registry import KINDS
+from ctxval.certificates.sample import Sample
 from ctxval.core.space import TaskSpace
-from ctxval.core.trial import Change, Trial
+from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
 Answer = Literal["validated", "falsified", "undecided"]
-
-CONFIDENCE = 0.95
-"""Of a validation, unless said otherwise."""
-
-LEAST_CONFIDENCE = 0.5
-"""Below it a statement is wrong as often as right."""
-
-MOST_VOLUME = 0.5
-"""Above it a statement leaves out most of what it is about."""
-
-_NAMED = 3
-"""Task parameters whose resolution is told one by one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,20 +53,14 @@ class Verdict:
         rows = [f"{name}: {shown(part)}" for name, part in found.items() if part is not None]
         return lines(call(self, self.answer, threshold=self.threshold), f"reason: {line(self.reason)}", *rows)
 
-
-def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
-    """Return sentences on what was changed in a store after it was written, for a certificate's assumptions."""
-    found = []
-    for change in changes:
-        if change.what == "accepted":
-            different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
-            found.append(
-                f"what was changed after {change.content.get('trials', 'some')} trials makes no difference to them, as "
-                f"you state: {change.why!r} ({different})"
-            )
-        elif change.what == "remeasured":
-            found.append(f"the distances are those measured anew: {change.why!r}")
-    return tuple(found)
+    def to_json(self) -> dict[str, Any]:
+        """Return the answer and its reasons, ready for JSON; the certificate has its own."""
+        return {
+            "verdict": self.answer,
+            "reason": self.reason,
+            "rests_on": self.rests_on,
+            "threshold": self.threshold,
+        }
 
 
 def require_threshold(threshold: float) -> float:
@@ -95,35 +72,6 @@ def require_threshold(threshold: float) -> float:
     if not isinstance(threshold, int | float) or not threshold > 0 or threshold == float("inf"):
         raise InputError(f"the threshold must be a positive number, got {threshold!r}.")
     return float(threshold)
-
-
-def require_confidence(confidence: float) -> float:
-    """Return the confidence of a verdict.
-
-    Raises:
-        CertificateError: it is no probability.
-        InputError: it is below 0.5.
-    """
-    if require_probability("the confidence", confidence) < LEAST_CONFIDENCE:
-        raise InputError(
-            f"a verdict with confidence {confidence:g} would be wrong more often than right; state at least "
-            f"{LEAST_CONFIDENCE:g}, and {CONFIDENCE:g} is usual."
-        )
-    return float(confidence)
-
-
-def require_volume(volume: float) -> float:
-    """Return the share of the task space that may exceed a threshold.
-
-    Raises:
-        InputError: it is negative, or above 0.5.
-    """
-    if not 0 <= volume <= MOST_VOLUME:
-        raise InputError(
-            f"the volume must be a share of the task space from 0 to {MOST_VOLUME:g}, got {volume!r}: more would leave "
-            "out most of the tasks."
-        )
-    return float(volume)
 
 
 def counterexample(trials: Sequence[Trial], threshold: float) -> Verdict | None:
@@ -180,9 +128,10 @@ def judge_by(
     if certificate.covers(tau, require_volume(volume)):
         but = f", but for {at_most(100 * certificate.volume, 3)} % of the task space" if certificate.volume else ""
         upper, limit = _bound_and_limit(certificate, tau)
+        kind = KINDS.of(certificate)
         reason = (
             f"the {certificate.kind} bound of {certificate.trials} trials is {upper}, at most {limit}, with confidence "
-            f"{certificate.confidence}{but}{_unusual_resolution(certificate, space)}."
+            f"{certificate.confidence}{but}{kind.qualification(certificate, space)}."
         )
         return Verdict("validated", tau, reason, certificate=certificate, rests_on=_rests_on(certificate, space))
     return Verdict("undecided", tau, _why_not(certificate, tau, volume), certificate=certificate)
@@ -205,53 +154,16 @@ def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
             f"the {certificate.kind} bound is {upper}, and {limit} is too near to it for the random draws that it is "
             "computed from; more executions tighten it."
         )
-    missing = certificate.details.get("not_counted")
-    why = f"; {missing} draws do not count, as their number was changed after they were known" if missing else ""
     return (
         f"the {certificate.kind} bound of {certificate.trials} trials leaves out "
         f"{at_most(100 * certificate.volume, 3)} % of the task space, more than the {100 * volume:.3g} % that are "
-        f"acceptable{why}; it is no bound on d*."
+        f"acceptable{KINDS.of(certificate).shortfall(certificate)}; it is no bound on d*."
     )
-
-
-def _unusual_resolution(certificate: Certificate, space: TaskSpace | None) -> str:
-    """Return what a verdict says of a resolution that is not the usual one."""
-    resolution = certificate.details.get("resolution")
-    if resolution is None or resolution["diagonals"] == RESOLUTION:
-        return ""
-    diagonals = f"{resolution['diagonals']:g} diagonals; usual: {RESOLUTION:g}"
-    if resolution["of_each_range"] >= 1:
-        return f", whole regions without a trial taken to be like the rest ({diagonals})"
-    return f", to a resolution of {_lengths(resolution, space)}, {_share(resolution)} of the task space ({diagonals})"
-
-
-def _lengths(resolution: dict[str, float], space: TaskSpace | None) -> str:
-    """Return a resolution in the units of the task parameters, if they are few and known."""
-    share = resolution["of_each_range"]
-    if space is None or space.dimension > _NAMED:
-        return f"{share:.2g} of each parameter's range"
-    return " and ".join(
-        f"{share * width:.2g} {space.units[name.partition('[')[0]]}".rstrip() + f" in {name}"
-        for name, width in zip(space.names, space.high - space.low, strict=True)
-    )
-
-
-def _share(resolution: dict[str, float]) -> str:
-    percent = 100 * resolution["of_the_space"]
-    return f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
 
 
 def _rests_on(certificate: Certificate, space: TaskSpace | None) -> str:
     """Return what a validation rests on, in one sentence."""
-    if certificate.kind == "posterior":
-        said = _of_the_distance(certificate.details, space)
-    elif certificate.volume:
-        said = [
-            "tasks that were drawn independently, and from which M was not learned (how large the distance is in the "
-            f"{at_most(100 * certificate.volume, 3)} % that are left out is not known)"
-        ]
-    else:
-        said = ["the theorem's assumptions, with the constants that you stated"]
+    said = KINDS.of(certificate).rests_on(certificate, space)
     made_good = certificate.details.get("failures", {}).get("made_good", [])
     if made_good:
         numbers = ", ".join(str(one["trial"]) for one in made_good)
@@ -259,69 +171,35 @@ def _rests_on(certificate: Certificate, space: TaskSpace | None) -> str:
     return f"It rests on {'; on '.join([*said, 'this campaign not being chosen among several'])}."
 
 
-def _of_the_distance(details: dict[str, Any], space: TaskSpace | None) -> list[str]:
-    """Return what the posterior bound needs of the distance."""
-    resolution = details.get("resolution")
-    smooth = "the distance being as smooth between the trials as at them, also in regions without any trial"
-    if resolution is not None and resolution["of_each_range"] < 1:
-        smooth = (
-            f"the distance being as smooth between the trials as at them, to a resolution of "
-            f"{_lengths(resolution, space)} (a peak inside a gap of that radius, {_share(resolution)} of the task "
-            "space, may be missed)"
-        )
-    if details.get("stochastic"):
-        return [
-            smooth,
-            "the noise that you declared being normal and alike everywhere (it is the expected distance that is "
-            "bounded: single executions may exceed it)",
-        ]
-    return [smooth, "each task having one distance, however often it is executed"]
-
-
 def judge(
     trials: Sequence[Trial],
     threshold: float,
-    confidence: float = CONFIDENCE,
-    *,
-    stochastic: bool = False,
-    resolution: float = RESOLUTION,
-    space: TaskSpace | None = None,
-    remarks: Sequence[str] = (),
+    options: CertificateOptions | None = None,
+    provenance: Provenance | None = None,
 ) -> Verdict:
-    """Return the verdict by an executed counterexample or the posterior bound; undecided says what more would take.
+    """Return the verdict by an executed counterexample, or by the certificate that the options ask for.
 
     Args:
         trials: all of them.
         threshold: tau, in the distance's units.
-        confidence: of a validation, at least 0.5.
-        stochastic: whether two executions of one task may differ.
-        resolution: how far from every trial a task may be, in diagonals of the task space.
-        space: the tasks, to tell the resolution in their units.
-        remarks: sentences that the certificate lists among its assumptions, such as what was changed on the system.
+        options: by which certificate; the posterior bound by default. If its theory refuses the trials, the verdict is
+            undecided.
+        provenance: what else is known of the campaign.
 
     Raises:
-        InputError: the threshold is not a positive number, or the confidence is below 0.5.
-        CertificateError: the confidence is not a probability, or the resolution not positive.
+        InputError: the threshold is not a positive number.
     """
-    require_confidence(confidence)
-    require_resolution(resolution)
+    chosen, known = options or CertificateOptions(), provenance or Provenance()
     found = counterexample(trials, threshold)
     if found is not None:
         return found
     try:
-        sample = Sample.of(trials)
-        drawn = settle_maxima(sample, threshold, confidence, stochastic=stochastic)
-        certificate = certify_posterior(sample, confidence, stochastic=stochastic, resolution=resolution, found=drawn)
+        sample = Sample.of(trials, known.search)
+        certificate, expected = chosen.kind.certify_against(sample, threshold, chosen.confidence)
     except CertificateError as error:
-        return Verdict("undecided", threshold, str(error))
-    verdict = judge_by(certificate.with_remarks(remarks), trials, threshold, space=space)
-    return verdict if verdict.answer == "validated" else _with_forecast(verdict, sample, drawn, confidence)
-
-
-def _with_forecast(verdict: Verdict, sample: Sample, drawn: Maxima, confidence: float) -> Verdict:
-    certificate = verdict.certificate
-    if certificate is not None and (certificate.doubt is not None or certificate.upper_bound <= verdict.threshold):
-        return verdict  # futures of a process that the trials speak against say nothing, nor does a bound that is kept
-    expected = forecast(sample, drawn, verdict.threshold, confidence)
-    reason = f"{verdict.reason.removesuffix('.')}; {expected}."
-    return Verdict("undecided", verdict.threshold, reason, certificate=verdict.certificate, expected=expected)
+        return Verdict("undecided", float(threshold), str(error))
+    certificate = certificate.with_remarks(known.remarks)
+    verdict = judge_by(certificate, trials, threshold, volume=chosen.volume, space=known.space)
+    if expected is None:
+        return verdict
+    return replace(verdict, reason=f"{verdict.reason.removesuffix('.')}; {expected}.", expected=expected)

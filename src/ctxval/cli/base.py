@@ -21,6 +21,7 @@ from rich.table import Table
 from ctxval._util.describe import describe
 from ctxval._util.texts import reason_of, shortened
 from ctxval.campaign.campaign import Campaign
+from ctxval.certificates.bounds import as_text
 from ctxval.certificates.verdict import Verdict
 from ctxval.cli.screen import Commands, Screen, line
 from ctxval.core.trial import Trial
@@ -227,10 +228,6 @@ def print_table(rows: dict[str, Any], units: str = "") -> None:
 
 def _text(value: Any, units: str) -> str:
     match value:
-        case None:
-            return "-"
-        case float():
-            return f"{value:.4g}"
         case list():
             return ", ".join(_text(item, units) for item in value)
         case {"task": dict() as task, "distance": distance, **rest}:
@@ -240,7 +237,7 @@ def _text(value: Any, units: str) -> str:
         case dict():
             return ", ".join(f"{name} {_text(item, '')}" for name, item in value.items())
         case _:
-            return str(value)
+            return as_text(value)
 
 
 def print_other_stores(others: list[str]) -> None:

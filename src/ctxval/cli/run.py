@@ -36,7 +36,6 @@ from ctxval.cli.base import (
     worst_of,
 )
 from ctxval.cli.case_options import CaseOptions, case_options
-from ctxval.cli.certify import decide
 from ctxval.cli.trust import AcceptChange
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment
@@ -95,7 +94,7 @@ def run(
     with hands(workers, dask, timeout) as given_hands, progress(campaign, total, show=not as_json) as on_trial:
         execute(budget=total, on_trial=on_trial, **given_hands)
     known = experiment.truth() if truth and experiment.truth is not None else None
-    verdict = None if limit is None else decide(campaign, limit, settings.confidence, settings.certificate)
+    verdict = None if limit is None else campaign.verdict(limit, certificate=settings.certificate_options)
     report = _report(campaign, experiment, settings, total, path, verdict, known)
     report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path)]
     if not as_json:
@@ -109,16 +108,7 @@ def run(
 def _until_decided(campaign: Campaign, threshold: float | None, settings: Settings) -> Callable[..., Campaign]:
     if threshold is None:
         raise InputError("--until-decided needs a threshold to decide about; say --threshold.")
-    table = settings.certificate
-    if table.kind != "posterior":
-        raise InputError(f"--until-decided needs the posterior bound, got {table.kind!r}.")
-    return functools.partial(
-        campaign.run_until_decided,
-        threshold,
-        confidence=settings.confidence,
-        stochastic=table.stochastic,
-        resolution=table.resolution,
-    )
+    return functools.partial(campaign.run_until_decided, threshold, certificate=settings.certificate_options)
 
 
 def _require_truth(experiment: Experiment) -> None:

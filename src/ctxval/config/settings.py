@@ -7,18 +7,18 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ctxval.campaign.campaign import Campaign
-from ctxval.certificates import KINDS, RESOLUTION, USES, require_use
-from ctxval.certificates.verdict import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME
+from ctxval.certificates import KINDS, CertificateOptions
+from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE
+from ctxval.config.certificate_table import CertificateTable
 from ctxval.config.experiments import named_experiment
 from ctxval.config.parts import argument, part, require_types, space_of, task_function
 from ctxval.config.signatures import code_named, signed, unsigned, verifies
 from ctxval.core.experiment import Experiment, labels_of
 from ctxval.core.validation import Validation
-from ctxval.errors import CertificateError, InputError, UnknownNameError
+from ctxval.errors import InputError, UnknownNameError
 from ctxval.searches import REGISTRY as SEARCHES
 from ctxval.searches import Search, by_name
 from ctxval.storage.store import Store
@@ -52,47 +52,6 @@ class SearchTable(BaseModel):
         options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
         options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
         return by_name(self.name, repeats=self.repeats, **options)
-
-
-class CertificateTable(BaseModel):
-    """The table ``[certificate]``: what a validation is to rest on, chosen before it is run.
-
-    Attributes:
-        kind: which certificate.
-        stochastic: whether two executions of one task may differ.
-        volume: share of the task space that may exceed the threshold.
-        resolution: how far from every trial a task may be, in diagonals of the task space.
-        discard, constant: of some kinds.
-    """
-
-    model_config = ConfigDict(extra="forbid")
-
-    kind: str = "posterior"
-    stochastic: bool = False
-    volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
-    resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
-    discard: int | None = Field(default=None, ge=0)
-    constant: float | None = None
-
-    @field_validator("kind")
-    @classmethod
-    def _known(cls, kind: str) -> str:
-        if kind not in KINDS:
-            raise PydanticCustomError("kind", f"the kind must be one of {', '.join(KINDS)}")
-        return kind
-
-    @model_validator(mode="after")
-    def _used(self) -> CertificateTable:
-        changed = {name for name in USES if hasattr(self, name) and getattr(self, name) != _default(self, name)}
-        try:
-            require_use(self.kind, sorted(changed))
-        except CertificateError as error:
-            raise PydanticCustomError("use", str(error).removesuffix(".")) from error
-        return self
-
-
-def _default(table: BaseModel, name: str) -> Any:
-    return type(table).model_fields[name].default
 
 
 Part = str | dict[str, Any]
@@ -239,6 +198,11 @@ class Settings(BaseModel):
             raise InputError(_sentence("certificate", error)) from error
         return self.model_copy(update={"certificate": table})
 
+    @property
+    def certificate_options(self) -> CertificateOptions:
+        """By which certificate the trials are to be judged."""
+        return self.certificate.options(self.confidence)
+
     def store_path(self, name: str) -> Path:
         """Return where the trials go: the given store, or a file under ``runs/`` named after what is run."""
         if self.store is not None:
@@ -287,6 +251,29 @@ def stored_settings(store: Store) -> Settings:
         InputError: the store has no settings, or they are not valid.
     """
     return _of_store(store.settings())
+
+
+def planned_settings(store: Store, kind: str | None = None) -> Settings:
+    """Return what was run into a store, as :func:`stored_settings` does; the defaults if no command made the store.
+
+    Args:
+        store: of the trials.
+        kind: the kind of certificate that the user asks for; None if the store's settings decide.
+
+    Raises:
+        InputError: what the store says is not allowed, or its certificate would run code that its user did not choose.
+    """
+    kept = store.settings()
+    if not kept:
+        return Settings()
+    settings = stored_settings(store)
+    planned = settings.certificate.kind
+    if kind is None and not KINDS.is_data(planned) and not verifies(kept):
+        raise InputError(
+            f"{store.name} names the certificate {planned!r}, which is code of another package, and you did not make "
+            f"the store; say --kind {planned} if you trust that package, or another kind."
+        )
+    return settings
 
 
 def _of_store(kept: dict[str, Any]) -> Settings:
@@ -373,8 +360,7 @@ def _sentence(target: str, error: ValidationError) -> str:
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
     if first["type"] == "use":
-        return f"{target}: {first['msg']}."
+        return f"{target}: {first['msg']}"
     if first["type"] == "extra_forbidden":
-        table = CertificateTable if first["loc"][:-1] == ("certificate",) else Settings
-        return f"{target}: {UnknownNameError.among('setting', str(first['loc'][-1]), table.model_fields)}"
+        return f"{target}: {UnknownNameError.among('setting', str(first['loc'][-1]), Settings.model_fields)}"
     return f"{target}: {where}: {first['msg'].lower()}, got {str(first['input'])[:100]!r}."

@@ -188,15 +188,11 @@ def _code_named(settings: Mapping[str, Any]) -> list[str]:
     return [*found, *_references("", settings)]
 
 
-def _is_kind(name: Any) -> bool:
-    return isinstance(name, str) and name in KINDS
-
-
 _NAMED: tuple[tuple[str, str | None, Callable[[Any], bool]], ...] = (
     ("experiment", None, cases.REGISTRY.is_data),
     *((kind, "type", registry.is_data) for kind, registry in REGISTRIES.items()),
     ("search", "name", searches.REGISTRY.is_data),
-    ("certificate", "kind", _is_kind),
+    ("certificate", "kind", KINDS.is_data),
 )
 """Settings that name a part: the key, the key of the name if it is a table, and whether a name is known to be data."""
 

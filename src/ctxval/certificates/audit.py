@@ -1,0 +1,142 @@
+"""An audit: independent draws bound how many tasks are worse than the worst one known.
+
+Nothing is assumed of how the distance depends on the task, nor of how the worst task was found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from ctxval._util.registry import part
+from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
+from ctxval.certificates.bounds import at_most, require_probability
+from ctxval.certificates.sample import Sample, advice_to_remeasure
+from ctxval.certificates.scenario import UNSEEN, rests_on_draws, violations, volume_bound, when_planned
+from ctxval.core.space import TaskSpace
+from ctxval.errors import CertificateError
+
+
+@part("audit")
+@dataclass(frozen=True, repr=False)
+class Audit(CertificateKind):
+    """The largest distance found bounds all tasks but a volume, by the independent draws among the trials."""
+
+    name: ClassVar[str] = "audit"
+    bounds_maximum: ClassVar[bool] = False
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return :func:`certify_audit` of the trials."""
+        return certify_audit(sample, confidence)
+
+    @classmethod
+    def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
+        """Return what it needs of the draws."""
+        return rests_on_draws(certificate)
+
+    @classmethod
+    def shortfall(cls, certificate: Certificate) -> str:
+        """Return how many draws do not count, if there are such."""
+        missing = certificate.details.get("not_counted")
+        return f"; {missing} draws do not count, as their number was changed after they were known" if missing else ""
+
+
+def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
+    """Bound the volume of the tasks that are worse than the worst one known, by the independent draws among the trials.
+
+    The volume above the largest of N independent draws is bounded whatever the distance is like, and that above the
+    largest of all trials, however chosen, is not larger. If the number of draws was raised after some were known, only
+    those that were decided on last count, as their number was chosen before they were executed.
+
+    Args:
+        sample: trials of any origin, some of them independent draws.
+        confidence: 1 - beta.
+
+    Raises:
+        CertificateError: there is no independent draw, their number depended on their distances, or an execution of
+            one failed.
+    """
+    beta = 1 - require_probability("confidence", confidence)
+    everything = sample.only("iid")
+    drawn = _countable(everything)
+    volume, h = volume_bound(len(drawn), 0, beta), sample.best
+    return Certificate(
+        kind="audit",
+        statement=(
+            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % of the task space "
+            f"has a distance above {at_most(h)}, the largest one found."
+        ),
+        upper_bound=h,
+        confidence=confidence,
+        volume=volume,
+        trials=len(drawn),
+        assumptions=(
+            "the audited tasks are independent and uniform over the task space, and "
+            f"{when_planned(drawn, len(everything))}",
+            *_not_counted(everything, drawn),
+            UNSEEN,
+            "each task has one distance: the system is deterministic",
+            "nothing is assumed of how the distance depends on the task",
+            "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
+            *sample.remarks,
+            ONE_CAMPAIGN,
+        ),
+        details={
+            **{"largest_found": h, **_against_the_search(sample, drawn)},
+            **{"not_counted": len(everything) - len(drawn), "failed": sample.failed, "failures": sample.failures},
+        },
+    )
+
+
+def _countable(everything: Sample) -> Sample:
+    """Return the draws whose number was chosen before they were executed, all of them with a distance.
+
+    Raises:
+        CertificateError: there is none, or one has no distance.
+    """
+    if not len(everything):
+        raise CertificateError("an audit needs independent draws of tasks, and there is none; run certify --audit N.")
+    drawn = _last_decided_on(everything)
+    if not len(drawn):
+        raise CertificateError(
+            f"the {len(everything)} independent draws ended with the verdict (--until-decided), so their number "
+            f"depended on their distances and none counts; certify --audit N draws until there are N in all, and "
+            f"counts those beyond the {len(everything)}."
+        )
+    if drawn.failed:
+        raise CertificateError(
+            f"{violations(drawn)}; a new store of a task space without such tasks can be audited, and says nothing of "
+            f"them.{advice_to_remeasure(drawn)}"
+        )
+    return drawn
+
+
+def _last_decided_on(drawn: Sample) -> Sample:
+    """Return the draws whose number was decided on last, without those that the verdict was to end."""
+    plans = [planned for planned in drawn.planned if planned != 0]
+    return drawn.rows([row for row, planned in enumerate(drawn.planned) if plans and planned == plans[-1]])
+
+
+def _not_counted(everything: Sample, drawn: Sample) -> tuple[str, ...]:
+    missing = len(everything) - len(drawn)
+    if not missing:
+        return ()
+    return (
+        f"{missing} other independent draws do not count: the number of draws was changed, or the verdict ended them, "
+        "after they were known",
+    )
+
+
+def _against_the_search(sample: Sample, drawn: Sample) -> dict[str, float | int | None]:
+    """Return the largest distances that were drawn and that were found otherwise, and how many draws exceed these."""
+    chosen = sample.distances[[origin != "iid" for origin in sample.origins]]
+    if not np.isfinite(chosen).any():
+        return {"largest_drawn": drawn.best, "largest_chosen": None, "exceeding": None}
+    largest = float(np.nanmax(chosen))
+    return {
+        "largest_drawn": drawn.best,
+        "largest_chosen": largest,
+        "exceeding": int((drawn.distances > largest).sum()),
+    }

@@ -1,0 +1,61 @@
+"""Numbers of certificates: probabilities are checked, and bounds are rounded up wherever they are printed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ctxval.errors import CertificateError
+
+ERRORS = 2.0
+"""Standard errors of a computed bound by which it must keep a threshold."""
+
+
+def with_error(upper: float, error: float) -> str:
+    """Return a bound and its standard error as text, both rounded up, with the digits that the error supports."""
+    if not error > 0 or not np.isfinite(error + upper):
+        return at_most(upper)
+    high, low = _place(upper or error), _place(error)
+    # Two digits of an error that starts with 1, and never more than four of the bound.
+    last = max(low - (error < 2 * 10.0**low), high - 3)
+    if error < 10.0**last:
+        return at_most(upper)
+    return f"{at_most(upper, max(high - last + 1, 1))} ± {at_most(error, max(low - last + 1, 1))}"
+
+
+def _place(value: float) -> int:
+    """Return the power of ten of a number's first digit."""
+    return int(np.floor(np.log10(abs(value))))
+
+
+def at_most(value: float, digits: int = 4) -> str:
+    """Return a bound as text, rounded up: what is printed must not be smaller than what holds."""
+    short = f"{value:.{digits}g}"
+    if float(short) >= value or not np.isfinite(value):
+        return short
+    return f"{value + 10.0 ** (np.floor(np.log10(abs(value))) - digits + 1):.{digits}g}"
+
+
+def require_probability(name: str, value: float) -> float:
+    """Return a probability strictly between 0 and 1.
+
+    Raises:
+        CertificateError: it is not.
+    """
+    if not 0 < value < 1:
+        raise CertificateError(f"{name} must be strictly between 0 and 1, got {value!r}.")
+    return float(value)
+
+
+def as_text(value: object) -> str:
+    """Return a number, a list or a table of numbers as text, floats with four digits."""
+    match value:
+        case None:
+            return "-"
+        case float():
+            return f"{value:.4g}"
+        case list() | tuple():
+            return ", ".join(as_text(item) for item in value)
+        case dict():
+            return ", ".join(f"{name} {as_text(item)}" for name, item in value.items())
+        case _:
+            return str(value)

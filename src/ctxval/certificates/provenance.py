@@ -1,0 +1,70 @@
+"""Where trials come from: the task space, the search, and what was changed in their store."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ctxval._util.representation import record
+from ctxval.core.space import TaskSpace
+from ctxval.core.trial import Change
+from ctxval.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Provenance:
+    """What is known of a campaign besides its trials, as far as it concerns a certificate.
+
+    Attributes:
+        space: the task space, to tell lengths in its units; None if it is not known.
+        search: the type of the search that chose the tasks; None if it is not known.
+        remarks: sentences that a certificate lists among its assumptions, such as what was changed on the system.
+    """
+
+    space: TaskSpace | None = None
+    search: str | None = None
+    remarks: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, description: Mapping[str, Any], changes: Iterable[Change] = ()) -> Provenance:
+        """Return it from a store's description of its experiment and the changes that the store lists."""
+        search = description.get("search")
+        return cls(
+            space=_space_of(description),
+            search=search.get("type") if isinstance(search, dict) else None,
+            remarks=remarks_on(changes),
+        )
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
+    """Return sentences on what was changed in a store after it was written, for a certificate's assumptions."""
+    found = []
+    for change in changes:
+        if change.what == "accepted":
+            different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
+            found.append(
+                f"what was changed after {change.content.get('trials', 'some')} trials makes no difference to them, as "
+                f"you state: {change.why!r} ({different})"
+            )
+        elif change.what == "remeasured":
+            found.append(f"the distances are those measured anew: {change.why!r}")
+    return tuple(found)
+
+
+def _space_of(description: Mapping[str, Any]) -> TaskSpace | None:
+    """Return the task space that is described; None if there is none that can be read."""
+    try:
+        described = dict(description["validation"]["space"])
+        described.pop("type", None)
+        bounds: dict[str, tuple[Any, ...]] = {}
+        for name, (low, high, *unit) in described.items():
+            vector = name.partition("[")[0]
+            lows, highs, *_ = bounds.get(vector, ([], []))
+            bounds[vector] = (low, high, *unit) if vector == name else ([*lows, low], [*highs, high], *unit)
+        return TaskSpace(**bounds)
+    except (KeyError, TypeError, ValueError, InputError):
+        return None  # nothing but the units in a sentence depends on it

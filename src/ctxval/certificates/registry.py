@@ -1,0 +1,158 @@
+"""Kinds of certificates by name, those of other packages among them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+from ctxval._util.registry import Registry
+from ctxval._util.representation import record
+from ctxval.certificates.audit import Audit
+from ctxval.certificates.base import Certificate, CertificateKind
+from ctxval.certificates.convergence import Convergence, TheoremConstants
+from ctxval.certificates.covering import RESOLUTION
+from ctxval.certificates.posterior import Posterior
+from ctxval.certificates.sample import Sample
+from ctxval.certificates.scenario import SamplingDiscarding, Scenario
+from ctxval.core.trial import Origin
+from ctxval.errors import CertificateError, InputError, UnknownNameError
+
+Kind = TypeVar("Kind", bound=type[CertificateKind])
+
+
+class KindRegistry(Registry):
+    """Kinds of certificates by name: built-in ones, those of installed packages, and those registered by a decorator.
+
+    A kind that was registered runs its user's code, so it never counts as data.
+
+    Args:
+        built_in: classes of this package, declared by ``@part``.
+    """
+
+    def __init__(self, *built_in: type[CertificateKind]) -> None:
+        super().__init__("certificate", "ctxval.certificates", method="certify", parts=built_in)
+        self._registered: dict[str, type[CertificateKind]] = {}
+
+    def register(self, kind: Kind) -> Kind:
+        """Add a kind, as a decorator of its class.
+
+        Raises:
+            InputError: it is no kind of certificate, or another one has its name.
+        """
+        name = _required(kind).name
+        known = self.find(name) if name in self.built_in else self._registered.setdefault(name, kind)
+        if known is not kind:
+            raise InputError(f"there is a kind of certificate called {name!r} already: {known.__qualname__}.")
+        return kind
+
+    def find(self, name: str) -> type[CertificateKind]:
+        """Return a kind.
+
+        Raises:
+            UnknownNameError: there is none of that name.
+            InputError: the package that has it cannot be imported.
+        """
+        if name in self._registered:
+            return self._registered[name]
+        found = _required(super().find(name))
+        if found.name != name:
+            raise InputError(f"the certificate {name!r} calls itself {found.name!r}.")
+        return found
+
+    @property
+    def imported(self) -> tuple[str, ...]:
+        """The names of the kinds whose code is imported: built-in and registered ones."""
+        return (*self.built_in, *self._registered)
+
+    def of(self, certificate: Certificate) -> type[CertificateKind]:
+        """Return the kind of a certificate; :class:`CertificateKind` with its defaults if it is not known."""
+        return self.find(certificate.kind) if certificate.kind in self else CertificateKind
+
+    def with_option(self, option: str) -> tuple[str, ...]:
+        """Return the names of the imported kinds that have a use for an option."""
+        return tuple(name for name in self.imported if option in self.find(name).options())
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._registered or super().__contains__(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys((*self.imported, *self.installed)))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+def _required(found: Any) -> type[CertificateKind]:
+    if isinstance(found, type) and issubclass(found, CertificateKind) and isinstance(getattr(found, "name", None), str):
+        return found
+    raise InputError(f"a kind of certificate must be a subclass of CertificateKind with a name, got {found!r}.")
+
+
+KINDS = KindRegistry(Posterior, Audit, Scenario, SamplingDiscarding, Convergence)
+"""Kinds of certificates by name; the first one is the default."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the built-in kinds in one record, for :func:`certify`; each kind takes those that are its own.
+
+    Attributes:
+        stochastic: posterior: whether two executions of one task may differ.
+        discard: sampling-discarding: how many of the largest distances are discarded.
+        constant: convergence: C, in the distance's units.
+        theorem: convergence: what C is computed from, in place of it.
+        search: convergence: the type of the search that chose the tasks, if it is known.
+        resolution: posterior: how far from every trial a task may be, in diagonals of the task space.
+        remarks: sentences that the certificate lists among its assumptions, such as what was changed on the system.
+    """
+
+    stochastic: bool = False
+    discard: int | None = None
+    constant: float | None = None
+    theorem: TheoremConstants | None = None
+    search: str | None = None
+    resolution: float = RESOLUTION
+    remarks: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def certify(sample: Sample, kind: str, confidence: float, options: Options | None = None) -> Certificate:
+    """Return the certificate of a kind.
+
+    Raises:
+        UnknownNameError: there is no such kind.
+        CertificateError: its theory does not allow these trials, or something that it needs is not given.
+    """
+    chosen = Options() if options is None else options
+    searched = sample if chosen.search is None else replace(sample, search=chosen.search)
+    return KINDS.find(kind).of(vars(chosen)).certify(searched, confidence).with_remarks(chosen.remarks)
+
+
+def require_use(kind: str, given: Iterable[str]) -> None:
+    """Refuse options that a kind would ignore: somebody who gives one believes that it counts.
+
+    Raises:
+        CertificateError: one is given that is for other kinds.
+        UnknownNameError: there is no such kind, or no kind has such an option.
+    """
+    own = KINDS.find(kind).options()
+    for option in given:
+        if option in own:
+            continue
+        kinds = " or ".join(KINDS.with_option(option))
+        if not kinds:
+            raise UnknownNameError.among(f"option of the certificate {kind!r}", option, own)
+        raise CertificateError(f"{option} is for certificates of the kind {kinds}; the kind here is {kind}.")
+
+
+def require_possible(origins: Iterable[Origin], kind: str, options: Options) -> None:
+    """Make sure, before draws are paid for, that a certificate could use them.
+
+    Raises:
+        CertificateError: none could, however they come out.
+        UnknownNameError: there is no such kind.
+    """
+    KINDS.find(kind).of(vars(options)).require_audit_helps(origins)

@@ -1,0 +1,248 @@
+"""What a certificate may know of trials: points of the unit cube, distances, and why each trial was chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import call, record
+from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
+from ctxval.errors import CertificateError
+
+PLANNED = "draws"
+"""What a note of an independent draw calls the number of draws that there were to be in all."""
+
+_SAME_TASK = 1e-9
+"""How far points of the unit cube may be apart that are one task: parameters are scaled there and back."""
+
+
+@dataclass(frozen=True)
+class MadeGood:
+    """A failure whose task was executed with success later.
+
+    Attributes:
+        trial: number of the trial that failed.
+        by: number of the one that succeeded.
+        because: what was changed on the system in between; None if nobody stated it.
+    """
+
+    trial: int
+    by: int
+    because: str | None
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Executed trials, as far as a certificate may know of them: numbers and why they were chosen.
+
+    Attributes:
+        points: of the unit cube, shape ``(n, d)``.
+        distances: shape ``(n,)``; NaN where the execution failed.
+        origins: n reasons why a trial was chosen.
+        states: n states; open trials are refused by every certificate.
+        numbers: of the trials, for messages; 0, 1, ... by default.
+        planned: for each trial, how many independent draws there were to be in all when it was drawn; 0 if they were to
+            end with the verdict, None if that is not known.
+        made_good: failures that are left out, because their tasks were executed with success later.
+        search: the type of the search that chose the tasks; None if it is not known.
+
+    Raises:
+        CertificateError: the parts do not fit together, or a trial is still open.
+    """
+
+    points: Array
+    distances: Array
+    origins: Sequence[Origin]
+    states: Sequence[State]
+    numbers: Sequence[int] = ()
+    planned: Sequence[int | None] = ()
+    made_good: tuple[MadeGood, ...] = ()
+    search: str | None = None
+
+    def __post_init__(self) -> None:
+        if not len(self.numbers):
+            object.__setattr__(self, "numbers", range(len(self.points)))
+        if not len(self.planned):
+            object.__setattr__(self, "planned", [None] * len(self.points))
+        parts = (self.points, self.distances, self.origins, self.states, self.numbers, self.planned)
+        lengths = {len(part) for part in parts}
+        if len(lengths) != 1:
+            raise CertificateError(
+                f"points, distances, origins, states, numbers and planned must be equally many, got {sorted(lengths)}."
+            )
+        if "open" in self.states:
+            waiting = [str(n) for n, state in zip(self.numbers, self.states, strict=True) if state == "open"]
+            raise CertificateError(f"trials are open: {', '.join(waiting)}; tell how they ended before certifying.")
+
+    def __repr__(self) -> str:
+        return call(self, len(self), best=self.best, failed=self.failed, points=self.points)
+
+    def __len__(self) -> int:
+        return len(self.distances)
+
+    @classmethod
+    def of(cls, trials: Sequence[Trial], search: str | None = None) -> Sample:
+        """Return what a certificate may know of trials; a task that failed before its execution has failed as well.
+
+        A failure does not count if the same task was executed with success later, except for independent draws. Trials
+        that people chose or imported come in an order of no meaning, and are sorted by their tasks.
+
+        Args:
+            trials: all trials of a campaign.
+            search: the type of the search that chose their tasks, if it is known.
+
+        Raises:
+            CertificateError: there is none, or one is still open.
+        """
+        if not trials:
+            raise CertificateError("nothing was executed yet, so nothing can be certified.")
+        good = _made_good(trials)
+        left_out = {one.trial for one in good} | _measured_later(trials)
+        count = _in_order([trial for trial in trials if trial.number not in left_out])
+        return cls(
+            np.array([trial.unit_point for trial in count]),
+            np.array([np.nan if trial.distance is None else trial.distance for trial in count]),
+            [trial.origin for trial in count],
+            [trial.state for trial in count],
+            [trial.number for trial in count],
+            [_planned(trial) for trial in count],
+            good,
+            search,
+        )
+
+    def only(self, origin: Origin) -> Sample:
+        """Return the trials of one origin."""
+        return self.rows([row for row, own in enumerate(self.origins) if own == origin])
+
+    def rows(self, rows: Sequence[int]) -> Sample:
+        """Return some of the trials."""
+        chosen = list(rows)
+        return Sample(
+            self.points[chosen],
+            self.distances[chosen],
+            [self.origins[row] for row in chosen],
+            [self.states[row] for row in chosen],
+            [self.numbers[row] for row in chosen],
+            [self.planned[row] for row in chosen],
+            self.made_good,
+            self.search,
+        )
+
+    @property
+    def best(self) -> float:
+        """The largest distance; minus infinity where none is known."""
+        return float(np.nanmax(self.distances, initial=-np.inf))
+
+    @property
+    def failed(self) -> int:
+        """How many trials have no distance: they failed, or could not be measured."""
+        return int(np.isnan(self.distances).sum())
+
+    def numbers_of(self, state: State) -> list[int]:
+        """Return the numbers of the trials in a state."""
+        return [number for number, own in zip(self.numbers, self.states, strict=True) if own == state]
+
+    @property
+    def failures(self) -> dict[str, list[Any]]:
+        """What failed, what could not be measured and what was made good, ready for JSON."""
+        return {
+            "failed": self.numbers_of("failed"),
+            "unmeasured": self.numbers_of("unmeasured"),
+            "made_good": [asdict(one) for one in self.made_good],
+        }
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on what failed, what could not be measured and what was made good."""
+        failed, unmeasured = self.numbers_of("failed"), self.numbers_of("unmeasured")
+        found = [f"{listed(failed)} failed, and no distance is known there"] if failed else []
+        if unmeasured:
+            found.append(f"{listed(unmeasured)} {_was(unmeasured)} executed, but the distance could not be measured")
+        causes = dict.fromkeys((one.by, one.because) for one in self.made_good)
+        for by, because in causes:
+            which = listed([one.trial for one in self.made_good if one.by == by])
+            why = "nobody stated why" if because is None else f"you state why: {because!r}"
+            found.append(f"{which} failed, and trial {by} executed the same task with success; {why}")
+        return tuple(found)
+
+
+_LISTED = 5
+"""Numbers of trials that a message has at most."""
+
+
+def listed(numbers: Sequence[int]) -> str:
+    """Return numbers of trials as text, the first few of many."""
+    first = ", ".join(map(str, numbers[:_LISTED])) + (", ..." if len(numbers) > _LISTED else "")
+    return f"trial {first}" if len(numbers) == 1 else f"{len(numbers)} trials ({first})"
+
+
+def advice_to_remeasure(sample: Sample) -> str:
+    """Return what to do about trials that were executed but not measured, as a sentence after another one."""
+    unmeasured = sample.numbers_of("unmeasured")
+    if not unmeasured:
+        return ""
+    what = listed(unmeasured)
+    return (
+        f" {what[0].upper()}{what[1:]} {_was(unmeasured)} executed, but the distance could not be measured: mend the "
+        "distance, and `ctxval remeasure STORE` measures what was recorded; what was not is to be executed again."
+    )
+
+
+def _was(numbers: Sequence[int]) -> str:
+    return "was" if len(numbers) == 1 else "were"
+
+
+def _planned(trial: Trial) -> int | None:
+    """Return how many independent draws there were to be when a trial was drawn; 0 if the verdict was to end them."""
+    planned = (trial.note or {}).get(PLANNED) if trial.origin == "iid" else None
+    return planned if isinstance(planned, int) else None
+
+
+def _in_order(trials: list[Trial]) -> list[Trial]:
+    """Return trials with those of no meaningful order sorted, each in the place of another one of them."""
+    places = [place for place, trial in enumerate(trials) if trial.origin == "manual"]
+    ordered = sorted(
+        (trials[place] for place in places),
+        key=lambda trial: (trial.unit_point.tolist(), np.inf if trial.distance is None else trial.distance),
+    )
+    found = list(trials)
+    for place, trial in zip(places, ordered, strict=True):
+        found[place] = trial
+    return found
+
+
+def _measured_later(trials: Sequence[Trial]) -> set[int]:
+    """Return the trials whose distance was told alone, in another definition, and whose tasks were executed again."""
+    known = [trial.unit_point for trial in trials if trial.distance is not None]
+    waiting = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
+    if not known or not waiting:
+        return set()
+    gaps = (np.abs(np.array(known) - trial.unit_point).max(axis=1).min() for trial in waiting)
+    return {trial.number for trial, gap in zip(waiting, gaps, strict=True) if gap <= _SAME_TASK}
+
+
+def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
+    """Return the trials that failed, but whose tasks were executed with success later.
+
+    Of several successes that is one whose reason was stated, if there is one, or else the first.
+    """
+    known = [trial for trial in trials if trial.distance is not None]
+    failed = [trial for trial in trials if trial.state == "failed" and trial.origin != "iid"]
+    if not known or not failed:
+        return ()
+    points, numbers = np.array([trial.unit_point for trial in known]), np.array([trial.number for trial in known])
+    found = []
+    for trial in failed:
+        same = (np.abs(points - trial.unit_point).max(axis=1) <= _SAME_TASK) & (numbers > trial.number)
+        later = [known[row] for row in np.flatnonzero(same)]
+        if later:
+            by = next((one for one in later if one.because), later[0])
+            found.append(MadeGood(trial.number, by.number, by.because))
+    return tuple(found)

@@ -1,0 +1,253 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctxval.certificates import (
+    Maxima,
+    Sample,
+    certify_posterior,
+    draw_maxima,
+    settle_maxima,
+)
+from ctxval.certificates.maxima import _MOST
+from ctxval.errors import CertificateError
+from ctxval.gp.hyperposterior import Prior
+
+confidences = st.floats(0.01, 0.999)
+numbers = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=60)
+
+
+def drawn(values: list[float]) -> Maxima:
+    return Maxima(np.sort(values), np.zeros((len(values), 1)), [], np.zeros(len(values), dtype=np.intp))
+
+
+def sample(n: int = 9, d: int = 1, origin: str = "acquisition", factor: float = 1.0) -> Sample:
+    rng = np.random.default_rng([n, d])
+    X = rng.random((n, d))
+    y = factor * (1.5 + np.sin(6 * X).sum(axis=1))
+    return Sample(X, y, [origin] * n, ["completed"] * n)  # type: ignore[list-item]
+
+
+def quick(trials: Sample, seed: int = 0, stochastic: bool = False) -> Maxima:
+    return draw_maxima(trials, draws=10, paths=4, seed=seed, stochastic=stochastic)
+
+
+# The order statistic
+
+
+@given(numbers, confidences, confidences)
+def test_more_confidence_never_lowers_the_bound(values: list[float], one: float, other: float) -> None:
+    low, high = sorted([one, other])
+    maxima = drawn(values)
+    try:
+        assert maxima.upper(low) <= maxima.upper(high)
+    except CertificateError:
+        assert len(values) < high * (len(values) + 1)
+
+
+@given(numbers, confidences, st.floats(-1e3, 1e3))
+def test_the_bound_is_at_most_a_threshold_just_where_that_is_probable_enough(
+    values: list[float], confidence: float, threshold: float
+) -> None:
+    maxima = drawn(values)
+    if confidence * (len(values) + 1) <= len(values):
+        covered = maxima.probability(threshold) >= confidence - 1e-9
+        assert (maxima.upper(confidence) <= threshold) == covered
+
+
+def test_the_rank_is_that_of_exchangeable_draws() -> None:
+    # Of 19 draws and the truth, each is equally likely to be the largest: 95 % need the largest of the 19.
+    maxima = drawn(list(range(1, 20)))
+    assert [maxima.upper(c) for c in (0.95, 0.9, 0.5, 1e-12)] == [19, 18, 10, 1]
+    with pytest.raises(CertificateError, match="needs more than the 19 draws"):
+        maxima.upper(0.951)
+    assert maxima.probability(19) == 0.95
+
+
+@pytest.mark.parametrize("confidence", [0.0, 1.0, -0.1, 1.5, np.nan])
+def test_a_confidence_that_is_no_probability_is_refused(confidence: float) -> None:
+    with pytest.raises(CertificateError, match="strictly between 0 and 1"):
+        drawn([1.0, 2.0]).upper(confidence)
+    with pytest.raises(CertificateError, match="strictly between 0 and 1"):
+        certify_posterior(sample(), confidence)
+
+
+# The draws
+
+
+@pytest.mark.parametrize("d", [1, 3])
+def test_no_bound_is_below_the_largest_distance_that_was_executed(d: int) -> None:
+    trials = sample(d=d)
+    maxima = quick(trials)
+    assert maxima.draws[0] >= trials.best
+    assert (np.diff(maxima.draws) >= 0).all()
+    assert ((maxima.points >= 0) & (maxima.points <= 1)).all()
+    assert certify_posterior(trials, 0.01, found=maxima).upper_bound >= trials.best
+
+
+def test_units_do_not_matter() -> None:
+    plain, scaled = quick(sample()), quick(sample(factor=4.0))
+    np.testing.assert_allclose(scaled.draws, 4 * plain.draws, rtol=1e-6)
+    own = Prior(offset=None)  # the logarithm's zero is that of the distance
+    trials = sample()
+    moved = Sample(trials.points, trials.distances + 50, trials.origins, trials.states)
+    first, second = (draw_maxima(some, draws=10, paths=4, prior=own) for some in (trials, moved))
+    np.testing.assert_allclose(second.draws - 50, first.draws, atol=1e-3)
+
+
+def test_the_seed_decides_and_the_order_of_origins_does_not() -> None:
+    np.testing.assert_array_equal(quick(sample()).draws, quick(sample(origin="iid")).draws)
+    assert (quick(sample(), seed=1).draws != quick(sample(), seed=2).draws).any()
+
+
+def test_a_function_that_is_known_densely_leaves_no_gap() -> None:
+    X = np.linspace(0, 1, 25)[:, None]
+    trials = Sample(X, np.sin(3 * X[:, 0]), ["iid"] * 25, ["completed"] * 25)
+    assert 1.0 - 1e-6 <= quick(trials).upper(0.9) < 1.002
+
+
+def from_prior(seed: int) -> tuple[Sample, float]:
+    """A path drawn from the prior, its hyperparameters too, seven trials of it chosen adaptively, and its maximum."""
+    rng = np.random.default_rng([9, seed])
+    hyper = Prior(offset=None).draw(1, rng)
+    grid = np.linspace(0, 1, 201)[:, None]
+    path = np.linalg.cholesky(hyper.kernel(grid, grid) + 1e-9 * np.eye(201)) @ rng.normal(size=201)
+    rows = [20, 70, 130, 180]
+    while len(rows) < 7:
+        gaps = np.abs(grid - grid[rows].T).min(axis=1)
+        near = np.abs(grid - grid[rows[int(path[rows].argmax())]])[:, 0]
+        rows.append(int(np.argmin(np.where(gaps > 0.03, near, np.inf)) if len(rows) % 2 else np.argmax(gaps)))
+    return Sample(grid[rows], path[rows], ["acquisition"] * 7, ["completed"] * 7), float(path.max())
+
+
+def test_on_the_prior_the_stated_confidence_is_the_measured_coverage() -> None:
+    runs, held = 60, {0.5: 0, 0.9: 0}
+    for seed in range(runs):
+        trials, truth = from_prior(seed)
+        maxima = draw_maxima(trials, draws=8, paths=4, seed=seed, prior=Prior(offset=None))
+        for confidence in held:
+            held[confidence] += truth <= maxima.upper(confidence)
+    for confidence, count in held.items():
+        allowed = 3 * np.sqrt(confidence * (1 - confidence) / runs)
+        assert abs(count / runs - confidence) < allowed, f"{count} of {runs} at {confidence}"
+
+
+# Stochastic systems
+
+
+def test_noise_widens_what_is_expected_and_may_stay_below_the_largest_value_seen() -> None:
+    rng = np.random.default_rng(5)
+    X = rng.random((40, 1))
+    mean = 3 + 0.5 * np.sin(3 * X[:, 0])
+    noisy = Sample(X, mean + 0.5 * rng.normal(size=40), ["iid"] * 40, ["completed"] * 40)
+    maxima = quick(noisy, stochastic=True)
+    certificate = certify_posterior(noisy, 0.9, stochastic=True, found=maxima)
+    assert 3.5 < certificate.upper_bound < noisy.best
+    assert "expected distance" in certificate.statement
+    assert any("noise" in line for line in certificate.assumptions)
+    assert not any(np.isfinite(one.warp.offset) for one in maxima.conditioned)  # else it would bound the median
+    assert quick(noisy).upper(0.9) > noisy.best  # taken for exact, the noise is roughness
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("distances", "sentence"),
+    [
+        ([0.1, 0.2, np.nan, 0.3, 0.4], "1 of 5 executions failed"),
+        ([0.1, 0.2, 0.3], "at least 4 trials, got 3"),
+        ([0.2] * 6, "all 6 distances are 0.2"),
+    ],
+)
+def test_trials_that_bound_nothing_are_refused(distances: list[float], sentence: str) -> None:
+    n = len(distances)
+    states = ["failed" if np.isnan(distance) else "completed" for distance in distances]
+    trials = Sample(np.linspace(0, 1, n)[:, None], np.array(distances), ["iid"] * n, states)  # type: ignore[arg-type]
+    with pytest.raises(CertificateError, match=sentence):
+        draw_maxima(trials)
+
+
+def test_open_trials_are_refused() -> None:
+    with pytest.raises(CertificateError, match="are open"):
+        Sample(np.zeros((2, 1)), np.array([1.0, np.nan]), ["iid"] * 2, ["completed", "open"])
+    with pytest.raises(CertificateError, match="nothing was executed"):
+        Sample.of([])
+
+
+def of(X: np.ndarray, y: np.ndarray) -> Sample:
+    return Sample(X, np.asarray(y, float), ["acquisition"] * len(y), ["completed"] * len(y))
+
+
+@pytest.mark.parametrize("factor", [1e-200, 1e155, 1e300])
+def test_numbers_whose_squares_no_float_holds_are_refused(factor: float) -> None:
+    with pytest.raises(CertificateError, match="take other units"):
+        draw_maxima(sample(factor=factor))
+
+
+def test_distances_that_differ_by_rounding_are_refused() -> None:
+    with pytest.raises(CertificateError, match="by rounding alone"):
+        draw_maxima(of(sample().points, 1 + 2.3e-16 * np.arange(9)))
+
+
+def test_one_task_with_two_distances_is_not_deterministic() -> None:
+    X, y = sample().points.copy(), sample().distances
+    X[5] = X[2]
+    with pytest.raises(CertificateError, match=r"trials 2 and 5 executed one task.*say --stochastic"):
+        draw_maxima(of(X, y))
+    assert np.isfinite(quick(of(X, y), stochastic=True).draws).all()
+    same = y.copy()
+    same[5] = y[2]
+    assert np.isfinite(quick(of(X, same)).draws).all()
+
+
+# The error of the bound
+
+
+def test_the_error_is_what_seeds_differ_by() -> None:
+    trials = sample(7)
+    found = [draw_maxima(trials, draws=48, paths=4, seed=seed) for seed in range(24)]
+    for confidence in (0.8, 0.9):
+        bounds = np.array([maxima.upper(confidence) for maxima in found])
+        errors = np.array([maxima.error(confidence) for maxima in found])
+        assert 0.5 * bounds.std(ddof=1) < np.median(errors) < 2 * bounds.std(ddof=1)
+        assert (np.abs(bounds - bounds.mean()) < 2 * errors).mean() >= 0.8
+
+
+def test_more_draws_have_a_smaller_error() -> None:
+    few, many = (draw_maxima(sample(7), draws=draws, paths=4) for draws in (16, 256))
+    assert 0 < many.error(0.9) < 0.7 * few.error(0.9)
+
+
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    seeds: list[int] = []
+
+    def few(trials: Sample, *, seed: int = 0, stochastic: bool = False) -> Maxima:
+        seeds.append(seed)
+        return draw_maxima(trials, draws=10, paths=4, seed=seed, stochastic=stochastic)
+
+    monkeypatch.setattr("ctxval.certificates.maxima.draw_maxima", few)
+    return seeds
+
+
+def test_far_from_the_threshold_the_draws_are_those_of_one_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds, usual = counted(monkeypatch), quick(sample())
+    for threshold in (1e-3, 1e3):
+        np.testing.assert_array_equal(settle_maxima(sample(), threshold, 0.9).draws, usual.draws)
+    assert seeds == [0, 0]
+
+
+def test_near_the_threshold_more_is_drawn_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds, trials = counted(monkeypatch), sample(6)
+    usual = quick(trials)
+    found = settle_maxima(trials, usual.upper(0.9), 0.9)
+    assert 2 <= len(seeds) <= _MOST
+    assert len(set(seeds)) == len(seeds)
+    assert len(found.draws) == len(seeds) * len(usual.draws)
+    assert len(found.conditioned) == 10 * len(seeds)
+    assert (np.diff(found.draws) >= 0).all()
+    assert np.bincount(found.owners).tolist() == [4] * len(found.conditioned)
+    assert np.isin(usual.draws, found.draws).all()

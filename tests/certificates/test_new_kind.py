@@ -1,0 +1,107 @@
+"""The recipe of a new kind of certificate: one file of fewer than 40 lines, as CONTRIBUTING.md has it."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from pydantic import ValidationError
+from typer.testing import CliRunner
+
+from conftest import make_validation
+from ctxval import Campaign
+from ctxval.certificates import KINDS, CertificateOptions
+from ctxval.cli import app
+from ctxval.config.certificate_table import CertificateTable
+
+RECIPE = '''
+"""A bound on d* for a distance whose slope is known."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ctxval.certificates import KINDS, Certificate, CertificateKind, Sample, farthest_task
+from ctxval.errors import CertificateError
+
+
+@KINDS.register
+@dataclass(frozen=True)
+class Lipschitz(CertificateKind):
+    """No task is worse than the worst one known by more than the slope over the largest gap between trials.
+
+    Attributes:
+        slope: by how much the distance changes over one diagonal of the task space at most.
+    """
+
+    name: ClassVar[str] = "lipschitz"
+
+    slope: float | None = None
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return the certificate of trials."""
+        if self.slope is None or sample.failed:
+            raise CertificateError("a lipschitz bound needs the slope, and a distance from every trial.")
+        gap = farthest_task(sample.points)
+        bound = sample.best + self.slope * gap
+        statement = f"d* is at most {bound:.4g}."
+        assumptions = (f"the distance changes by at most {self.slope:g} over one diagonal", *sample.remarks)
+        details = {"best": sample.best, "largest_gap": gap}
+        return Certificate(self.name, statement, bound, confidence, 0.0, len(sample), assumptions, details)
+
+    @classmethod
+    def rests_on(cls, certificate, space=None):
+        """Return what a validation by it rests on."""
+        return ["the slope that you stated"]
+'''
+
+
+@pytest.fixture
+def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Import the file of the recipe, and forget the kind afterwards."""
+    monkeypatch.setattr(KINDS, "_registered", dict(KINDS._registered))
+    (tmp_path / "lipschitz.py").write_text(RECIPE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "lipschitz", raising=False)
+    return importlib.import_module("lipschitz")
+
+
+def test_the_recipe_is_short() -> None:
+    assert len(RECIPE.strip().splitlines()) < 40
+
+
+def test_the_new_kind_is_found_by_name_and_judges(recipe: ModuleType) -> None:
+    campaign = Campaign(make_validation(), seed=1).run(8)
+    kind = KINDS.find("lipschitz").of({"slope": 2.0})
+    assert kind == recipe.Lipschitz(2.0)
+    verdict = campaign.verdict(1e3, certificate=CertificateOptions(kind))
+    assert verdict.answer == "validated"
+    assert verdict.reason.startswith("the lipschitz bound of 8 trials is ")
+    assert verdict.rests_on is not None
+    assert verdict.rests_on.startswith("It rests on the slope that you stated; on this campaign")
+    missing = campaign.verdict(1e3, certificate=CertificateOptions(recipe.Lipschitz()))
+    assert (missing.answer, missing.reason[:23]) == ("undecided", "a lipschitz bound needs")
+    assert campaign.verdict(1e-6, certificate=CertificateOptions(kind)).answer == "falsified"
+
+
+def test_the_command_line_and_files_know_the_new_kind(
+    recipe: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    store = Campaign(make_validation(), store="own.sqlite", seed=1).run(8).store.path
+    result = CliRunner().invoke(app, ["certify", str(store), "--kind", "lipschitz", "--option", "slope=2.0"])
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith("lipschitz: d* is at most")
+    assert "largest gap" in result.stdout
+    for option, sentence in (("slope=high", "valid number"), ("slop=1", "did you mean 'slope'"), ("5", "NAME=VALUE")):
+        refused = CliRunner().invoke(app, ["certify", str(store), "--kind", "lipschitz", "--option", option])
+        assert refused.exit_code == 2
+        assert sentence in refused.stderr.replace("\n", " ")
+    stated = {"kind": "lipschitz", "slope": 2.0}
+    assert CertificateTable.model_validate(stated).model_dump()["slope"] == 2.0
+    assert CertificateTable.model_validate(stated).options(0.9).kind == recipe.Lipschitz(2.0)
+    for wrong in ({"slop": 2.0}, {"slope": "steep"}, {"discard": 2}):
+        with pytest.raises(ValidationError):
+            CertificateTable.model_validate({**stated, **wrong})

@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+import numpy as np
+
+from ctxval import TaskSpace
+from ctxval.certificates import Provenance
+from ctxval.certificates.provenance import remarks_on
+from ctxval.core.trial import Change
+
+
+def test_what_was_changed_in_a_store_is_remarked() -> None:
+    changes = [
+        Change("described anew", "made by an older version", {}),
+        Change("accepted", "gripper replaced", {"differences": ["x was 1 and is now 2", "y is new"], "trials": 7}),
+        Change("remeasured", "another norm", {"before": {}}),
+    ]
+    assert remarks_on(changes) == (
+        "what was changed after 7 trials makes no difference to them, as you state: 'gripper replaced' (x was 1 and is "
+        "now 2)",
+        "the distances are those measured anew: 'another norm'",
+    )
+
+
+def test_what_a_store_describes_is_read() -> None:
+    space = {"type": "TaskSpace", "goal": [-1.0, 1.0, "rad"], "load[0]": [0.0, 1.0, "kg"], "load[1]": [0.0, 2.0, "kg"]}
+    known = Provenance.of({"search": {"type": "GPUCB"}, "validation": {"space": space}})
+    assert known.search == "GPUCB"
+    assert isinstance(known.space, TaskSpace)
+    assert known.space.names == ("goal", "load[0]", "load[1]")
+    assert known.space.units == {"goal": "rad", "load": "kg"}
+    np.testing.assert_array_equal(known.space.high, [1.0, 1.0, 2.0])
+
+
+def test_what_a_store_does_not_describe_is_not_known() -> None:
+    for description in ({}, {"search": None, "validation": {"space": {"goal": "anything"}}}):
+        known = Provenance.of(description)
+        assert (known.space, known.search, known.remarks) == (None, None, ())

@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from types import ModuleType
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctxval import certificates
+from ctxval.certificates import (
+    KINDS,
+    Certificate,
+    CertificateKind,
+    Options,
+    Posterior,
+    Sample,
+    TheoremConstants,
+    certify,
+    require_use,
+)
+from ctxval.certificates.registry import KindRegistry
+from ctxval.errors import CertificateError, InputError, UnknownNameError
+
+confidences = st.floats(0.01, 0.999)
+
+
+def sample(n: int = 9, origin: str = "acquisition") -> Sample:
+    X = np.linspace(0.0, 1.0, n)[:, None]
+    return Sample(X, 1.0 + np.sin(4 * X[:, 0]), [origin] * n, ["completed"] * n)  # type: ignore[list-item]
+
+
+# The kinds of this package
+
+
+def everything(kind: str) -> tuple[Sample, Options]:
+    trials = sample(30, origin="acquisition" if kind == "convergence" else "iid")
+    theorem = TheoremConstants(1.0, 0.01, 1.0, 3.0, 1.0)
+    return trials, Options(discard=2, theorem=theorem)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "posterior"])
+@given(confidences, confidences)
+def test_more_confidence_never_gives_a_lower_bound_or_a_smaller_volume(kind: str, one: float, other: float) -> None:
+    trials, options = everything(kind)
+    low, high = (certify(trials, kind, confidence, options) for confidence in sorted([one, other]))
+    assert low.upper_bound <= high.upper_bound
+    assert low.volume <= high.volume
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_has_its_name_on_its_certificate(kind: str) -> None:
+    trials, options = everything(kind)
+    certificate = certify(trials, kind, 0.9, options)
+    assert isinstance(certificate, Certificate)
+    assert certificate.kind == kind
+    assert certificate.upper_bound >= np.sort(trials.distances)[-3]
+    assert certificate.assumptions
+
+
+def test_what_a_kind_needs_and_is_not_given_is_asked_for() -> None:
+    trials, _ = everything("scenario")
+    with pytest.raises(CertificateError, match="how many to discard"):
+        certify(trials, "sampling-discarding", 0.9)
+    with pytest.raises(CertificateError, match="needs its constant C"):
+        certify(trials, "convergence", 0.9)
+    with pytest.raises(UnknownNameError, match="did you mean 'posterior'"):
+        certify(trials, "posteriour", 0.9)
+
+
+def test_a_confidence_below_1_is_not_printed_as_1() -> None:
+    certificate = certify(
+        Sample(np.zeros((9, 1)), np.arange(9.0), ["iid"] * 9, ["completed"] * 9), "scenario", 0.9999999
+    )
+    assert "confidence 0.9999999," in certificate.statement
+
+
+def test_proposition_1_is_refused_where_another_search_chose_the_tasks() -> None:
+    with pytest.raises(CertificateError, match="CMAES chose these"):
+        certify(sample(), "convergence", 0.9, Options(constant=1.0, search="CMAES"))
+
+
+def test_the_first_kind_is_what_people_use_first() -> None:
+    assert list(KINDS) == ["posterior", "audit", "scenario", "sampling-discarding", "convergence"]
+    assert len(KINDS) == 5
+    assert "posteriour" not in KINDS
+    assert KINDS["posterior"] is Posterior
+
+
+def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> None:
+    assert certificates.USES == {
+        "stochastic": ("posterior",),
+        "resolution": ("posterior",),
+        "volume": ("audit", "scenario", "sampling-discarding"),
+        "discard": ("sampling-discarding",),
+        "constant": ("convergence",),
+        "theorem": ("convergence",),
+    }
+    with pytest.raises(AttributeError, match="no attribute 'USED'"):
+        _ = certificates.USED
+    with pytest.raises(UnknownNameError, match="did you mean 'resolution'"):
+        require_use("posterior", ["resolutoin"])
+    with pytest.raises(CertificateError, match="for certificates of the kind sampling-discarding; the kind here is"):
+        require_use("posterior", ["discard"])
+
+
+# Kinds of other packages
+
+
+@dataclass(frozen=True)
+class Largest(CertificateKind):
+    """The largest distance found, as if nothing were between the trials."""
+
+    name: ClassVar[str] = "largest"
+
+    factor: float = 1.0
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        return Certificate(self.name, "A guess.", self.factor * sample.best, confidence, 0.0, len(sample), ())
+
+
+@pytest.fixture
+def elsewhere(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Return a module of another package, whose entry points are installed."""
+    module = ModuleType("other_package")
+    monkeypatch.setitem(sys.modules, "other_package", module)
+    points = [
+        EntryPoint(name, value, "ctxval.certificates")
+        for name, value in (
+            ("largest", "other_package:Largest"),
+            ("broken", "other_package:Missing"),
+            ("misnamed", "other_package:Largest"),
+            ("number", "other_package:number"),
+        )
+    ]
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: points if "certificates" in group else [])
+    return module
+
+
+def test_a_kind_of_another_package_is_imported_when_it_is_asked_for(elsewhere: ModuleType) -> None:
+    known = KindRegistry(Posterior)
+    assert list(known) == ["posterior", "broken", "largest", "misnamed", "number"]
+    assert "largest" in known  # nothing was imported for that
+    elsewhere.Largest, elsewhere.number = Largest, 3  # type: ignore[attr-defined]
+    assert known["largest"] is known.find("largest") is Largest
+    for name, sentence in (
+        ("broken", "has no attribute"),
+        ("misnamed", "calls itself 'largest'"),
+        ("number", "must be a class with the method certify"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            known.find(name)
+    with pytest.raises(UnknownNameError, match="did you mean 'largest'"):
+        known.find("largst")
+
+
+def test_a_kind_is_registered_once() -> None:
+    known = KindRegistry(Posterior)
+    assert known.register(Largest) is known.register(Largest) is known["largest"]
+
+    class Other(Largest):
+        pass
+
+    with pytest.raises(InputError, match="a kind of certificate called 'largest' already"):
+        known.register(Other)
+    with pytest.raises(InputError, match="subclass of CertificateKind with a name"):
+        known.register(int)  # type: ignore[type-var]
+
+
+def test_a_kind_takes_its_own_options_alone() -> None:
+    assert Largest.of({"factor": 2.0, "resolution": 3.0}) == Largest(2.0)
+    assert Largest.of({"factor": None}) == Largest()
+    assert Largest.options() == ("factor",)
+
+
+def test_a_certificate_of_an_unknown_kind_rests_on_what_it_assumes() -> None:
+    certificate = Largest().certify(sample())
+    assert KINDS.of(certificate).rests_on(certificate) == ["what its certificate assumes"]
