@@ -119,7 +119,7 @@ def _forked(store: Path) -> Any:
 def _campaign(store: Path, ready: Connection) -> None:
     validation = make_validation()
     ready.send_bytes(b"ready")
-    Campaign(validation, store=store, seed=11, name="killed").run(BUDGET)
+    Campaign(validation, search=searches.GPUCB(), store=store, seed=11, name="killed").run(BUDGET)
 
 
 def worker_kills(count: int, folder: Path, seed: int, *, whole: bool) -> dict[str, int]:

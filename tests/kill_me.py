@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 
 from conftest import make_validation
-from ctxval import Campaign
+from ctxval import Campaign, searches
 
 
 def main(store: str, budget: int) -> None:
     validation = make_validation()
     print("ready", flush=True)
-    Campaign(validation, store=store, seed=11, name="killed").run(budget)
+    Campaign(validation, search=searches.GPUCB(), store=store, seed=11, name="killed").run(budget)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from ctxval import Experiment
 from rig_workers import Logging
 
 HERE = Path(__file__).parent
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(HERE)}
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path])}
 EXPERIMENT = """
 experiment = "rig_cluster:experiment"
 budget = 12

@@ -8,13 +8,25 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from conftest import make_validation
-from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, plot, systems, testing
+from ctxval import (
+    Campaign,
+    Task,
+    TaskSpace,
+    Validation,
+    controllers,
+    distances,
+    models,
+    plot,
+    searches,
+    systems,
+    testing,
+)
 from ctxval.errors import InputError
 
 
 @pytest.fixture(scope="module")
 def campaign() -> Campaign:
-    return Campaign(make_validation(), seed=1).run(9)
+    return Campaign(make_validation(), search=searches.GPUCB(), seed=1).run(9)
 
 
 def test_the_surrogate_shows_every_sample_the_truth_and_the_maximum(campaign: Campaign) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ctxval import Validation
 from ctxval._util.arrays import Array
-from ctxval.core.validation import Outcome
+from ctxval.core.plan import Outcome
 from study_auto import ROOT, experiment, truth
 
 TRUTHS = ROOT / "runs" / "truth"

@@ -8,7 +8,7 @@ import numpy as np
 
 from ctxval import Campaign, searches
 from ctxval._util.arrays import Array
-from ctxval.core.validation import Outcome
+from ctxval.core.plan import Outcome
 from ctxval.distances import ComposedDistance
 from ctxval.learning.vector import predict_composed
 from peers.recorder import Recorder, Suggest, Suggesting

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.core.validation import Outcome
+from ctxval.core.plan import Outcome
 from peers.functions import Function
 
 Suggest = Callable[[Array, Array], Array]

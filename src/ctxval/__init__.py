@@ -14,13 +14,14 @@ from ctxval._util.registry import part
 from ctxval.campaign import Campaign, OpenTrial
 from ctxval.certificates.verdict import Verdict
 from ctxval.core.experiment import Experiment
+from ctxval.core.plan import Outcome, Plan
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.trial import Trial
 from ctxval.core.truth import Truth, cached_truth, grid_truth, search_truth
-from ctxval.core.validation import Outcome, Plan, Validation
+from ctxval.core.validation import Validation
 from ctxval.storage.store import Store
 from ctxval.version import VERSION
 

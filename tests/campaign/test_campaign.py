@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,13 +33,18 @@ class OneCorner(searches.SequentialSearch):
         return 0.1 * rng.random(self.dimension)
 
 
+def gp_ucb(validation: Validation, **options: Any) -> Campaign:
+    """Return a campaign with the paper's search, which chooses fast."""
+    return Campaign(validation, search=searches.GPUCB(), **options)
+
+
 def facts(trials: tuple[Trial, ...]) -> list[tuple[object, ...]]:
     """What a resumed campaign must share with one never stopped, bit for bit."""
     return [(t.number, t.origin, t.state, t.unit_point.tobytes(), t.distance, t.failure) for t in trials]
 
 
 def test_gp_ucb_finds_the_worst_task(validation: Validation) -> None:
-    campaign = Campaign(validation, seed=4).run(20)
+    campaign = gp_ucb(validation, seed=4).run(20)
     grid = validation.space.grid(2001)
     truth = validation.distances(grid).max()
     assert campaign.worst is not None
@@ -115,7 +121,7 @@ def test_discarding_lowers_the_estimate_but_not_the_facts(validation: Validation
 
 def test_failures_are_data(validation: Validation) -> None:
     rig = FaultyRig(validation.system, {1: "raise", 3: "nan", 6: "short", 8: "wrong shape"})
-    campaign = Campaign(make_validation(system=rig), seed=3).run(15)
+    campaign = gp_ucb(make_validation(system=rig), seed=3).run(15)
     reasons = [t.failure for t in campaign.failed]
     assert campaign.executions == 15
     assert [t.number for t in campaign.failed] == [1, 3, 6, 8]
@@ -130,13 +136,13 @@ def test_failures_are_data(validation: Validation) -> None:
 def test_failures_do_not_change_what_a_resumed_campaign_chooses(validation: Validation, tmp_path: Path) -> None:
     def campaign(store: Path | None, done: int) -> Campaign:
         faults = {k - done: "raise" for k in (1, 6) if k >= done}
-        return Campaign(make_validation(system=FaultyRig(validation.system, faults)), seed=3, store=store)
+        return gp_ucb(make_validation(system=FaultyRig(validation.system, faults)), seed=3, store=store)
 
     # The store describes the rig too, so one rig stands for both: what failed before stays failed.
     whole = campaign(None, 0).run(12)
     shared = FaultyRig(validation.system, {1: "raise", 6: "raise"})
-    first = Campaign(make_validation(system=shared), seed=3, store=tmp_path / "a.sqlite").run(7)
-    second = Campaign(make_validation(system=shared), seed=3, store=first.store).run(12)
+    first = gp_ucb(make_validation(system=shared), seed=3, store=tmp_path / "a.sqlite").run(7)
+    second = gp_ucb(make_validation(system=shared), seed=3, store=first.store).run(12)
     assert facts(second.trials) == facts(whole.trials)
 
 
@@ -148,22 +154,22 @@ def test_an_interrupted_execution_is_repeated_as_the_same_trial(validation: Vali
                 interrupt_at_once()
             return super().execute(controller, task)
 
-    whole = Campaign(make_validation(system=FaultyRig(validation.system)), seed=1).run(10)
+    whole = gp_ucb(make_validation(system=FaultyRig(validation.system)), seed=1).run(10)
     stopped = make_validation(system=Interrupting(validation.system))
     store = tmp_path / "a.sqlite"
     with pytest.raises(KeyboardInterrupt):
-        Campaign(stopped, seed=1, store=store).run(10)
-    resumed = Campaign(stopped, seed=1, store=store).run(10)
+        gp_ucb(stopped, seed=1, store=store).run(10)
+    resumed = gp_ucb(stopped, seed=1, store=store).run(10)
     assert facts(resumed.trials) == facts(whole.trials)
     assert [t.attempts for t in resumed.trials] == [1] * 6 + [2] + [1] * 3
 
 
 def test_asking_and_telling_by_hand_equals_running(validation: Validation) -> None:
-    by_hand = Campaign(validation, seed=6)
+    by_hand = gp_ucb(validation, seed=6)
     for _ in range(9):
         opened = by_hand.ask()
         by_hand.tell(opened, validation.system.execute(opened.plan.controller, opened.plan.task))
-    assert facts(by_hand.trials) == facts(Campaign(validation, seed=6).run(9).trials)
+    assert facts(by_hand.trials) == facts(gp_ucb(validation, seed=6).run(9).trials)
 
 
 def test_a_trial_can_be_told_later_by_its_number(validation: Validation, tmp_path: Path) -> None:
@@ -230,7 +236,7 @@ def test_a_model_that_fails_stops_the_campaign_and_the_next_run_goes_on_behind_i
             return {}
 
     model = Bad()
-    campaign = Campaign(make_validation(model=model))
+    campaign = gp_ucb(make_validation(model=model))
     with pytest.raises(ModelError, match="model's closed loop diverged at step 1"):
         campaign.run(3)
     assert (campaign.executions, len(campaign.failed)) == (0, 1)
@@ -248,7 +254,7 @@ def test_a_distance_of_nan_stops_the_campaign_but_keeps_the_execution(validation
 
 
 def test_verdicts_are_executed_facts_or_undecided(validation: Validation) -> None:
-    campaign = Campaign(validation).run(8)
+    campaign = gp_ucb(validation).run(8)
     assert campaign.worst is not None
     worst = campaign.worst.distance or 0
     falsified = campaign.verdict(worst * 0.9)
@@ -313,7 +319,7 @@ def origins(campaign: Campaign) -> list[str]:
 
 
 def test_an_audit_adds_independent_draws_until_there_are_so_many(validation: Validation) -> None:
-    campaign = Campaign(validation, seed=2).run(7)
+    campaign = gp_ucb(validation, seed=2).run(7)
     assert origins(campaign.audit(4))[7:] == ["iid"] * 4
     assert len(campaign.audit(4).trials) == 11  # a total, as the budget is
     assert len(campaign.audit(6).trials) == 13
@@ -354,7 +360,7 @@ def test_the_points_of_many_audits_are_uniform() -> None:
 
 
 def test_a_search_goes_on_after_an_audit_and_knows_what_it_showed(validation: Validation, tmp_path: Path) -> None:
-    whole = Campaign(validation, seed=4).run(6).audit(3).run(12)
+    whole = gp_ucb(validation, seed=4).run(6).audit(3).run(12)
     for act in (
         lambda c: c.run(6),
         lambda c: c.audit(1),
@@ -362,7 +368,7 @@ def test_a_search_goes_on_after_an_audit_and_knows_what_it_showed(validation: Va
         lambda c: c.run(10),
         lambda c: c.run(12),
     ):
-        pieces = act(Campaign(validation, seed=4, store=tmp_path / "a.sqlite"))
+        pieces = act(gp_ucb(validation, seed=4, store=tmp_path / "a.sqlite"))
     assert facts(pieces.trials) == facts(whole.trials)
     assert origins(whole) == ["initial"] * 5 + ["acquisition"] + ["iid"] * 3 + ["acquisition"] * 3
 
@@ -375,15 +381,15 @@ def test_an_audit_finishes_what_was_interrupted_first(validation: Validation, tm
                 interrupt_at_once()
             return super().execute(controller, task)
 
-    whole = Campaign(make_validation(system=FaultyRig(validation.system)), seed=1).run(7).audit(4)
+    whole = gp_ucb(make_validation(system=FaultyRig(validation.system)), seed=1).run(7).audit(4)
     stopped = make_validation(system=Interrupting(validation.system))
-    campaign = Campaign(stopped, seed=1, store=tmp_path / "a.sqlite")
+    campaign = gp_ucb(stopped, seed=1, store=tmp_path / "a.sqlite")
     with pytest.raises(KeyboardInterrupt):
         campaign.run(7)
     with pytest.raises(KeyboardInterrupt):
         campaign.run(7).audit(4)
     assert campaign.trials[-1].state == "open"
-    resumed = Campaign(stopped, seed=1, store=tmp_path / "a.sqlite").audit(4)
+    resumed = gp_ucb(stopped, seed=1, store=tmp_path / "a.sqlite").audit(4)
     assert facts(resumed.trials) == facts(whole.trials)
 
 
@@ -408,12 +414,12 @@ def test_a_campaign_stops_before_the_execution_that_is_not_needed(validation: Va
         asked.append(campaign.executions)
         return campaign.executions >= 7
 
-    campaign = Campaign(validation, seed=1)
+    campaign = gp_ucb(validation, seed=1)
     assert campaign.run(20, until=enough).executions == 7
     assert asked == list(range(8))
     assert campaign.run(20, until=enough).executions == 7
     assert campaign.run(5, until=lambda _: False).executions == 7
-    assert facts(campaign.trials) == facts(Campaign(validation, seed=1).run(7).trials)
+    assert facts(campaign.trials) == facts(gp_ucb(validation, seed=1).run(7).trials)
 
 
 @pytest.mark.usefixtures("few_draws")
@@ -471,10 +477,10 @@ def test_an_interrupt_while_planning_leaves_no_ghost_in_the_search(validation: V
 
     hasty = make_validation()
     hasty.synthesizer = Impatient()
-    campaign = Campaign(hasty, seed=2)
+    campaign = gp_ucb(hasty, seed=2)
     with pytest.raises(KeyboardInterrupt):
         campaign.run(10)
-    assert facts(campaign.run(10).trials) == facts(Campaign(validation, seed=2).run(10).trials)
+    assert facts(campaign.run(10).trials) == facts(gp_ucb(validation, seed=2).run(10).trials)
 
 
 def test_an_interrupted_trial_that_cannot_be_planned_any_more_is_passed_over(tmp_path: Path) -> None:
@@ -484,9 +490,9 @@ def test_an_interrupted_trial_that_cannot_be_planned_any_more_is_passed_over(tmp
 
     plain = make_validation()
     with pytest.raises(KeyboardInterrupt):
-        Campaign(make_validation(system=Stopped(plain.system)), store=tmp_path / "a.sqlite").run(3)
+        gp_ucb(make_validation(system=Stopped(plain.system)), store=tmp_path / "a.sqlite").run(3)
     again = make_validation(system=Stopped(plain.system))
-    campaign = Campaign(again, store=tmp_path / "a.sqlite")
+    campaign = gp_ucb(again, store=tmp_path / "a.sqlite")
     whole, again.synthesizer.design = again.synthesizer.design, None  # type: ignore[attr-defined, method-assign]
     with pytest.raises(CtxvalError):
         campaign.run(3)

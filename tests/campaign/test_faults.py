@@ -468,7 +468,7 @@ def test_what_a_system_prints_does_not_spoil_the_json(tmp_path: Path) -> None:
             capture_output=True,
             text=True,
             cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": str(HERE)},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path])},
             check=False,
         )
         assert done.returncode == 0, done.stderr

@@ -14,8 +14,10 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Store, TaskSpace, Validation, distances, models, searches
 from ctxval._util.arrays import Array
+from ctxval._util.describe import describe
 from ctxval.config.settings import read_settings
 from ctxval.errors import DistanceError, InputError, StoreMismatchError
+from ctxval.gp.kernels import Matern
 from ctxval.testing import FaultyRig
 
 DATA = Path(__file__).parents[1] / "data"
@@ -283,6 +285,59 @@ def test_a_store_with_the_older_name_of_a_search_goes_on(
         Campaign(make_validation(), search=searches.CMAES(), store=path, seed=2)
 
 
+# Without a search
+
+
+@pytest.mark.parametrize(
+    "search",
+    [
+        SEARCH(beta=3.0, noise=(1e-6, 0.5)),
+        searches.Auto(designs=40),
+        searches.Random(),
+        searches.SamplingDiscarding(2),
+        searches.Annealing(cooling=0.9),
+        searches.Repeated(searches.Scalar(initial=2), 2),
+    ],
+    ids=lambda search: type(search).__name__,
+)
+def test_a_campaign_goes_on_with_the_search_that_its_store_was_made_with(tmp_path: Path, search: Any) -> None:
+    whole = Campaign(make_validation(), search=search, seed=2).run(6)
+    Campaign(make_validation(), search=search, seed=2, store=tmp_path / "a.sqlite").run(4)
+    resumed = Campaign(make_validation(), seed=2, store=tmp_path / "a.sqlite")
+    assert type(resumed.search) is type(search)
+    assert describe(resumed.search) == describe(search)
+    points = [[trial.unit_point.tolist() for trial in one.trials] for one in (resumed.run(6), whole)]
+    assert points[0] == points[1]
+
+
+def test_a_store_of_version_0_1_0_resumes_with_its_search(old: Path) -> None:
+    settings = read_settings("cart.toml", {"search": "gp-ucb"})
+    experiment = settings.load()
+    resumed = Campaign(experiment.validation, name=experiment.name, store=old / "cart-0.1.0.sqlite")
+    assert isinstance(resumed.search, searches.GPUCB)
+    assert resumed.run(resumed.executions + 1).trials[-1].origin == "acquisition"
+
+
+class Random(searches.Random):
+    """A user's own search, under the name of a ready-made one."""
+
+
+@pytest.mark.parametrize(
+    ("search", "called"),
+    [(SEARCH(kernel=Matern(2.5)), "GPUCB"), (SEARCH(prior_mean=np.sum), "GPUCB"), (Random(), "Random")],
+)
+def test_a_search_that_cannot_be_made_again_must_be_given(tmp_path: Path, search: Any, called: str) -> None:
+    Campaign(make_validation(), search=search, seed=2, store=tmp_path / "a.sqlite")
+    with pytest.raises(StoreMismatchError, match=rf"a\.sqlite was made with the search '{called}'.*search= in Python"):
+        Campaign(make_validation(), seed=2, store=tmp_path / "a.sqlite")
+    assert Campaign(make_validation(), search=search, seed=2, store=tmp_path / "a.sqlite").search is search
+
+
+def test_a_new_campaign_has_the_search_of_the_command_line() -> None:
+    default = read_settings("pendulum", {}).search.build()
+    assert describe(Campaign(make_validation()).search) == describe(default) == describe(searches.Auto())
+
+
 # Changed while it is open
 
 
@@ -334,8 +389,10 @@ def test_what_is_told_while_distances_are_measured_anew_is_measured_anew_too(tmp
 
     second = campaign(path)
     second.remeasure(Telling(scale=100.0))
+    plan = first.validation.plan
+    measure, space = first.validation.measure, first.validation.space
     plain = [
-        first.validation.measure(first._plan(t), m) for t in second.trials for m in [second.trajectories(t)[1]] if m
+        measure(plan(space.from_unit(t.unit_point)), m) for t in second.trials for m in [second.trajectories(t)[1]] if m
     ]
     np.testing.assert_allclose([t.distance for t in second.trials], 100 * np.array(plain))
     assert len(plain) == 3

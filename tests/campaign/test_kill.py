@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import make_validation
-from ctxval import Campaign, Store
+from ctxval import Campaign, Store, searches
 
 BUDGET = 12
 SCRIPT = Path(__file__).parents[1] / "kill_me.py"
@@ -42,7 +42,7 @@ def content(store: Path) -> list[tuple[object, ...]]:
 def resumed(store: Path) -> tuple[list[tuple[object, ...]], list[tuple[object, ...]]]:
     """Resume a campaign that was killed; return what was completed before, and everything afterwards."""
     before = [row for row in content(store) if row[2] == "completed"]
-    Campaign(make_validation(), store=store, seed=11, name="killed").run(BUDGET)
+    Campaign(make_validation(), search=searches.GPUCB(), store=store, seed=11, name="killed").run(BUDGET)
     return before, content(store)
 
 

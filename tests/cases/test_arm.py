@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from ctxval import Campaign, Experiment, Validation, cases, distances, grid_truth
+from ctxval import Campaign, Experiment, Validation, cases, distances, grid_truth, searches
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, first_difference
 from ctxval.cases import arm
@@ -152,7 +152,7 @@ def test_the_grid_finds_a_distance_that_is_attained(experiment: Experiment) -> N
 
 
 def test_a_campaign_runs_on_it(experiment: Experiment) -> None:
-    campaign = Campaign(experiment.validation, seed=0).run(7)
+    campaign = Campaign(experiment.validation, search=searches.GPUCB(), seed=0).run(7)
     assert len(campaign.completed) == 7
     assert campaign.worst is not None
 

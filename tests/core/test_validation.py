@@ -315,6 +315,38 @@ def test_an_execution_that_is_not_whole_and_finite_fails_with_its_reason(
     assert np.isnan(validation.distances(points(2))).all()
 
 
+def test_accepting_checks_and_measures_at_once() -> None:
+    validation = make()
+    plan = validation.plan(POINT)
+    whole = validation.system.execute(plan.controller, plan.task)
+    accepted = validation.accept(plan, whole)
+    assert (accepted.distance, accepted.unusable) == (validation.measure(plan, whole), None)
+
+
+def test_accepting_refuses_what_is_no_execution_of_the_plan() -> None:
+    validation = make()
+    plan = validation.plan(POINT)
+    whole = validation.system.execute(plan.controller, plan.task)
+    for broken in (None, "fell over", stopped(whole), Trajectory(whole.times, whole.states * np.nan, whole.inputs)):
+        with pytest.raises(ExecutionError):
+            validation.accept(plan, broken)
+    moved = Trajectory(whole.times, whole.states + np.array([1.0, 0.0]), whole.inputs)
+    with pytest.raises(InputError, match="starts elsewhere"):
+        validation.accept(plan, moved)
+    assert validation.accept(plan, moved, start_tolerance=10.0).distance is not None
+
+
+@pytest.mark.parametrize("distance", [lambda a, b, task: np.nan, lambda a, b, task: 1 / 0, lambda a, b, task: -1.0])
+def test_an_accepted_execution_without_a_usable_distance_says_why(distance: object) -> None:
+    validation = make(distance=distance)
+    plan = validation.plan(POINT)
+    whole = validation.system.execute(plan.controller, plan.task)
+    with pytest.raises(DistanceError) as error:
+        validation.measure(plan, whole)
+    accepted = validation.accept(plan, whole)
+    assert (accepted.distance, accepted.unusable) == (None, str(error.value))
+
+
 def test_a_system_that_diverges_fails_with_the_step() -> None:
     system = Simulated(lambda x, u: np.where(x > 0.4, np.nan, STEP(x, u)), vectorized=True)
     with pytest.raises(ExecutionError, match=r"^diverged at step 1$"):

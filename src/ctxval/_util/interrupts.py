@@ -92,8 +92,8 @@ def _function_of(handler: object) -> FunctionType | None:
 
 
 @contextmanager
-def kept_alive() -> Iterator[None]:
-    """Make an exit of this very process, which no exception would show, an exception; forked processes may exit.
+def exits_as_exceptions() -> Iterator[None]:
+    """Turn ``os._exit`` of this process into an exception; forked processes may exit.
 
     A recursion limit that is set inside is taken back, as little of this package would run under a small one.
     """

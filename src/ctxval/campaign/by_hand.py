@@ -13,13 +13,15 @@ from typing import Any
 
 from ctxval._util.files import csv_rows
 from ctxval._util.texts import unguarded
-from ctxval.campaign.campaign import Campaign, OpenTrial
+from ctxval.campaign.known import KnownExecution, TrialResult, check_known
+from ctxval.campaign.trials import OpenTrial
 from ctxval.core.controller import AffineFeedback
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.experiment import Experiment, labels_of
+from ctxval.core.plan import Plan
 from ctxval.core.space import TaskSpace
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.validation import Plan
+from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 
 _RESULTS = ("trajectory", "distance", "failed")
@@ -125,19 +127,18 @@ class KnownRun:
     failed: str | None = None
 
     def checked(
-        self, campaign: Campaign, experiment: Experiment, resample: bool, tolerance: float
-    ) -> Trajectory | None:
-        """Return its recording, if it has one, after a check that all of it can be taken in.
+        self, validation: Validation, experiment: Experiment, resample: bool, tolerance: float
+    ) -> KnownExecution:
+        """Return the execution with its recording, if it has one, after a check that it can be taken in.
 
         Raises:
             InputError: it cannot.
         """
-        point = campaign.validation.space.point(self.parameters)
+        point = validation.space.point(self.parameters)
         recording = None
         if self.trajectory is not None:
-            recording = read_recording(self.trajectory, experiment, campaign.validation.plan(point), resample=resample)
-        campaign.known(self.parameters, recording, distance=self.distance, failed=self.failed, tolerance=tolerance)
-        return recording
+            recording = read_recording(self.trajectory, experiment, validation.plan(point), resample=resample)
+        return check_known(validation, point, TrialResult(recording, self.distance, self.failed), tolerance)
 
 
 def read_runs(files: Sequence[Path], parameters: Mapping[str, Any] | None, space: TaskSpace) -> list[KnownRun]:

@@ -1,37 +1,37 @@
-"""The campaign: the only object with a life."""
+"""The campaign: a search for the worst task, with budget, failures and storage."""
 
 from __future__ import annotations
 
 import concurrent.futures as cf
-import time
-from collections import Counter, deque
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ctxval._util.interrupts import Interrupts, kept_alive
-from ctxval._util.texts import text_of
-from ctxval.campaign import display
-from ctxval.campaign.ledger import Ledger, OpenTrial
-from ctxval.campaign.workers import Crew, Ended, crew
+from ctxval._util.arrays import Array
+from ctxval.campaign import display, remeasuring
+from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
+from ctxval.campaign.identity import description_of, identify, search_of
+from ctxval.campaign.known import KnownExecution, TrialResult, check_known, told_distance
+from ctxval.campaign.results import CampaignResults
+from ctxval.campaign.trials import Choice, OpenTrial, TrialRecorder
+from ctxval.campaign.workers import WorkerPool, worker_pool
 from ctxval.certificates import RESOLUTION, CertificateOptions, Provenance, StoppingRule, Verdict, judge
 from ctxval.certificates.options import CONFIDENCE
+from ctxval.core.distance import Distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
-from ctxval.errors import CtxvalError, ExecutionError, InputError
-from ctxval.gp.surrogate import Surrogate, fit_surrogate
-from ctxval.plot import overview
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from pandas import DataFrame
+from ctxval.core.validation import Validation
+from ctxval.errors import InputError
+from ctxval.searches import Search
+from ctxval.storage.store import Store
 
 __all__ = ["Campaign", "OpenTrial"]
 
 
-class Campaign(Ledger):
+class Campaign(CampaignResults):
     """A search for the worst task, with everything stored before and after each execution.
 
     The budget is a total: running again resumes, and a resumed campaign makes the choices that it would have made
@@ -39,7 +39,8 @@ class Campaign(Ledger):
 
     Args:
         validation: the map p -> d(p).
-        search: chooses the tasks; GP-UCB as in the paper by default.
+        search: chooses the tasks. If it is not given, a new store has ``auto``, as on the command line, and an existing
+            one goes on with the search that it was made with.
         store: file of the trials; in memory by default.
         seed: of the search's randomness, not negative.
         name: what the store calls the experiment.
@@ -50,32 +51,37 @@ class Campaign(Ledger):
     Raises:
         InputError: a value cannot be used.
         DistanceError: a stored execution cannot be measured anew; nothing is changed.
-        StoreError: the store cannot be used, or was made by another experiment.
+        StoreError: the store cannot be used, was made by another experiment, or has a search that must be given.
     """
 
-    @property
-    def worst(self) -> Trial | None:
-        """The completed trial with the largest distance."""
-        return max(self.completed, key=_distance, default=None)
+    def __init__(
+        self,
+        validation: Validation,
+        *,
+        search: Search | None = None,
+        store: Store | str | Path | None = None,
+        seed: int = 0,
+        name: str = "",
+        accept_change: str | None = None,
+        remeasure: bool = False,
+    ) -> None:
+        if not isinstance(validation, Validation):
+            raise InputError(f"validation must be a Validation, got {validation!r}.")
+        if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+            raise InputError(f"seed must be an integer >= 0, got {seed!r}.")
+        if search is not None and not isinstance(search, Search):
+            raise InputError(f"search must have reset, ask and tell, got {search!r}.")
+        self.seed = int(seed)
+        self.name = name
+        trials = store if isinstance(store, Store) else Store(store)
+        self.search: Search = search_of(trials) if search is None else search
+        description = description_of(validation, self.search, self.seed, name)
+        identify(trials, validation, description, accept_change, remeasure)
+        super().__init__(TrialRecorder(validation, self.search, trials, self.seed, description))
+        if remeasure:
+            self.remeasure()
 
-    @property
-    def estimate(self) -> float | None:
-        """The search's estimate of d*: the largest distance, after discarding where the search discards (SD).
-
-        Where the search repeats its tasks, the largest mean distance of a task that was executed that often.
-        """
-        ordered = sorted(self._heights(), reverse=True)
-        discard = getattr(self.search, "discard", 0)
-        return ordered[discard] if len(ordered) > discard else None
-
-    def _heights(self) -> list[float]:
-        times = getattr(self.search, "times", 1)
-        if times == 1:
-            return [_distance(trial) for trial in self.completed]
-        tasks: dict[bytes, list[float]] = {}
-        for trial in self.completed:
-            tasks.setdefault(trial.unit_point.tobytes(), []).append(_distance(trial))
-        return [float(np.mean(found)) for found in tasks.values() if len(found) >= times]
+    # The verdict
 
     def verdict(
         self,
@@ -101,19 +107,6 @@ class Campaign(Ledger):
         chosen = certificate or CertificateOptions.posterior(confidence, stochastic=stochastic, resolution=resolution)
         known = Provenance.of(self.store.description(), self.store.history())
         return judge(self.trials, threshold, chosen, replace(known, space=self.validation.space))
-
-    def surrogate(self) -> Surrogate:
-        """Return the GP of the distance over the task space, whichever search chose the trials.
-
-        Raises:
-            InputError: fewer than two distances are known.
-        """
-        own = getattr(self.search, "surrogate", None)
-        if own is not None:
-            surrogate: Surrogate = own()
-            return surrogate
-        points = np.array([trial.unit_point for trial in self.completed])
-        return fit_surrogate(points, np.array([_distance(trial) for trial in self.completed]))
 
     # Running
 
@@ -144,7 +137,7 @@ class Campaign(Ledger):
             executor: of ``concurrent.futures``, in place of own processes.
             timeout: seconds after which an execution has failed; it then runs in a process of its own.
             retries: how often the execution of a trial is repeated whose worker was lost.
-            retry_failures: how often it is repeated where the system itself failed.
+            retry_failures: how often it is repeated if the system itself failed.
 
         Raises:
             InputError: a value cannot be used, or the system cannot be sent to the workers.
@@ -152,14 +145,16 @@ class Campaign(Ledger):
                 executed is stored; running again goes on behind the trial that failed.
             CampaignError: the workers are gone.
         """
+        total = _count("budget must be a positive integer", budget)
+        by_search = Choice(planned_draws=total if until is None else 0)
 
-        def chosen() -> OpenTrial | None:
-            return None if until is not None and until(self) else self._open(None, attempts=1)
+        def rule() -> Choice | None:
+            return None if until is not None and until(self) else by_search
 
-        hands, patience = self._crew(workers, executor, timeout), _Patience(retries, retry_failures)
-        if retry_failures and hands is None:
+        pool, retry = self._pool(workers, executor, timeout), RetryPolicy(retries, retry_failures)
+        if retry_failures and pool is None:
             raise InputError("retry_failures is for workers, an executor or a timeout, and none is given.")
-        return self._carry_out(self._within(budget, chosen, budget if until is None else 0), hands, on_trial, patience)
+        return self._execute(Schedule(self._recorder, rule, total), pool, on_trial, retry)
 
     def run_until_decided(
         self,
@@ -191,33 +186,19 @@ class Campaign(Ledger):
             InputError, ModelError, DesignError, DistanceError, CampaignError: as :meth:`run` does.
             CertificateError: the confidence is not a probability.
         """
-        rule = StoppingRule(
-            threshold,
-            certificate or CertificateOptions.posterior(confidence, stochastic=stochastic, resolution=resolution),
-        )
+        total = _count("budget must be a positive integer", budget)
+        by = certificate or CertificateOptions.posterior(confidence, stochastic=stochastic, resolution=resolution)
+        stopping = StoppingRule(threshold, by)
 
-        def chosen() -> OpenTrial | None:
-            now = rule.decide(self.trials, budget - self.executions)
+        def rule() -> Choice | None:
+            now = stopping.decide(self.trials, total - self.executions)
             if now.decided:
                 return None
-            return self._open(None if now.next_point is None else (now.next_point, "covering"), attempts=1)
+            # What is found decides how many draws there are, so their number is not planned.
+            return Choice(now.next_point, "covering", planned_draws=0)
 
-        hands = self._crew(workers, executor, timeout)
-        return self._carry_out(self._within(budget, chosen, 0), hands, on_trial, _Patience())
-
-    def _within(
-        self, budget: int, chosen: Callable[[], OpenTrial | None], draws: int
-    ) -> Callable[[int], OpenTrial | None]:
-        """Return what is wanted, given how many executions are running: what was interrupted, then what is chosen."""
-        _require_count("budget must be a positive integer", budget)
-        self._planned = int(draws)  # how many independent draws there are to be; 0 if what is found ends them
-
-        def wanted(running: int) -> OpenTrial | None:
-            if self.executions + running >= budget:
-                return None
-            return self._reopen(self._again.popleft()) if self._again else chosen()
-
-        return wanted
+        pool = self._pool(workers, executor, timeout)
+        return self._execute(Schedule(self._recorder, rule, total), pool, on_trial)
 
     def audit(
         self,
@@ -239,69 +220,153 @@ class Campaign(Ledger):
             InputError: the number is not a positive integer.
             ModelError, DesignError, DistanceError: as :meth:`run` does.
         """
-        _require_count("an audit needs a positive number of draws", draws)
+        planned = _count("an audit needs a positive number of draws", draws)
 
-        def wanted(running: int) -> OpenTrial | None:
-            if self._again:
-                return self._reopen(self._again.popleft())
-            enough = sum(trial.origin == "iid" for trial in self._trials) >= draws
-            return None if enough else self._open((self._draws.point(self._trials), "iid"), attempts=1)
+        def rule() -> Choice | None:
+            drawn = sum(trial.origin == "iid" for trial in self.trials)
+            return None if drawn >= planned else Choice(self._recorder.draw(), "iid", planned_draws=planned)
 
-        self._planned = int(draws)
-        return self._carry_out(wanted, self._crew(workers, executor, timeout), on_trial, _Patience())
+        return self._execute(Schedule(self._recorder, rule), self._pool(workers, executor, timeout), on_trial)
 
-    def _crew(self, workers: int | None, executor: cf.Executor | None, timeout: float | None) -> Crew | None:
+    def _pool(self, workers: int | None, executor: cf.Executor | None, timeout: float | None) -> WorkerPool | None:
         system = self.validation.system
         if getattr(system, "manual", False):
             raise InputError(
                 "this system is executed by people, not by run or audit: take tasks with ask and say what happened "
                 "with tell, in Python or as `ctxval ask` and `ctxval tell`."
             )
-        return crew(system, workers=workers, executor=executor, timeout=timeout)
+        return worker_pool(system, workers=workers, executor=executor, timeout=timeout)
 
-    def _carry_out(
+    def _execute(
         self,
-        wanted: Callable[[int], OpenTrial | None],
-        hands: Crew | None,
+        schedule: Schedule,
+        pool: WorkerPool | None,
         on_trial: Callable[[Trial], None] | None,
-        patience: _Patience,
+        retry: RetryPolicy | None = None,
     ) -> Campaign:
-        """Execute what is wanted, given how many executions are running, until nothing is."""
-        with self.store.sole_writer(), Interrupts() as interrupts, kept_alive():
-            self._refresh()
-            if self.unmeasured:
-                self.remeasure()
-            self._again = deque(trial for trial in self._trials if trial.state == "open" and trial.attempts)
-            try:
-                if hands is None:
-                    self._one_by_one(wanted, on_trial, interrupts)
-                else:
-                    _Together(self, hands, on_trial, patience).carry_out(wanted, interrupts)
-            finally:
-                self._executing.clear()
+        execute_schedule(schedule, pool, on_trial, retry or RetryPolicy())
         return self
 
-    def _one_by_one(
-        self,
-        wanted: Callable[[int], OpenTrial | None],
-        on_trial: Callable[[Trial], None] | None,
-        interrupts: Interrupts,
-    ) -> None:
-        while (opened := wanted(0)) is not None:
-            with interrupts.shielded():
-                self._execute(opened, on_trial)
-            interrupts.raise_if_asked()
+    # By hand
 
-    def _execute(self, opened: OpenTrial, on_trial: Callable[[Trial], None] | None) -> None:
-        started = time.perf_counter()
-        try:
-            trajectory = self.validation.execute(opened.plan)
-        except ExecutionError as error:
-            ended = self._close(opened.trial, failure=text_of(error), seconds=time.perf_counter() - started)
-        else:
-            ended = self._measure(opened, trajectory, time.perf_counter() - started)
-        if on_trial is not None:
-            on_trial(ended)
+    def ask(
+        self,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        draw: bool = False,
+        because: str | None = None,
+        wait: float = 0.0,
+    ) -> OpenTrial:
+        """Open the next trial: the search's choice, the task with these parameters, or an independent uniform draw.
+
+        Args:
+            parameters: of a task that you chose yourself.
+            draw: for an audit.
+            because: what was changed on the system since the task of these parameters was executed before.
+            wait: seconds to wait for another process that is asking.
+
+        Raises:
+            InputError: the parameters are not of the task space.
+            StoreAccessError: another process is running the store.
+            ModelError, DesignError: no controller could be designed and run on the model; the trial is stored as
+                failed and costs no execution.
+        """
+        if because is not None and (parameters is None or not because.strip()):
+            raise InputError('a reason such as "fuse replaced" is given for a task that was executed before.')
+        with self.store.sole_writer(wait):
+            self._recorder.refresh()
+            if parameters is not None:
+                return self._recorder.open(Choice(self._unit_point(parameters), "manual", because))
+            return self._recorder.open(Choice(self._recorder.draw(), "iid") if draw else Choice())
+
+    def reopen(self, number: int) -> OpenTrial:
+        """Return an open trial again, with its task and controller.
+
+        Raises:
+            InputError: there is no such trial, or it is not open.
+        """
+        self._recorder.refresh()
+        trial = self._recorder.open_trial(number)
+        return OpenTrial(trial, self._recorder.plan(trial))
+
+    def tell(
+        self,
+        opened: OpenTrial | int,
+        trajectory: Trajectory | None = None,
+        *,
+        distance: float | None = None,
+        failed: str | None = None,
+        start_tolerance: float | None = None,
+    ) -> Trial:
+        """Record how an open trial, or the one of this number, ended: its trajectory, its distance, or why it failed.
+
+        Raises:
+            InputError: not exactly one of them is given, the trial is not open, or the trajectory is of another task.
+            ExecutionError: the trajectory is not a whole execution of the trial's task; the trial stays open.
+            DistanceError: the distance gave no usable number; the execution is stored.
+        """
+        recorder = self._recorder
+        recorder.refresh()
+        trial = recorder.open_trial(opened.number if isinstance(opened, OpenTrial) else int(opened))
+        if isinstance(opened, OpenTrial) and not np.array_equal(opened.trial.unit_point, trial.unit_point):
+            raise InputError(f"this open trial {opened.number} is of another campaign.")
+        told = TrialResult(trajectory, distance, failed)
+        with recorder.not_executing(trial):
+            trial = recorder.open_trial(trial.number)
+            if told.failed is not None:
+                return recorder.fail(trial, told.failed)
+            if told.distance is not None:
+                return recorder.complete(trial, told_distance(told.distance))
+            plan = opened.plan if isinstance(opened, OpenTrial) else recorder.plan(trial)
+            return recorder.complete(
+                trial, self.validation.accept(plan, told.trajectory, start_tolerance), told.trajectory
+            )
+
+    def add(
+        self,
+        parameters: Mapping[str, Any],
+        trajectory: Trajectory | None = None,
+        *,
+        distance: float | None = None,
+        failed: str | None = None,
+        start_tolerance: float | None = None,
+        wait: float = 0.0,
+    ) -> Trial | None:
+        """Record an execution that was made before, with the origin manual; None if it is in the store already.
+
+        It counts as an execution.
+
+        Raises:
+            InputError, ExecutionError: as :meth:`tell` does; nothing is stored then.
+            ModelError, DesignError: the task cannot be planned; nothing is stored.
+        """
+        point = self.validation.space.point(parameters)
+        told = TrialResult(trajectory, distance, failed)
+        return self.add_known(check_known(self.validation, point, told, start_tolerance), wait)
+
+    def add_known(self, known: KnownExecution, wait: float = 0.0) -> Trial | None:
+        """Record an execution that ``campaign.known.check_known`` has checked; None if it is in the store already."""
+        return self._recorder.add(known, wait)
+
+    def _unit_point(self, parameters: Mapping[str, Any]) -> Array:
+        return self.validation.space.to_unit(self.validation.space.point(parameters))
+
+    # Measuring again
+
+    def remeasure(self, distance: Distance | None = None) -> list[Trial]:
+        """Measure the distance of every stored execution anew, without an execution; return the trials that changed.
+
+        The values of before stay in the store's history. A distance that was told without a trajectory cannot be
+        measured anew: if the definition has changed, its trial has no distance from then on.
+
+        Args:
+            distance: the distance from now on; the one of the validation if it is not given.
+
+        Raises:
+            DistanceError: the distance of a trial that had one cannot be measured any more; nothing is changed.
+            StoreAccessError: another process is running the store.
+        """
+        return remeasuring.remeasure(self._recorder, distance)
 
     # What a person sees
 
@@ -311,136 +376,9 @@ class Campaign(Ledger):
     def _repr_html_(self) -> str:
         return display.as_html(self)
 
-    def to_dataframe(self) -> DataFrame:
-        """Return the trials as a table of pandas, one row for each.
 
-        The columns are number, origin, state, one for each task parameter (``name[0], name[1], ...`` for a vector),
-        distance, seconds, attempts and failure. A parameter that is called like another column, such as ``distance``,
-        is in the column ``parameters.distance``. What is not known is missing.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
-        return display.to_dataframe(self.trials, self.validation.space)
-
-    def plot(self, *, units: str = "", ax: Axes | None = None) -> Axes:
-        """Draw the surrogate over one task parameter, or else the distances in their order; return the axes.
-
-        Args:
-            units: the distance's.
-            ax: matplotlib axes to draw into; new ones of ``matplotlib.pyplot`` by default.
-
-        Raises:
-            InputError: no distance is known.
-        """
-        return overview(self, units=units, ax=ax)
-
-
-@dataclass(frozen=True)
-class _Patience:
-    """How often an execution is repeated: where the worker was lost, and where the system failed."""
-
-    losses: int = 2
-    failures: int = 0
-
-    def __post_init__(self) -> None:
-        for name, value in (("retries", self.losses), ("retry_failures", self.failures)):
-            if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-                raise InputError(f"{name} must be an integer >= 0, got {value!r}.")
-
-
-class _Together:
-    """Many executions at a time, of one campaign."""
-
-    def __init__(
-        self, campaign: Campaign, hands: Crew, on_trial: Callable[[Trial], None] | None, patience: _Patience
-    ) -> None:
-        self.campaign, self.hands, self.on_trial, self.patience = campaign, hands, on_trial, patience
-        self.running: dict[int, OpenTrial] = {}
-        self.losses: Counter[int] = Counter()
-        self.failures: Counter[int] = Counter()
-        self.stopped: BaseException | None = None
-
-    def carry_out(self, wanted: Callable[[int], OpenTrial | None], interrupts: Interrupts) -> None:
-        """Keep the workers busy; whatever stops that, first wait for the executions that are running."""
-        try:
-            while True:
-                self._start_wanted(wanted, interrupts)
-                if not self.running:
-                    break
-                with interrupts.shielded():
-                    self._take(self.hands.wait())
-        finally:
-            self.hands.close()
-        if self.stopped is not None:
-            raise self.stopped
-        interrupts.raise_if_asked()
-
-    def _start_wanted(self, wanted: Callable[[int], OpenTrial | None], interrupts: Interrupts) -> None:
-        while self.stopped is None and not interrupts.asked and len(self.running) < self.hands.size:
-            try:
-                opened = wanted(len(self.running))
-                if opened is None:
-                    return
-                self._start(opened)
-            except (CtxvalError, KeyboardInterrupt) as error:
-                self.stopped = error
-                if self.running and isinstance(error, KeyboardInterrupt):
-                    interrupts.announce()
-
-    def _start(self, opened: OpenTrial) -> None:
-        self.hands.start(opened.number, opened.plan)
-        self.running[opened.number] = opened
-
-    def _take(self, ended: Ended) -> None:
-        opened = self.running.pop(ended.number)
-        try:
-            closed = self._closed(opened, ended)
-        except CtxvalError as error:
-            self.stopped = self.stopped or error
-            return
-        if closed is not None and self.on_trial is not None:
-            self.on_trial(closed)
-
-    def _closed(self, opened: OpenTrial, ended: Ended) -> Trial | None:
-        """Store how an execution ended; None where it is repeated."""
-        number, campaign = ended.number, self.campaign
-        if ended.lost is not None:
-            self.losses[number] += 1
-            if self.losses[number] <= self.patience.losses:
-                self._repeat(opened)
-                return None
-            reason = f"the worker was lost {self.losses[number]} times, at last: {ended.lost}"
-            return campaign._close(opened.trial, failure=text_of(reason))
-        failure = ended.failure or self._refused(opened, ended.trajectory)
-        if failure is not None:
-            self.failures[number] += 1
-            if self.failures[number] <= self.patience.failures:
-                self._repeat(opened)
-                return None
-            return campaign._close(opened.trial, failure=text_of(failure), seconds=ended.seconds)
-        assert ended.trajectory is not None
-        return campaign._measure(opened, ended.trajectory, ended.seconds)
-
-    def _refused(self, opened: OpenTrial, trajectory: Trajectory | None) -> str | None:
-        """Return why what a worker returned is no execution; None if it is one."""
-        try:
-            self.campaign.validation.require(opened.plan, trajectory)
-        except (ExecutionError, InputError) as error:
-            return str(error)
-        return None
-
-    def _repeat(self, opened: OpenTrial) -> None:
-        if self.stopped is None:
-            begun = self.campaign._begin_again(opened.trial)
-            self._start(OpenTrial(begun, opened.plan))
-
-
-def _require_count(sentence: str, count: object) -> None:
+def _count(sentence: str, count: object) -> int:
+    """Return a positive integer, or raise with the sentence."""
     if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
         raise InputError(f"{sentence}, got {count!r}.")
-
-
-def _distance(trial: Trial) -> float:
-    assert trial.distance is not None  # completed trials have one
-    return trial.distance
+    return int(count)

@@ -15,7 +15,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Change, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreMismatchError
-from ctxval.searches import Search
+from ctxval.searches import DEFAULT, NAMES, Repeated, Search, by_name
 from ctxval.storage.store import Store
 
 VERSION = 2
@@ -40,10 +40,66 @@ def description_of(validation: Validation, search: Search, seed: int, name: str)
     return plain
 
 
+def search_of(store: Store) -> Search:
+    """Return the search that a store was made with, made again from its description; the default one for a new store.
+
+    Raises:
+        StoreMismatchError: it cannot be made from what the store says of it.
+    """
+    described = _with_present_names(store.description()).get("search")
+    search = by_name(DEFAULT) if described is None else _search_described(described)
+    if search is None:
+        kind = described.get("type", "unknown") if isinstance(described, dict) else described
+        raise StoreMismatchError(
+            f"{store.name} was made with the search {kind!r}, which cannot be made again from what the store says of "
+            "it; open it with that search (search= in Python)."
+        )
+    return search
+
+
+def _search_described(described: Any) -> Search | None:
+    """Return a ready-made search from its description; None if it is none or has options other than numbers."""
+    if not isinstance(described, dict):
+        return None
+    if described.get("type") == Repeated.__name__:
+        inner, times = _ready_made(described.get("search")), described.get("times")
+        search: Search | None = None if inner is None or not isinstance(times, int) else Repeated(inner, times)
+    else:
+        search = _ready_made(described)
+    # A user's own search of the same name, and options that are no numbers, do not come back as they were.
+    return search if search is not None and _plain(search) == described else None
+
+
+def _ready_made(described: Any) -> Search | None:
+    """Return the search of a description, with those options that are not the default ones."""
+    if not isinstance(described, dict):
+        return None
+    kind = next((kind for kind in NAMES.values() if kind.__name__ == described.get("type")), None)
+    if kind is None:
+        return None
+    default = _plain(kind())
+    options = {name: value for name, value in described.items() if value != default.get(name)}
+    if not all(_is_numeric(value) for value in options.values()):
+        return None
+    try:
+        search: Search = kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in options.items()})
+    except (TypeError, InputError):
+        return None
+    return search
+
+
+def _is_numeric(value: Any) -> bool:
+    return all(isinstance(item, int | float | None) for item in (value if isinstance(value, list) else [value]))
+
+
+def _plain(value: Any) -> Any:
+    """Return the description of an object as a store gives it back."""
+    return json.loads(json.dumps(describe(value)))
+
+
 def with_distance(description: dict[str, Any], distance: Distance) -> dict[str, Any]:
     """Return a description with another distance; the rest stays as it was described."""
-    described = json.loads(json.dumps(describe(distance)))
-    return {**description, "validation": {**description["validation"], "distance": described}}
+    return {**description, "validation": {**description["validation"], "distance": _plain(distance)}}
 
 
 def identify(

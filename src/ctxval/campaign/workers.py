@@ -1,4 +1,4 @@
-"""Executions on many workers: processes of this computer, or any executor of ``concurrent.futures``."""
+"""Pools of workers that execute tasks: processes of this computer, or any executor of ``concurrent.futures``."""
 
 from __future__ import annotations
 
@@ -21,65 +21,59 @@ from typing import Any, NoReturn
 import numpy as np
 
 from ctxval._util.cores import can_fork, forking
-from ctxval._util.interrupts import kept_alive, raised_by_signal
+from ctxval._util.interrupts import exits_as_exceptions, raised_by_signal
 from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller
+from ctxval.core.plan import Plan
 from ctxval.core.system import System
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.validation import Plan
 from ctxval.errors import CampaignError, InputError
 
-_GRACE = 2.0
+_GRACE_PERIOD = 2.0
 """Seconds that a worker has to clean up before it is killed."""
 
 _TERMINATED = 143
-"""Exit status of a worker that was asked to leave, as shells have it for SIGTERM."""
+"""Exit status of a worker that was asked to end, as shells have it for SIGTERM."""
 
-_POLL = 0.5
+_POLL_INTERVAL = 0.5
 """Seconds between two looks at what cannot be waited for."""
 
 
 @dataclass(frozen=True, eq=False)
-class Ended:
-    """How an execution on a worker ended.
+class ExecutionResult:
+    """How an execution ended, before anybody has checked its trajectory.
 
     Attributes:
-        number: of its trial.
-        trajectory: what the system returned, whole or not; None where there is none.
+        trajectory: what the system returned, whole or not; None if there is none.
         failure: why there is none: the system's own failure, or that it took too long.
         lost: why the worker is gone, which says nothing of the system.
-        seconds: how long the execution took.
+        seconds: how long the execution took; None if that is not known.
     """
 
-    number: int
     trajectory: Trajectory | None = None
     failure: str | None = None
     lost: str | None = None
     seconds: float | None = None
 
 
-def _not_ended_within(timeout: float, number: int, seconds: float) -> Ended:
-    return Ended(number, failure=f"the execution did not end within {timeout:g} s", seconds=seconds)
-
-
-Answer = tuple[Trajectory | None, str | None, float]
-"""What a worker returns: a trajectory, or why there is none; and the seconds."""
-
-
-def execute_task(system: System, controller: Controller, task: Task) -> Answer:
-    """Execute a task on the system, in a worker; what the system raises is an answer too."""
+def execute_task(system: System, controller: Controller, task: Task) -> ExecutionResult:
+    """Execute a task on the system, here or in a worker; what the system raises is a result too."""
     started = time.perf_counter()
     try:
         trajectory = system.execute(controller, task)
     except BaseException as error:
         if raised_by_signal(error):
             raise
-        return None, reason_of(error), time.perf_counter() - started
-    return trajectory, None, time.perf_counter() - started
+        return ExecutionResult(failure=reason_of(error), seconds=time.perf_counter() - started)
+    return ExecutionResult(trajectory, seconds=time.perf_counter() - started)
 
 
-class Crew(ABC):
+def _timed_out(timeout: float, seconds: float) -> ExecutionResult:
+    return ExecutionResult(failure=f"the execution did not end within {timeout:g} s", seconds=seconds)
+
+
+class WorkerPool(ABC):
     """Workers that execute one plan each.
 
     Attributes:
@@ -98,8 +92,8 @@ class Crew(ABC):
         """
 
     @abstractmethod
-    def wait(self) -> Ended:
-        """Return the next execution that has ended."""
+    def wait(self) -> tuple[int, ExecutionResult]:
+        """Wait for the next execution that ends; return the number of its trial, and how it ended."""
 
     @abstractmethod
     def close(self) -> None:
@@ -118,11 +112,17 @@ class _Worker:
     number: int | None = None
     started: float = 0.0
 
+    def release(self) -> int:
+        """Make it free for another execution; return the number of the trial that it has executed."""
+        number, self.number = self.number, None
+        assert number is not None
+        return number
 
-class Processes(Crew):
+
+class ProcessPool(WorkerPool):
     """Processes of this computer, each with its own copy of the system.
 
-    Where processes can be forked the system need not be picklable. A worker that dies or takes too long is replaced.
+    If processes can be forked, the system need not be picklable. A worker that dies or takes too long is replaced.
 
     Args:
         system: what they execute.
@@ -137,7 +137,7 @@ class Processes(Crew):
 
     def start(self, number: int, plan: Plan) -> None:
         """Start the execution of a trial on a free worker."""
-        worker = next((one for one in self._workers if one.number is None), None) or self._hire()
+        worker = next((one for one in self._workers if one.number is None), None) or self._start_worker()
         try:
             message = pickle.dumps((plan.controller, plan.task))
         except Exception as error:
@@ -150,12 +150,12 @@ class Processes(Crew):
         with contextlib.suppress(OSError):  # it died meanwhile, which wait() finds
             worker.pipe.send_bytes(message)
 
-    def _hire(self) -> _Worker:
+    def _start_worker(self) -> _Worker:
         ours, theirs = self._context.Pipe()
         others = [worker.pipe for worker in self._workers] + [ours]
         forked = self._context.get_start_method() == "fork"
         arguments = (self.system, theirs, others if forked else [], os.getpid())
-        process = self._context.Process(target=_serve, args=arguments, daemon=False)
+        process = self._context.Process(target=_run_worker, args=arguments, daemon=False)
         try:
             with forking():
                 process.start()
@@ -168,8 +168,8 @@ class Processes(Crew):
         self._workers.append(worker)
         return worker
 
-    def wait(self) -> Ended:
-        """Return the next execution that has ended."""
+    def wait(self) -> tuple[int, ExecutionResult]:
+        """Wait for the next execution that ends; return the number of its trial, and how it ended."""
         while True:
             busy = [worker for worker in self._workers if worker.number is not None]
             ready = wait_for([worker.pipe for worker in busy], self._remaining(busy))
@@ -185,28 +185,24 @@ class Processes(Crew):
             return None
         return max(0.0, min(worker.started for worker in busy) + self.timeout - time.monotonic())
 
-    def _received(self, worker: _Worker) -> Ended:
-        number, worker.number = worker.number, None
-        assert number is not None
+    def _received(self, worker: _Worker) -> tuple[int, ExecutionResult]:
+        number = worker.release()
         try:
-            trajectory, failure, seconds = pickle.loads(worker.pipe.recv_bytes())
+            result: ExecutionResult = pickle.loads(worker.pipe.recv_bytes())
         except (EOFError, OSError, pickle.UnpicklingError):
-            self._dismiss(worker)
-            return _gone(number, worker.process.exitcode)
-        return Ended(number, trajectory, failure, seconds=seconds)
+            self._stop(worker)
+            return number, _result_of_exit(worker.process.exitcode)
+        return number, result
 
-    def _too_late(self, worker: _Worker) -> Ended:
-        number, worker.number = worker.number, None
-        assert number is not None
+    def _too_late(self, worker: _Worker) -> tuple[int, ExecutionResult]:
         assert self.timeout is not None
-        self._dismiss(worker)
-        seconds = time.monotonic() - worker.started
-        return _not_ended_within(self.timeout, number, seconds)
+        self._stop(worker)
+        return worker.release(), _timed_out(self.timeout, time.monotonic() - worker.started)
 
-    def _dismiss(self, worker: _Worker) -> None:
+    def _stop(self, worker: _Worker) -> None:
         """End a worker: it may clean up first, as a command's process must go with it."""
         worker.process.terminate()
-        worker.process.join(_GRACE)
+        worker.process.join(_GRACE_PERIOD)
         if worker.process.is_alive():
             worker.process.kill()
             worker.process.join()
@@ -218,17 +214,17 @@ class Processes(Crew):
         for worker in self._workers:
             worker.process.terminate()
         for worker in list(self._workers):
-            self._dismiss(worker)
+            self._stop(worker)
 
 
-def _serve(system: System, pipe: Connection, others: list[Connection], parent: int) -> None:
+def _run_worker(system: System, pipe: Connection, others: list[Connection], parent: int) -> None:
     """Execute what comes through the pipe, until it is closed."""
     # Ctrl-C reaches every process of a terminal; which execution ends is decided by the campaign.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(signal.SIGTERM, _exit_on_signal)
     for other in others:
         other.close()
-    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+    threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
     # A copy of the campaign's randomness would give every worker the same noise.
     np.random.seed()  # noqa: NPY002
     random.seed()
@@ -237,42 +233,37 @@ def _serve(system: System, pipe: Connection, others: list[Connection], parent: i
             controller, task = pickle.loads(pipe.recv_bytes())
         except EOFError:
             return
-        with kept_alive():
-            answer = execute_task(system, controller, task)
-        pipe.send_bytes(pickle.dumps(answer))
+        with exits_as_exceptions():
+            result = execute_task(system, controller, task)
+        pipe.send_bytes(pickle.dumps(result))
 
 
-def _gone(number: int, status: int | None) -> Ended:
+def _result_of_exit(status: int | None) -> ExecutionResult:
     """Return what the end of a worker's process says: who ends by itself has failed, who is killed is lost."""
-    if status is None or status < 0 or status == _TERMINATED:
-        how = (
-            "by signal 15"
-            if status == _TERMINATED
-            else "for no known reason"
-            if status is None
-            else f"by signal {-status}"
-        )
-        return Ended(number, lost=f"the worker ended {how}")
-    return Ended(number, failure=f"the system ended its process with status {status}")
+    if status is None:
+        return ExecutionResult(lost="the worker ended for no known reason")
+    if status < 0 or status == _TERMINATED:
+        return ExecutionResult(lost=f"the worker ended by signal {-status if status < 0 else signal.SIGTERM:d}")
+    return ExecutionResult(failure=f"the system ended its process with status {status}")
 
 
-def _leave(_signal: int, _frame: FrameType | None) -> NoReturn:
+def _exit_on_signal(_signal: int, _frame: FrameType | None) -> NoReturn:
     raise SystemExit(_TERMINATED)
 
 
-def _watch(parent: int) -> None:
-    """Leave with the campaign: an execution whose result nobody takes must not go on beside its repetition."""
+def _exit_with_parent(parent: int) -> None:
+    """End with the campaign: an execution whose result nobody takes must not go on beside its repetition."""
     while os.getppid() == parent:
-        time.sleep(_POLL)
+        time.sleep(_POLL_INTERVAL)
     os.kill(os.getpid(), signal.SIGTERM)
-    time.sleep(_GRACE)
+    time.sleep(_GRACE_PERIOD)
     os._exit(1)
 
 
 # Any executor
 
 
-class Executor(Crew):
+class ExecutorPool(WorkerPool):
     """An executor of ``concurrent.futures``: a pool of threads or processes, Dask, and others.
 
     A system in a pool of threads is shared by all of them. What takes too long is cancelled; a thread cannot be, and
@@ -287,7 +278,7 @@ class Executor(Crew):
 
     def __init__(self, system: System, executor: cf.Executor, size: int, timeout: float | None = None) -> None:
         self.system, self.executor, self.size, self.timeout = system, executor, size, timeout
-        self._running: dict[cf.Future[Answer], tuple[int, float]] = {}
+        self._running: dict[cf.Future[ExecutionResult], tuple[int, float]] = {}
 
     def start(self, number: int, plan: Plan) -> None:
         """Start the execution of a trial."""
@@ -300,19 +291,19 @@ class Executor(Crew):
             raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
         self._running[future] = number, time.monotonic()
 
-    def wait(self) -> Ended:
-        """Return the next execution that has ended."""
+    def wait(self) -> tuple[int, ExecutionResult]:
+        """Wait for the next execution that ends; return the number of its trial, and how it ended."""
         while True:
-            cf.wait(self._running, timeout=_POLL, return_when=cf.FIRST_COMPLETED)
+            cf.wait(self._running, timeout=_POLL_INTERVAL, return_when=cf.FIRST_COMPLETED)
             for future, (number, started) in list(self._running.items()):
                 seconds = time.monotonic() - started
                 if future.done():
                     del self._running[future]
-                    return self._ended(number, future)
+                    return number, self._result(future)
                 if self.timeout is not None and seconds >= self.timeout:
                     del self._running[future]
                     future.cancel()
-                    return _not_ended_within(self.timeout, number, seconds)
+                    return number, _timed_out(self.timeout, seconds)
             # What was sent while a client looked for its scheduler stays pending for ever.
             self._await_scheduler()
 
@@ -323,22 +314,21 @@ class Executor(Crew):
             CampaignError: it has given up. The trials stay open, so that the campaign can go on with another.
         """
         while self._status() == "connecting":
-            time.sleep(_POLL)
+            time.sleep(_POLL_INTERVAL)
         if self._status() == "closed":
             raise CampaignError("the executor takes no more work: its scheduler is gone.")
 
     def _status(self) -> str:
         return str(getattr(getattr(self.executor, "_client", None), "status", "running"))
 
-    def _ended(self, number: int, future: cf.Future[Answer]) -> Ended:
+    def _result(self, future: cf.Future[ExecutionResult]) -> ExecutionResult:
         try:
-            trajectory, failure, seconds = future.result()
+            return future.result()
         except (Exception, cf.CancelledError) as error:
             if _is_loss(error):
                 self._await_scheduler()
-                return Ended(number, lost=reason_of(error))
+                return ExecutionResult(lost=reason_of(error))
             raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
-        return Ended(number, trajectory, failure, seconds=seconds)
 
     def close(self) -> None:
         """Cancel what has not started; the executor is its owner's."""
@@ -352,14 +342,14 @@ def _is_loss(error: BaseException) -> bool:
     return isinstance(error, known) or type(error).__module__.split(".")[0] == "distributed"
 
 
-def crew(
+def worker_pool(
     system: System,
     *,
     workers: int | None = None,
     executor: cf.Executor | None = None,
     timeout: float | None = None,
-) -> Crew | None:
-    """Return the workers that are asked for; None where one execution after the other runs here.
+) -> WorkerPool | None:
+    """Return the workers that are asked for; None if one execution after the other runs in this process.
 
     Raises:
         InputError: a value cannot be used.
@@ -373,7 +363,7 @@ def crew(
             raise InputError(f"executor must be one of concurrent.futures, got {type(executor).__name__}.")
         # Every pool of the standard library has it, under this name.
         size = getattr(executor, "_max_workers", 1) if workers is None else workers
-        return Executor(system, executor, int(size), timeout)
+        return ExecutorPool(system, executor, int(size), timeout)
     if (workers or 1) > 1 or timeout is not None:
-        return Processes(system, workers or 1, timeout)
+        return ProcessPool(system, workers or 1, timeout)
     return None

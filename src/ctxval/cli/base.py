@@ -118,8 +118,8 @@ Timeout = Annotated[float | None, typer.Option(help="Seconds after which an exec
 
 
 @contextmanager
-def hands(workers: int | None, dask: str | None, timeout: float | None) -> Iterator[dict[str, Any]]:
-    """Yield what a campaign needs to know of those that execute.
+def worker_options(workers: int | None, dask: str | None, timeout: float | None) -> Iterator[dict[str, Any]]:
+    """Yield the options of a campaign's run that say who executes: processes, or the workers of a Dask scheduler.
 
     Raises:
         InputError: there is no such scheduler, or it has no workers.

@@ -173,20 +173,10 @@ def import_runs(
     for run in runs:
         # All of it before any is stored.
         try:
-            checked.append((run, run.checked(opened.campaign, opened.experiment, resample, tolerance)))
+            checked.append(run.checked(opened.campaign.validation, opened.experiment, resample, tolerance))
         except InputError as error:
             raise InputError(f"{run.where}: {error}") from error
-    ended = [
-        opened.campaign.add(
-            run.parameters,
-            recording,
-            distance=run.distance,
-            failed=run.failed,
-            start_tolerance=tolerance,
-            wait=_WAIT,
-        )
-        for run, recording in checked
-    ]
+    ended = [opened.campaign.add_known(execution, _WAIT) for execution in checked]
     new = [trial for trial in ended if trial is not None]
     report = {
         "imported": [_ended(trial, opened) for trial in new],

@@ -26,13 +26,13 @@ from ctxval.cli.base import (
     command,
     err,
     failures_of,
-    hands,
     print_failures,
     print_other_stores,
     print_table,
     print_verdict,
     progress,
     say_error,
+    worker_options,
     worst_of,
 )
 from ctxval.cli.case_options import CaseOptions, case_options
@@ -91,8 +91,8 @@ def run(
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
     total = experiment.budget if settings.budget is None else settings.budget
     execute = _until_decided(campaign, limit, settings) if until_decided else campaign.run
-    with hands(workers, dask, timeout) as given_hands, progress(campaign, total, show=not as_json) as on_trial:
-        execute(budget=total, on_trial=on_trial, **given_hands)
+    with worker_options(workers, dask, timeout) as execution, progress(campaign, total, show=not as_json) as on_trial:
+        execute(budget=total, on_trial=on_trial, **execution)
     known = experiment.truth() if truth and experiment.truth is not None else None
     verdict = None if limit is None else campaign.verdict(limit, certificate=settings.certificate_options)
     report = _report(campaign, experiment, settings, total, path, verdict, known)

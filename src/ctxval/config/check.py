@@ -11,9 +11,10 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.texts import reason_of
 from ctxval.core.experiment import Experiment, labels_of
+from ctxval.core.plan import Plan
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.validation import Plan, Validation
+from ctxval.core.validation import Validation
 from ctxval.errors import ConformanceError, CtxvalError
 from ctxval.testing import check_distance, check_model, check_synthesizer
 

@@ -19,11 +19,10 @@ from ctxval.config.signatures import code_named, signed, unsigned, verifies
 from ctxval.core.experiment import Experiment, labels_of
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError, UnknownNameError
+from ctxval.searches import DEFAULT as DEFAULT_SEARCH
 from ctxval.searches import REGISTRY as SEARCHES
 from ctxval.searches import Search, by_name
 from ctxval.storage.store import Store
-
-DEFAULT_SEARCH = "auto"
 
 
 class SearchTable(BaseModel):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
@@ -12,10 +11,11 @@ from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats, require_shape
 from ctxval._util.describe import describe
 from ctxval._util.interrupts import raised_by_signal
 from ctxval._util.representation import call, lines, shown
-from ctxval._util.texts import reason_of
-from ctxval.core.controller import Controller, Synthesizer
+from ctxval._util.texts import reason_of, text_of
+from ctxval.core.controller import Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model, Step, as_model
+from ctxval.core.plan import Measurement, Outcome, Plan
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.system import System
@@ -38,51 +38,6 @@ _CHUNK = 4096
 """Tasks in one batched call: enough to be fast, few enough for memory."""
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """Everything about a task that can be known before S is executed; one task or a batch.
-
-    Attributes:
-        parameters: p.
-        task: the task g_p.
-        controller: pi(x; g_p, M).
-        model_trajectory: the closed loop on the model.
-    """
-
-    parameters: Parameters
-    task: Task
-    controller: Controller
-    model_trajectory: Trajectory
-
-    def __repr__(self) -> str:
-        fields = ("parameters", "task", "controller", "model_trajectory")
-        return lines(type(self).__name__, *(f"{name}: {shown(getattr(self, name))}" for name in fields))
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """A plan after the execution of S.
-
-    Attributes:
-        plan: what was known before.
-        system_trajectory: the closed loop on the system.
-        distance: d(p).
-    """
-
-    plan: Plan
-    system_trajectory: Trajectory
-    distance: float
-
-    def __repr__(self) -> str:
-        known = {
-            "parameters": self.plan.parameters,
-            "task": self.plan.task,
-            "model_trajectory": self.plan.model_trajectory,
-            "system_trajectory": self.system_trajectory,
-        }
-        return lines(call(self, distance=self.distance), *(f"{name}: {shown(part)}" for name, part in known.items()))
-
-
 class Validation:
     """A system, a model of it, and what the model is for: the map p -> d(p).
 
@@ -93,8 +48,8 @@ class Validation:
         model: the model M, or a function ``(x, u) -> x_next``.
         synthesizer: how controllers are designed on M.
         distance: d between the trajectories of M and S.
-        start_tolerance: by how much each state may miss the task's initial state where an execution starts, as a share
-            of that state's range in the model's trajectory, or of its initial value where that is larger.
+        start_tolerance: by how much each state may miss the task's initial state when an execution starts, as a share
+            of that state's range in the model's trajectory, or of its initial value if that is larger.
 
     Raises:
         InputError: one of them is not what it should be; the message says which and what is missing.
@@ -185,13 +140,12 @@ class Validation:
                 raise
             raise ExecutionError(reason_of(error)) from error
         try:
-            self.require(plan, trajectory)
+            return self.require(plan, trajectory)
         except InputError as error:
             raise ExecutionError(str(error)) from error
-        return trajectory
 
-    def require(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> None:
-        """Check that a trajectory, wherever it comes from, is a whole and finite execution of a plan.
+    def require(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Trajectory:
+        """Check that a trajectory, wherever it comes from, is a whole and finite execution of a plan; return it.
 
         Args:
             plan: of the task.
@@ -209,6 +163,27 @@ class Validation:
         if not trajectory.finite.all():
             raise ExecutionError("the system's trajectory is not finite")
         _require_task(plan, trajectory, self.start_tolerance if start_tolerance is None else start_tolerance)
+        return trajectory
+
+    def accept(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Measurement:
+        """Check that a trajectory is an execution of a plan, as :meth:`require` does, and measure its distance.
+
+        Every execution passes here, whether it was run, told, imported or returned by a worker.
+
+        Args:
+            plan: of the task.
+            trajectory: what the system returned, or a recording.
+            start_tolerance: in place of this validation's own.
+
+        Raises:
+            ExecutionError: it is no whole and finite execution.
+            InputError: it is of another task.
+        """
+        executed = self.require(plan, trajectory, start_tolerance)
+        try:
+            return Measurement(self.measure(plan, executed))
+        except DistanceError as error:
+            return Measurement(None, text_of(error))
 
     def measure(self, plan: Plan, trajectory: Trajectory) -> float:
         """Return d(p).
@@ -247,7 +222,7 @@ class Validation:
         return bool(getattr(self.system, "batched", False) and getattr(self.synthesizer, "batched", False))
 
     def distances(self, points: ArrayLike) -> Array:
-        """Return d at points ``(N, d)``, shape ``(N,)``; NaN where the execution fails. Executes S N times.
+        """Return d at points ``(N, d)``, shape ``(N,)``; NaN if the execution fails. Executes S N times.
 
         Raises:
             InputError, DesignError, ModelError: as in :meth:`plan`.

@@ -78,7 +78,7 @@ def _search(job: Job) -> Result:
     """Return the points and distances of one campaign, in order; of independent draws only the records."""
     experiment = job.experiment()
     search = searches.by_name(job.search)
-    if getattr(search, "iid", False):
+    if searches.BaseSearch.of(search).iid:
         # The points depend on no distance, so all of them are executed in one batch.
         search.reset(experiment.validation.space.dimension, job.seed)
         unit = search.ask(job.budget)

@@ -8,7 +8,7 @@ from ctxval._util.registry import Registry
 from ctxval.errors import InputError
 from ctxval.searches.annealing import Annealing
 from ctxval.searches.auto import Auto
-from ctxval.searches.base import Note, Prediction, Search, SequentialSearch
+from ctxval.searches.base import BaseSearch, Note, Prediction, Search, SequentialSearch
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 from ctxval.searches.cma_es import CMAES
 from ctxval.searches.gp_ucb import GPUCB
@@ -18,11 +18,13 @@ from ctxval.searches.trust_region import TrustRegion, TrustRegionSettings
 
 __all__ = [
     "CMAES",
+    "DEFAULT",
     "GPUCB",
     "NAMES",
     "REGISTRY",
     "Annealing",
     "Auto",
+    "BaseSearch",
     "BayesianOptimisation",
     "Climbs",
     "Note",
@@ -48,6 +50,9 @@ REGISTRY = Registry("search", __name__, method="ask")
 
 NAMES: dict[str, type[Any]] = {name: REGISTRY.find(name) for name in sorted((*REGISTRY.built_in, *REGISTRY.aliases))}
 """The searches of this package, by name; ``climbs`` and ``scalar`` are older names."""
+
+DEFAULT = "auto"
+"""The search of a new campaign that names none, in Python, in experiment files and on the command line."""
 
 
 def by_name(name: str, *, repeats: int = 1, **options: Any) -> Search:

@@ -12,6 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, Rows, as_floats
 from ctxval._util.representation import call, options, record
 from ctxval.errors import InputError, ShapeError
+from ctxval.gp.surrogate import Surrogate
 
 Note = dict[str, Any]
 """What a search thought when it chose a point, plain enough for JSON."""
@@ -23,12 +24,12 @@ class Prediction:
 
     Attributes:
         expected: points ``(m, d)`` -> the values expected ``(m,)``, and the doubt in what leads to each, ``(m,)``: 0
-            where all of it was seen before, about 1 where nothing was. Both are NaN where there is no saying.
+            if all of it was seen before, about 1 if nothing was. Both are NaN if nothing can be predicted.
         left_out: rows ``(k,)`` of the points with a known value, in the order of asking -> what would be expected
             there, ``(k,)``, had each not been evaluated.
         budget: how many points may be asked about in choosing one, the known ones not counted; each may cost a
             controller's design.
-        otherwise: finds what may be used where leaving points out shows that this one is no good.
+        otherwise: returns what may be used instead if leaving points out shows that this one is no good.
     """
 
     expected: Callable[[Array], tuple[Array, Array]]
@@ -48,15 +49,8 @@ class Search(Protocol):
     search that is reset with the same seed and told the same history asks for the same points. So a campaign
     resumes by telling, and saves no search.
 
-    Optional attributes:
-        iid: whether every point is an independent uniform draw (default False).
-        initial: how many first points are an initial design (default 0).
-        discard: how many of the largest values its estimate of the maximum leaves out (default 0).
-
-    Optional methods:
-        use_prediction(prediction): takes a :class:`Prediction`, or None, before each question.
-        note(): what it thought when it chose the point asked for last, plain enough for JSON, or None.
-        remember(notes): takes back, after a history was told, the note of each of its points.
+    These three methods are all that a search needs. One that has more to tell a campaign, such as independent draws or
+    notes, inherits :class:`BaseSearch`; attributes and methods of other classes are their own, whatever their names.
     """
 
     def reset(self, dimension: int, seed: int) -> None:
@@ -69,12 +63,96 @@ class Search(Protocol):
         """Learn the values ``(n,)`` at points ``(n, d)``; NaN for an evaluation that is pending or has failed."""
 
 
-class SequentialSearch(ABC):
-    """A search that proposes one point at a time from the history of all points."""
+class BaseSearch(ABC):
+    """Base class of searches that tell a campaign more than their next points; all ready-made ones inherit it.
 
-    iid = False
-    initial = 0
-    discard = 0
+    A subclass has the three methods of :class:`Search`. Everything else has a default, which does nothing.
+
+    Attributes:
+        iid: whether every point is an independent uniform draw.
+        initial: how many first points are an initial design.
+        discard: how many of the largest values its estimate of the maximum leaves out.
+    """
+
+    iid: bool = False
+    initial: int = 0
+    discard: int = 0
+
+    @staticmethod
+    def of(search: Search) -> BaseSearch:
+        """Return a search of this class as it is, and any other one with the defaults of this class."""
+        return search if isinstance(search, BaseSearch) else _WithDefaults(search)
+
+    @abstractmethod
+    def reset(self, dimension: int, seed: int) -> None:
+        """Forget everything and start on the unit cube of this dimension."""
+
+    @abstractmethod
+    def ask(self, n: int = 1) -> Array:
+        """Return the next points, shape ``(n, d)``; they are pending until told."""
+
+    @abstractmethod
+    def tell(self, points: ArrayLike, values: ArrayLike) -> None:
+        """Learn the values ``(n,)`` at points ``(n, d)``; NaN for an evaluation that is pending or has failed."""
+
+    @property
+    def uses_prediction(self) -> bool:
+        """Whether a prediction is made before each question: it is costly, and only who takes it needs it.
+
+        By default, whether the subclass has its own :meth:`use_prediction`.
+        """
+        return type(self).use_prediction is not BaseSearch.use_prediction
+
+    def use_prediction(self, prediction: Prediction | None) -> None:  # noqa: B027
+        """Take what is expected of values before the next question; None if nothing is."""
+
+    def note(self) -> Note | None:
+        """Return what it thought when it chose the point asked for last, plain enough for JSON; None if nothing."""
+        return None
+
+    def remember(self, notes: Sequence[Note | None]) -> None:  # noqa: B027
+        """Take back the note of each point of a history that was told, in their order."""
+
+    def estimate(self, points: Array, values: Array) -> float | None:
+        """Return the estimate of the maximum from known values, without the ``discard`` largest ones.
+
+        Args:
+            points: of the unit cube, shape ``(n, d)``.
+            values: shape ``(n,)``, finite.
+
+        Returns:
+            None if there are too few values.
+        """
+        ordered = np.sort(values)[::-1]
+        return float(ordered[self.discard]) if len(ordered) > self.discard else None
+
+    def surrogate(self) -> Surrogate | None:
+        """Return the Gaussian process of the values that it searches by; None if it has none of its own.
+
+        Raises:
+            InputError: too few values are known.
+        """
+        return None
+
+
+class _WithDefaults(BaseSearch):
+    """A search of another class, of which only the three methods of the protocol are used."""
+
+    def __init__(self, search: Search) -> None:
+        self._search = search
+
+    def reset(self, dimension: int, seed: int) -> None:
+        self._search.reset(dimension, seed)
+
+    def ask(self, n: int = 1) -> Array:
+        return self._search.ask(n)
+
+    def tell(self, points: ArrayLike, values: ArrayLike) -> None:
+        self._search.tell(points, values)
+
+
+class SequentialSearch(BaseSearch):
+    """A search that proposes one point at a time from the history of all points."""
 
     def reset(self, dimension: int, seed: int) -> None:
         """Forget everything and start on the unit cube of this dimension."""
@@ -172,7 +250,7 @@ class SequentialSearch(ABC):
 
     @property
     def notes(self) -> tuple[Note | None, ...]:
-        """What was thought when each was chosen; None where nothing was, or the point was told by hand."""
+        """What was thought when each was chosen; None if nothing was, or if the point was told by hand."""
         return tuple(self._notes)
 
     def __repr__(self) -> str:

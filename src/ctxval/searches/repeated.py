@@ -9,7 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
-from ctxval.searches.base import Note, Prediction, Search, SequentialSearch
+from ctxval.searches.base import BaseSearch, Note, Prediction, Search, SequentialSearch
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,10 +18,10 @@ class _Means:
 
     Attributes:
         points: shape ``(k, d)``.
-        values: means of what is known there, ``(k,)``; NaN where nothing is.
+        values: mean of the known values of each, ``(k,)``; NaN if there are none.
         counts: how many evaluations each has, pending and failed ones too, ``(k,)``.
         first: row of the first evaluation in the history, ``(k,)``.
-        evaluated: row of the first known value among all known ones, ``(k,)``; meaningless where nothing is known.
+        evaluated: row of the first known value among all known ones, ``(k,)``; meaningless if there are none.
         last: which of them was evaluated last.
     """
 
@@ -51,7 +51,7 @@ class _Means:
 class Repeated(SequentialSearch):
     """A search for the largest mean value of a noisy function: each point that it asks for is evaluated some times.
 
-    A point that somebody else chose is repeated as well, where it was evaluated last.
+    A point that somebody else chose is repeated as well, if it was evaluated last.
 
     Args:
         search: chooses the points; it is told the mean of what is known at each.
@@ -68,13 +68,19 @@ class Repeated(SequentialSearch):
             raise InputError(f"each point must be evaluated at least once, got times = {times}.")
         self.search = search
         self.times = times
-        self.initial = times * getattr(search, "initial", 0)
-        self.discard = getattr(search, "discard", 0)
+        self._inner = BaseSearch.of(search)
+        self.initial = times * self._inner.initial
+        self.discard = self._inner.discard
 
     def reset(self, dimension: int, seed: int) -> None:
         """Forget everything and start on the unit cube of this dimension."""
         super().reset(dimension, seed)
         self._prediction: Prediction | None = None
+
+    @property
+    def uses_prediction(self) -> bool:
+        """Whether the search that chooses the points takes a prediction."""
+        return self._inner.uses_prediction
 
     def use_prediction(self, prediction: Prediction | None) -> None:
         """Take what is expected before the next question, for the search that chooses the points."""
@@ -86,21 +92,33 @@ class Repeated(SequentialSearch):
         means = _Means.of(points, self.values, self._slots.values()) if len(points) else None
         if means is not None and means.counts[means.last] < self.times:
             return np.asarray(means.points[means.last])
-        self.search.reset(self.dimension, self._seed)
+        self._inner.reset(self.dimension, self._seed)
         if means is not None:
             self._tell(means)
-        point = np.asarray(self.search.ask(1)[0])
-        self._thought = self.search.note() if hasattr(self.search, "note") else None
+        point = np.asarray(self._inner.ask(1)[0])
+        self._thought = self._inner.note()
         return point
 
     def _tell(self, means: _Means) -> None:
-        self.search.tell(means.points, means.values)
-        if hasattr(self.search, "remember"):
-            notes: list[Note | None] = [self.notes[row] for row in means.first.tolist()]
-            self.search.remember(notes)
-        if hasattr(self.search, "use_prediction"):
-            known = means.evaluated[np.isfinite(means.values)]
-            self.search.use_prediction(None if self._prediction is None else _by_point(self._prediction, known))
+        self._inner.tell(means.points, means.values)
+        notes: list[Note | None] = [self.notes[row] for row in means.first.tolist()]
+        self._inner.remember(notes)
+        known = means.evaluated[np.isfinite(means.values)]
+        self._inner.use_prediction(None if self._prediction is None else _by_point(self._prediction, known))
+
+    def estimate(self, points: Array, values: Array) -> float | None:
+        """Return the estimate of the largest mean from points that were evaluated often enough; None if there are none.
+
+        Args:
+            points: of the unit cube, shape ``(n, d)``.
+            values: shape ``(n,)``, finite.
+        """
+        groups: dict[bytes, list[int]] = {}
+        for row, point in enumerate(points):
+            groups.setdefault(point.tobytes(), []).append(row)
+        whole = [rows for rows in groups.values() if len(rows) >= self.times]
+        means = np.array([np.mean(values[rows]) for rows in whole])
+        return self._inner.estimate(points[[rows[0] for rows in whole]], means)
 
 
 def _by_point(prediction: Prediction, evaluated: Rows) -> Prediction:

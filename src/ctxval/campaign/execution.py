@@ -1,0 +1,204 @@
+"""The loop over executions: one after the other in this process, or many at a time on workers."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ctxval._util.interrupts import Interrupts, exits_as_exceptions
+from ctxval.campaign.remeasuring import remeasure
+from ctxval.campaign.trials import Choice, OpenTrial, TrialRecorder
+from ctxval.campaign.workers import ExecutionResult, WorkerPool, execute_task
+from ctxval.core.plan import Measurement, Plan
+from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
+from ctxval.errors import CtxvalError, ExecutionError, InputError
+
+OnTrial = Callable[[Trial], None]
+"""Called with each trial that has ended."""
+
+
+@dataclass(frozen=True)
+class RetryPolicy:
+    """How often the execution of one trial is repeated.
+
+    Attributes:
+        retries: if its worker was lost.
+        retry_failures: if the system failed.
+
+    Raises:
+        InputError: a number is not an integer >= 0.
+    """
+
+    retries: int = 2
+    retry_failures: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("retries", "retry_failures"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+                raise InputError(f"{name} must be an integer >= 0, got {value!r}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Schedule:
+    """What is executed next: first the trials that were interrupted, then what a rule chooses.
+
+    Attributes:
+        recorder: of the trials.
+        rule: returns the choice of a new trial; None if there is none as things stand. It is asked again once an
+            execution has ended.
+        budget: how many executions there are to be in all; None if the rule alone ends them.
+    """
+
+    recorder: TrialRecorder
+    rule: Callable[[], Choice | None]
+    budget: int | None = None
+
+    def next(self) -> Choice | Trial | None:
+        """Return the choice of a new trial, or a trial that was interrupted; None if nothing is to be executed now."""
+        recorder = self.recorder
+        if self.budget is not None and recorder.executions + recorder.executing >= self.budget:
+            return None
+        return recorder.interrupted or self.rule()
+
+
+def execute_schedule(schedule: Schedule, pool: WorkerPool | None, on_trial: OnTrial | None, retry: RetryPolicy) -> None:
+    """Execute what a schedule says until there is nothing more, as the only process that runs the store.
+
+    Args:
+        schedule: what is executed.
+        pool: workers; None to execute one trial after the other in this process.
+        on_trial: called with each trial that has ended.
+        retry: how often workers repeat an execution.
+    """
+    recorder = schedule.recorder
+    with recorder.store.sole_writer(), Interrupts() as interrupts, exits_as_exceptions():
+        recorder.refresh()
+        if any(trial.state == "unmeasured" for trial in recorder.trials):
+            remeasure(recorder)
+        try:
+            if pool is None:
+                _execute_in_turn(schedule, on_trial, interrupts)
+            else:
+                _ParallelExecution(schedule, pool, on_trial, retry).run(interrupts)
+        finally:
+            recorder.abandon_executions()
+
+
+def _execute_in_turn(schedule: Schedule, on_trial: OnTrial | None, interrupts: Interrupts) -> None:
+    recorder = schedule.recorder
+    while (chosen := schedule.next()) is not None:
+        opened = recorder.start(chosen)
+        with interrupts.shielded():
+            system, plan = recorder.validation.system, opened.plan
+            result = execute_task(system, plan.controller, plan.task)
+            try:
+                measurement = _measured(recorder.validation, plan, result)
+            except ExecutionError as error:
+                ended = recorder.fail(opened.trial, error, seconds=result.seconds)
+            else:
+                ended = recorder.complete(opened.trial, measurement, result.trajectory, result.seconds)
+            if on_trial is not None:
+                on_trial(ended)
+        interrupts.raise_if_asked()
+
+
+def _measured(validation: Validation, plan: Plan, result: ExecutionResult) -> Measurement:
+    """Return the distance of an execution.
+
+    Raises:
+        ExecutionError: it failed.
+    """
+    if result.failure is not None:
+        raise ExecutionError(result.failure)
+    try:
+        return validation.accept(plan, result.trajectory)
+    except InputError as error:
+        raise ExecutionError(str(error)) from error
+
+
+class _ParallelExecution:
+    """Many executions at a time.
+
+    Args:
+        schedule: what is executed.
+        pool: who executes it.
+        on_trial: called with each trial that has ended.
+        retry: how often an execution is repeated.
+    """
+
+    def __init__(self, schedule: Schedule, pool: WorkerPool, on_trial: OnTrial | None, retry: RetryPolicy) -> None:
+        self.schedule, self.pool, self.on_trial, self.retry = schedule, pool, on_trial, retry
+        self.recorder = schedule.recorder
+        self.running: dict[int, OpenTrial] = {}
+        self.losses: Counter[int] = Counter()
+        self.failures: Counter[int] = Counter()
+        self.stopped: BaseException | None = None
+
+    def run(self, interrupts: Interrupts) -> None:
+        """Keep the workers busy; whatever stops that, first wait for the executions that are running."""
+        try:
+            while True:
+                self._fill_pool(interrupts)
+                if not self.running:
+                    break
+                with interrupts.shielded():
+                    self._take(*self.pool.wait())
+        finally:
+            self.pool.close()
+        if self.stopped is not None:
+            raise self.stopped
+        interrupts.raise_if_asked()
+
+    def _fill_pool(self, interrupts: Interrupts) -> None:
+        while self.stopped is None and not interrupts.asked and len(self.running) < self.pool.size:
+            try:
+                chosen = self.schedule.next()
+                if chosen is None:
+                    return
+                self._start(self.recorder.start(chosen))
+            except (CtxvalError, KeyboardInterrupt) as error:
+                self.stopped = error
+                if self.running and isinstance(error, KeyboardInterrupt):
+                    interrupts.announce()
+
+    def _start(self, opened: OpenTrial) -> None:
+        self.pool.start(opened.number, opened.plan)
+        self.running[opened.number] = opened
+
+    def _take(self, number: int, result: ExecutionResult) -> None:
+        opened = self.running.pop(number)
+        try:
+            ended = self._lost(opened, result.lost) if result.lost is not None else self._ended(opened, result)
+        except CtxvalError as error:
+            self.stopped = self.stopped or error
+            return
+        if ended is not None and self.on_trial is not None:
+            self.on_trial(ended)
+
+    def _lost(self, opened: OpenTrial, reason: str) -> Trial | None:
+        """Repeat an execution whose worker was lost and return None; return its trial, failed, after too many."""
+        self.losses[opened.number] += 1
+        if self.losses[opened.number] <= self.retry.retries:
+            self._repeat(opened)
+            return None
+        said = f"the worker was lost {self.losses[opened.number]} times, at last: {reason}"
+        return self.recorder.fail(opened.trial, said)
+
+    def _ended(self, opened: OpenTrial, result: ExecutionResult) -> Trial | None:
+        """Store how an execution ended and return its trial; None if it failed and is repeated."""
+        try:
+            measurement = _measured(self.recorder.validation, opened.plan, result)
+        except ExecutionError as error:
+            self.failures[opened.number] += 1
+            if self.failures[opened.number] <= self.retry.retry_failures:
+                self._repeat(opened)
+                return None
+            return self.recorder.fail(opened.trial, error, seconds=result.seconds)
+        return self.recorder.complete(opened.trial, measurement, result.trajectory, result.seconds)
+
+    def _repeat(self, opened: OpenTrial) -> None:
+        if self.stopped is None:
+            self._start(self.recorder.repeat(opened))

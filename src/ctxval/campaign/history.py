@@ -1,0 +1,81 @@
+"""What a search learns from stored trials: the history that it is told, and a prediction from the trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Rows
+from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
+from ctxval.learning.prediction import predict_distance
+from ctxval.searches import Prediction
+from ctxval.storage.store import Store
+
+
+def history_of(trials: Sequence[Trial]) -> list[Trial]:
+    """Return the trials as a search keeps them: of a point that waits for its value there is one."""
+    told: list[Trial] = []
+    waiting: dict[bytes, int] = {}
+    for trial in trials:
+        key = trial.unit_point.tobytes()
+        if key in waiting:
+            slot = waiting[key]
+            told[slot] = replace(trial, note=told[slot].note)
+        else:
+            slot = waiting[key] = len(told)
+            told.append(trial)
+        if trial.distance is not None:
+            del waiting[key]
+    return told
+
+
+def predict_from(validation: Validation, store: Store, trials: Sequence[Trial]) -> Prediction | None:
+    """Return the distance that the trajectories executed so far predict; None if they predict nothing.
+
+    Args:
+        validation: the map p -> d(p).
+        store: of the trajectories.
+        trials: all of them.
+    """
+    executed = [
+        (trial, trajectory)
+        for trial in trials
+        if trial.state == "completed" and (trajectory := store.trajectory(trial.number, "system")) is not None
+    ]
+    prediction = predict_distance(validation, [(trial.unit_point, trajectory) for trial, trajectory in executed])
+    known = [trial for trial in history_of(trials) if trial.distance is not None]
+    if prediction is None or [trial.number for trial in known] == [trial.number for trial, _ in executed]:
+        return prediction
+    # A distance that was told alone is a value that the search knows, but no trajectory.
+    row_of = {trial.number: row for row, (trial, _) in enumerate(executed)}
+    rows = np.array([row_of.get(trial.number, -1) for trial in known], dtype=np.intp)
+    return _by_known_value(prediction, np.array([trial.unit_point for trial in known]), rows)
+
+
+def _by_known_value(prediction: Prediction, points: Array, executed: Rows) -> Prediction:
+    """Return a prediction whose rows are those of the known values.
+
+    Args:
+        prediction: its rows are those of the trajectories.
+        points: of the known values, shape ``(n, d)``.
+        executed: row of the trajectory of each, ``(n,)``; -1 if there is none.
+    """
+
+    def left_out(rows: Rows) -> Array:
+        found = np.empty(len(rows))
+        has_trajectory = executed[rows] >= 0
+        if has_trajectory.any():
+            found[has_trajectory] = prediction.left_out(executed[rows[has_trajectory]])
+        if not has_trajectory.all():
+            # Nothing was learned from this point, so what is expected there is what would be without it.
+            found[~has_trajectory] = prediction.expected(points[rows[~has_trajectory]])[0]
+        return found
+
+    def otherwise() -> Prediction | None:
+        other = None if prediction.otherwise is None else prediction.otherwise()
+        return None if other is None else _by_known_value(other, points, executed)
+
+    return replace(prediction, left_out=left_out, otherwise=otherwise)

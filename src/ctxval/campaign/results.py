@@ -1,0 +1,129 @@
+"""What a campaign has found so far."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval.campaign import display
+from ctxval.campaign.trials import TrialRecorder
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
+from ctxval.gp.surrogate import Surrogate, fit_surrogate
+from ctxval.plot import overview
+from ctxval.storage.store import Store
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from pandas import DataFrame
+
+
+class CampaignResults:
+    """The trials of a campaign and what follows from them; reads alone.
+
+    Args:
+        recorder: of the trials.
+    """
+
+    def __init__(self, recorder: TrialRecorder) -> None:
+        self._recorder = recorder
+
+    @property
+    def validation(self) -> Validation:
+        """The map p -> d(p), with the distance that is measured now."""
+        return self._recorder.validation
+
+    @property
+    def store(self) -> Store:
+        """Where the trials are."""
+        return self._recorder.store
+
+    @property
+    def trials(self) -> tuple[Trial, ...]:
+        """All trials in the order of asking."""
+        return self._recorder.trials
+
+    @property
+    def completed(self) -> list[Trial]:
+        """The trials with a distance."""
+        return [trial for trial in self.trials if trial.state == "completed"]
+
+    @property
+    def failed(self) -> list[Trial]:
+        """The trials that failed."""
+        return [trial for trial in self.trials if trial.state == "failed"]
+
+    @property
+    def unmeasured(self) -> list[Trial]:
+        """The trials that were executed but have no distance, because it could not be measured."""
+        return [trial for trial in self.trials if trial.state == "unmeasured"]
+
+    @property
+    def executions(self) -> int:
+        """How many executions of S have ended, well or badly."""
+        return self._recorder.executions
+
+    def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
+        """Return the trajectories of the model and of the system in a trial; None for one that is not stored."""
+        return self.store.trajectory(trial.number, "model"), self.store.trajectory(trial.number, "system")
+
+    @property
+    def worst(self) -> Trial | None:
+        """The completed trial with the largest distance."""
+        return max(self.completed, key=_distance, default=None)
+
+    @property
+    def estimate(self) -> float | None:
+        """The search's estimate of d*: the largest distance, unless the search discards some (SD) or repeats its tasks.
+
+        If it repeats them, the estimate is the largest mean distance of a task that was executed that often. It is None
+        if there are too few distances.
+        """
+        return self._recorder.search.estimate(*self._distances())
+
+    def surrogate(self) -> Surrogate:
+        """Return the GP of the distance over the task space, whichever search chose the trials.
+
+        Raises:
+            InputError: fewer than two distances are known.
+        """
+        own = self._recorder.search.surrogate()
+        return fit_surrogate(*self._distances()) if own is None else own
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the trials as a table of pandas, one row for each.
+
+        The columns are number, origin, state, one for each task parameter (``name[0], name[1], ...`` for a vector),
+        distance, seconds, attempts and failure. A parameter that is called like another column, such as ``distance``,
+        is in the column ``parameters.distance``. What is not known is missing.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        return display.to_dataframe(self.trials, self.validation.space)
+
+    def plot(self, *, units: str = "", ax: Axes | None = None) -> Axes:
+        """Draw the surrogate over one task parameter, or else the distances in their order; return the axes.
+
+        Args:
+            units: the distance's.
+            ax: matplotlib axes to draw into; new ones of ``matplotlib.pyplot`` by default.
+
+        Raises:
+            InputError: no distance is known.
+        """
+        return overview(self, units=units, ax=ax)
+
+    def _distances(self) -> tuple[Array, Array]:
+        """Return the points of the unit cube with a distance ``(n, d)``, and the distances ``(n,)``."""
+        completed = self.completed
+        points = np.array([trial.unit_point for trial in completed]).reshape(-1, self.validation.space.dimension)
+        return points, np.array([_distance(trial) for trial in completed])
+
+
+def _distance(trial: Trial) -> float:
+    assert trial.distance is not None  # completed trials have one
+    return trial.distance

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import make_validation
+from ctxval import Campaign, searches
+from ctxval._util.arrays import Array
+from ctxval.searches import BaseSearch, Prediction, Repeated, Search
+from ctxval.testing import check_search
+
+
+class Stranger:
+    """A search of three methods, whose other attributes are its own, whatever they are called."""
+
+    iid = "never"
+    initial = "x"
+    discard = None
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+
+    def reset(self, dimension: int, seed: int) -> None:
+        self.dimension, self.seed, self.told = dimension, seed, 0
+
+    def ask(self, n: int = 1) -> Array:
+        rng = np.random.default_rng([self.seed, self.told])
+        return rng.random((n, self.dimension))
+
+    def tell(self, points: Any, values: Any) -> None:
+        self.told += len(points)
+        self.times.append(float(self.told))
+
+    def use_prediction(self) -> None:
+        raise AssertionError("its own method, of another meaning")
+
+    note = remember = estimate = surrogate = use_prediction
+
+    def describe(self) -> dict[str, object]:
+        return {}
+
+
+class Bare:
+    """A search of three methods and nothing else."""
+
+    def reset(self, dimension: int, seed: int) -> None:
+        self.inner = Stranger()
+        self.inner.reset(dimension, seed)
+
+    def ask(self, n: int = 1) -> Array:
+        return self.inner.ask(n)
+
+    def tell(self, points: Any, values: Any) -> None:
+        self.inner.tell(points, values)
+
+    def describe(self) -> dict[str, object]:
+        return {}
+
+
+class Noting(BaseSearch):
+    """A search that inherits the base class and has two of its methods; it asks for one point after the other."""
+
+    iid = True
+
+    def reset(self, dimension: int, seed: int) -> None:
+        self.dimension, self.told, self.reminded = dimension, 0, list[Any]()
+
+    def ask(self, n: int = 1) -> Array:
+        return np.full((n, self.dimension), (self.told % 10) / 10)
+
+    def tell(self, points: Any, values: Any) -> None:
+        self.told += len(points)
+
+    def note(self) -> dict[str, Any]:
+        return {"told": self.told}
+
+    def remember(self, notes: Any) -> None:
+        self.reminded = list(notes)
+
+    def describe(self) -> dict[str, object]:
+        return {}
+
+
+@pytest.mark.parametrize("search", [Stranger(), Bare()])
+def test_a_campaign_takes_any_search_of_three_methods(search: Search, tmp_path: Any) -> None:
+    campaign = Campaign(make_validation(), search=search, store=tmp_path / "a.sqlite").run(3)
+    resumed = Campaign(make_validation(), search=search, store=tmp_path / "a.sqlite").run(5)
+    assert campaign.search is search
+    assert [trial.origin for trial in resumed.trials] == ["acquisition"] * 5
+    assert all(trial.note is None for trial in resumed.trials)
+    assert resumed.worst is not None
+    assert resumed.estimate == resumed.worst.distance
+    mean, _ = resumed.surrogate().predict(np.array([trial.unit_point for trial in resumed.trials]))
+    np.testing.assert_allclose(mean, [trial.distance for trial in resumed.trials], atol=1e-3)
+
+
+def test_any_search_of_three_methods_can_be_repeated() -> None:
+    repeated = Repeated(Stranger(), 2)
+    assert (repeated.initial, repeated.discard) == (0, 0)
+    campaign = Campaign(make_validation(), search=repeated).run(4)
+    points = [trial.unit_point.tolist() for trial in campaign.trials]
+    assert points[0] == points[1] != points[2] == points[3]
+
+
+def test_what_a_subclass_has_of_its_own_reaches_the_campaign(tmp_path: Any) -> None:
+    Campaign(make_validation(), search=Noting(), store=tmp_path / "a.sqlite").run(2, until=lambda _: False)
+    search = Noting()
+    resumed = Campaign(make_validation(), search=search, store=tmp_path / "a.sqlite")
+    assert [trial.origin for trial in resumed.trials] == ["iid", "iid"]
+    assert [trial.note["told"] for trial in resumed.trials if trial.note] == [0, 1]
+    assert search.reminded == [trial.note for trial in resumed.trials]
+
+
+def test_only_a_search_that_takes_a_prediction_is_given_one() -> None:
+    given: list[Prediction | None] = []
+
+    class Predicting(searches.Random):
+        def use_prediction(self, prediction: Prediction | None) -> None:
+            given.append(prediction)
+
+    assert Predicting().uses_prediction
+    assert Repeated(Predicting()).uses_prediction
+    assert searches.Auto().uses_prediction
+    for search in (searches.GPUCB(), Repeated(searches.GPUCB()), BaseSearch.of(Stranger())):
+        assert not search.uses_prediction
+    Campaign(make_validation(), search=Predicting()).run(2)
+    assert len(given) == 2
+
+
+def test_the_estimate_of_the_maximum_is_the_search_s() -> None:
+    points, values = np.array([[0.1], [0.1], [0.2], [0.2], [0.3]]), np.array([1.0, 3.0, 2.5, 2.7, 9.0])
+    assert searches.Random().estimate(points, values) == 9.0
+    assert searches.SamplingDiscarding(2).estimate(points, values) == 2.7
+    assert searches.SamplingDiscarding(5).estimate(points, values) is None
+    assert Repeated(searches.GPUCB(), 2).estimate(points, values) == pytest.approx(2.6)
+    assert Repeated(searches.SamplingDiscarding(1), 2).estimate(points, values) == pytest.approx(2.0)
+    assert Repeated(searches.GPUCB(), 3).estimate(points, values) is None
+    for search in (searches.Random(), Repeated(searches.Random(), 2), BaseSearch.of(Stranger())):
+        assert search.estimate(np.empty((0, 1)), np.empty(0)) is None
+
+
+@pytest.mark.parametrize("search", [Bare(), BaseSearch.of(Bare())])
+def test_searches_of_three_methods_keep_the_contract(search: Search) -> None:
+    check_search(search)
