@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ctxval import cases, controllers, distances, models, searches, systems
+from ctxval import cases, certificates, controllers, distances, models, searches, systems
 from ctxval._util.registry import Declaration, Registry, declaration_of
 from ctxval.config.experiments import plain_options
 
@@ -42,6 +42,11 @@ SECTIONS = (
     ),
     Section(
         "Searches", searches.REGISTRY, '`[search]` with `name = "auto"`; `--search auto`; `searches.by_name("auto")`'
+    ),
+    Section(
+        "Certificates",
+        certificates.KINDS,
+        '`[certificate]` with `kind = "audit"`; `--kind audit`; `certificates.certify(sample, "audit", 0.95)`',
     ),
     Section(
         "Cases",

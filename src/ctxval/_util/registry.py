@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -87,7 +87,6 @@ class Registry(Mapping[str, Any]):
         package: the package that exports the parts; the group of the entry points has the same name.
         method: the method that each part has; None if parts are plain functions.
         modules: built-in parts that are imported when they are asked for: name -> ``module:attr``.
-        parts: the built-in parts; by default those that the package exports and ``@part`` declares.
 
     Attributes:
         aliases: older names of built-in parts, each with the present name.
@@ -100,15 +99,22 @@ class Registry(Mapping[str, Any]):
         *,
         method: str | None = None,
         modules: Mapping[str, str] | None = None,
-        parts: Iterable[Any] | None = None,
     ) -> None:
         self.kind, self.group, self.method = kind, package, method
-        exported = vars(sys.modules[package])
-        named = (exported.get(name) for name in exported["__all__"]) if parts is None else parts
-        found = [one for one in named if declaration_of(one) is not None]
-        self._built_in: dict[str, Any] = {_declarations[one].name: one for one in found}
+        self.aliases: dict[str, str] = {}
+        self._built_in: dict[str, Any] = {}
         self._modules = dict(modules or {})
-        self.aliases = {alias: _declarations[one].name for one in found for alias in _declarations[one].aliases}
+        if "__all__" in vars(sys.modules[package]):
+            self.collect()
+
+    def collect(self) -> None:
+        """Take the parts that the package exports; for a registry that is made before the package's ``__all__``."""
+        exported = vars(sys.modules[self.group])
+        for found in (exported.get(name) for name in exported["__all__"]):
+            declared = declaration_of(found)
+            if declared is not None:
+                self._built_in[declared.name] = found
+                self.aliases |= dict.fromkeys(declared.aliases, declared.name)
 
     @property
     def built_in(self) -> tuple[str, ...]:

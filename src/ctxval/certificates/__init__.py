@@ -87,6 +87,8 @@ __all__ = [
     "volume_bound",
 ]
 
+KINDS.collect()
+
 
 def __getattr__(name: str) -> Any:
     """Return ``USES``, which kinds have a use for each option: all kinds are imported for it."""

@@ -22,7 +22,7 @@ from ctxval.errors import CertificateError
 @part("audit")
 @dataclass(frozen=True, repr=False)
 class Audit(CertificateKind):
-    """The largest distance found bounds all tasks but a volume, by the independent draws among the trials."""
+    """Bound on all tasks but a volume, from the independent draws among the trials."""
 
     name: ClassVar[str] = "audit"
     bounds_maximum: ClassVar[bool] = False

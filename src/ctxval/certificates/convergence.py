@@ -108,7 +108,7 @@ class TheoremConstants:
 @part("convergence")
 @dataclass(frozen=True, repr=False)
 class Convergence(CertificateKind):
-    """The bound of Proposition 1 on d*.
+    """Bound on d* by Proposition 1 of the paper, after GP-UCB.
 
     Attributes:
         constant: C, in the distance's units; a bound by it is withdrawn.

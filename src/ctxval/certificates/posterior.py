@@ -35,7 +35,7 @@ _NAMED = 3
 @part("posterior")
 @dataclass(frozen=True, repr=False)
 class Posterior(CertificateKind):
-    """The posterior bound on d*.
+    """Bound on d* from the posterior of a Gaussian process of the distance.
 
     Attributes:
         stochastic: whether two executions of one task may differ; then the largest expected distance is bounded.

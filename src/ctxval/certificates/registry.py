@@ -8,13 +8,10 @@ from typing import Any, TypeVar
 
 from ctxval._util.registry import Registry
 from ctxval._util.representation import record
-from ctxval.certificates.audit import Audit
 from ctxval.certificates.base import Certificate, CertificateKind
-from ctxval.certificates.convergence import Convergence, TheoremConstants
+from ctxval.certificates.convergence import TheoremConstants
 from ctxval.certificates.covering import RESOLUTION
-from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.scenario import SamplingDiscarding, Scenario
 from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 
@@ -25,13 +22,10 @@ class KindRegistry(Registry):
     """Kinds of certificates by name: built-in ones, those of installed packages, and those registered by a decorator.
 
     A kind that was registered runs its user's code, so it never counts as data.
-
-    Args:
-        built_in: classes of this package, declared by ``@part``.
     """
 
-    def __init__(self, *built_in: type[CertificateKind]) -> None:
-        super().__init__("certificate", "ctxval.certificates", method="certify", parts=built_in)
+    def __init__(self) -> None:
+        super().__init__("certificate", "ctxval.certificates", method="certify")
         self._registered: dict[str, type[CertificateKind]] = {}
 
     def register(self, kind: Kind) -> Kind:
@@ -89,8 +83,8 @@ def _required(found: Any) -> type[CertificateKind]:
     raise InputError(f"a kind of certificate must be a subclass of CertificateKind with a name, got {found!r}.")
 
 
-KINDS = KindRegistry(Posterior, Audit, Scenario, SamplingDiscarding, Convergence)
-"""Kinds of certificates by name; the first one is the default."""
+KINDS = KindRegistry()
+"""Kinds of certificates by name."""
 
 
 @dataclass(frozen=True)

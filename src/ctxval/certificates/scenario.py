@@ -62,7 +62,7 @@ class _ByDraws(CertificateKind):
 @part("scenario")
 @dataclass(frozen=True, repr=False)
 class Scenario(_ByDraws):
-    """The largest of all distances bounds all tasks but a volume (scenario optimisation)."""
+    """Bound on all tasks but a volume, from independent draws alone (scenario optimisation, SC)."""
 
     name: ClassVar[str] = "scenario"
 
@@ -74,7 +74,7 @@ class Scenario(_ByDraws):
 @part("sampling-discarding")
 @dataclass(frozen=True, repr=False)
 class SamplingDiscarding(_ByDraws):
-    """The largest distance that is left after discarding bounds all tasks but a volume (sampling and discarding).
+    """Bound on all tasks but a volume, after some largest distances are discarded (sampling and discarding, SD).
 
     Attributes:
         discard: how many of the largest distances are discarded, at least 1; chosen before they are known.

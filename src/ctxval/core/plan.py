@@ -1,0 +1,69 @@
+"""What is known of a task before, and after, the execution of S."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ctxval._util.representation import call, lines, shown
+from ctxval.core.controller import Controller
+from ctxval.core.space import Parameters
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Everything about a task that can be known before S is executed; one task or a batch.
+
+    Attributes:
+        parameters: p.
+        task: the task g_p.
+        controller: pi(x; g_p, M).
+        model_trajectory: the closed loop on the model.
+    """
+
+    parameters: Parameters
+    task: Task
+    controller: Controller
+    model_trajectory: Trajectory
+
+    def __repr__(self) -> str:
+        fields = ("parameters", "task", "controller", "model_trajectory")
+        return lines(type(self).__name__, *(f"{name}: {shown(getattr(self, name))}" for name in fields))
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A plan after the execution of S.
+
+    Attributes:
+        plan: what was known before.
+        system_trajectory: the closed loop on the system.
+        distance: d(p).
+    """
+
+    plan: Plan
+    system_trajectory: Trajectory
+    distance: float
+
+    def __repr__(self) -> str:
+        known = {
+            "parameters": self.plan.parameters,
+            "task": self.plan.task,
+            "model_trajectory": self.plan.model_trajectory,
+            "system_trajectory": self.system_trajectory,
+        }
+        return lines(call(self, distance=self.distance), *(f"{name}: {shown(part)}" for name, part in known.items()))
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """The distance of an execution, or why there is none.
+
+    Attributes:
+        distance: d(p); None if the distance gave no usable number.
+        unusable: why it gave none; None if there is a distance.
+    """
+
+    distance: float | None
+    unusable: str | None = None
