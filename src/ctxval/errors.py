@@ -6,17 +6,17 @@
     ├── InputError (also ValueError)        a value given by the user cannot be used
     │   ├── ShapeError                      ... because of its shape
     │   └── UnknownNameError                ... because nothing has that name (also AttributeError)
-    ├── ModelError                          the model M gave something unusable
+    ├── ModelError                          the model M failed or returned an unusable result
     ├── DesignError                         no controller could be designed for a task
     ├── ExecutionError                      an execution of S failed; a campaign records it as a failed trial
-    ├── DistanceError                       the distance gave something unusable
-    ├── CertificateError (also ValueError)  the theory of a certificate does not allow what it was given
+    ├── DistanceError                       the distance failed or returned an unusable result
+    ├── CertificateError (also ValueError)  the trials or options do not meet the assumptions of a certificate
     ├── StoreError
     │   ├── StoreAccessError                the file cannot be opened, read or written
     │   ├── ForeignStoreError               the file is not a store that this version can read
     │   └── StoreMismatchError              the store was made by another experiment
-    ├── CampaignError                       the campaign cannot go on
-    └── ConformanceError (also AssertionError)  an own part breaks the contract of its protocol
+    ├── CampaignError                       the campaign cannot continue
+    └── ConformanceError (also AssertionError)  a part breaks the contract of its protocol
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class UnknownNameError(InputError, AttributeError):
 
     @classmethod
     def among(cls, kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-        """Say that ``name`` is no ``kind``, and which known name is nearest to it."""
+        """Return the error that ``name`` is unknown; its message gives the nearest known name, or all of them."""
         names = sorted(known)
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names)}."
@@ -50,7 +50,7 @@ class UnknownNameError(InputError, AttributeError):
 
 
 class ModelError(CtxvalError):
-    """The model M gave something unusable."""
+    """The model M failed or returned an unusable result."""
 
 
 class DesignError(CtxvalError):
@@ -62,15 +62,15 @@ class ExecutionError(CtxvalError):
 
 
 class DistanceError(CtxvalError):
-    """The distance gave something unusable."""
+    """The distance failed or returned an unusable result."""
 
 
 class CertificateError(CtxvalError, ValueError):
-    """The theory of a certificate does not allow what it was given."""
+    """The trials or options do not meet the assumptions of a certificate."""
 
 
 class StoreError(CtxvalError):
-    """Something is wrong with a store."""
+    """A store cannot be used."""
 
 
 class StoreAccessError(StoreError):
@@ -86,8 +86,8 @@ class StoreMismatchError(StoreError):
 
 
 class CampaignError(CtxvalError):
-    """The campaign cannot go on."""
+    """The campaign cannot continue."""
 
 
 class ConformanceError(CtxvalError, AssertionError):
-    """An own model, system, synthesizer, distance or search breaks the contract of its protocol."""
+    """A model, system, synthesizer, distance or search breaks the contract of its protocol."""

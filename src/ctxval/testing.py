@@ -1,6 +1,6 @@
-"""Conformance checks for your own parts, and a rig that fails on command.
+"""Conformance checks for your own parts, and a system that fails at chosen executions.
 
-Each check raises :class:`ctxval.errors.ConformanceError` with one sentence, and returns nothing where all is well.
+Each check raises :class:`ctxval.errors.ConformanceError` with one sentence if the part breaks its contract.
 """
 
 from __future__ import annotations
@@ -26,19 +26,23 @@ from ctxval.searches import Search
 _TOLERANCE = 1e-10
 
 _MAGNIFIED = 2e5
-"""By how much differences over the distances of ``linearize``, some 6e-6, magnify rounding."""
+"""Factor by which the central differences of ``linearize``, with steps of about 6e-6, magnify rounding errors."""
 
 
 def check_model(
     model: Model, *, states: int, inputs: int, seed: int = 0, scale: float = 1.0, tolerance: float = _TOLERANCE
 ) -> None:
-    """Check that a model takes batches as it takes single states, and that its Jacobian is its derivative.
+    """Check that a model gives the same steps for a batch as one by one, and that its Jacobian is its derivative.
 
     Args:
-        model: with ``step`` and perhaps ``jacobian``.
-        states, inputs: n and m.
-        seed, scale: of the random states and inputs that it is tried on.
-        tolerance: relative, by how much a batch may differ: 1e-6 for a model in single precision.
+        model: the model; it has ``step`` and optionally ``jacobian``.
+        states, inputs: the numbers of states n and of inputs m.
+        seed: seed of the random states and inputs.
+        scale: standard deviation of the random states and inputs.
+        tolerance: largest relative difference between a batch and single steps; use 1e-6 for single precision.
+
+    Raises:
+        ConformanceError: if the model breaks its contract.
     """
     rng = np.random.default_rng(seed)
     x, u = scale * rng.normal(size=(7, states)), scale * rng.normal(size=(7, inputs))
@@ -56,12 +60,19 @@ def check_model(
 
 
 def check_system(system: System, controller: Controller, task: Task, *, tolerance: float = _TOLERANCE) -> None:
-    """Check that a system starts where the task says, runs to its horizon, and does the same twice. Executes it twice.
+    """Check that a system starts in the task's initial state, runs to the horizon, and repeats itself.
+
+    The check executes the system twice, and once more if it is ``batched``.
 
     Args:
-        system: with ``execute``.
-        controller, task: of one task, not a batch.
-        tolerance: by how much two executions may differ: the noise that you expect.
+        system: the system; it has ``execute``.
+        controller: the controller for this task.
+        task: one task, not a batch.
+        tolerance: largest difference between two executions, relative to the larger of 1 and the state; set it to the
+            noise that you expect.
+
+    Raises:
+        ConformanceError: if the system breaks its contract.
     """
     first, second = system.execute(controller, task), system.execute(controller, task)
     for trajectory in (first, second):
@@ -71,7 +82,7 @@ def check_system(system: System, controller: Controller, task: Task, *, toleranc
         _require(got == expected, f"states must have shape {expected} for this task, got {got}")
         _require(trajectory.ended == COMPLETE, f"the execution ended early: {trajectory.ended}")
         start = np.abs(trajectory.states[0] - task.initial_state).max()
-        _require(start <= tolerance, f"it starts {start:g} away from the task's initial state")
+        _require(start <= tolerance, f"the execution starts {start:g} away from the task's initial state")
     _require_close("the first execution", first.states, "the second", second.states, tolerance)
     if getattr(system, "batched", False):
         _check_batched_system(system, controller, task, first, tolerance)
@@ -91,9 +102,12 @@ def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> Non
     """Check that a synthesizer designs the same controller in a batch as task by task.
 
     Args:
-        synthesizer: with ``design``.
+        synthesizer: the synthesizer; it has ``design``.
         task: a batch of tasks ``(N,)``.
-        model: what it designs on.
+        model: the model that the controllers are designed on.
+
+    Raises:
+        ConformanceError: if the synthesizer breaks its contract.
     """
     singles = []
     for index in range(task.batch_shape[0]):
@@ -107,11 +121,14 @@ def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> Non
 
 
 def check_distance(distance: Distance, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> None:
-    """Check that a distance is finite, not negative, zero between equals, and the same in a batch.
+    """Check that a distance is finite and not negative, and the same for a batch as one by one.
 
     Args:
         distance: ``(model_trajectory, system_trajectory, task) -> d``.
-        model_trajectory, system_trajectory, task: a batch ``(N,)``.
+        model_trajectory, system_trajectory, task: a batch of trajectories and tasks ``(N,)`` to compare.
+
+    Raises:
+        ConformanceError: if the distance breaks its contract.
     """
     d = np.asarray(distance(model_trajectory, system_trajectory, task), dtype=np.float64)
     _require(d.shape == task.batch_shape, f"the distance of a batch {task.batch_shape} has shape {d.shape}")
@@ -122,11 +139,16 @@ def check_distance(distance: Distance, model_trajectory: Trajectory, system_traj
 
 
 def check_search(search: Search, *, dimension: int = 2, seed: int = 3, budget: int = 12) -> None:
-    """Check that a search stays in the unit cube, resumes from what it was told, and survives failures.
+    """Check that a search stays in the unit cube, resumes from its history, and never repeats a failed point.
 
     Args:
-        search: with ``reset``, ``ask`` and ``tell``.
-        dimension, seed, budget: of the trial run.
+        search: the search; it has ``reset``, ``ask`` and ``tell``.
+        dimension: dimension of the unit cube in the test run.
+        seed: seed of the test run.
+        budget: number of points in the test run; every fourth evaluation fails.
+
+    Raises:
+        ConformanceError: if the search breaks its contract.
     """
     history = _trial_run(search, dimension, seed, budget)
     again = _trial_run(search, dimension, seed, budget)
@@ -137,8 +159,8 @@ def check_search(search: Search, *, dimension: int = 2, seed: int = 3, budget: i
         resumed = search.ask(1)[0]
         _require(
             np.array_equal(resumed, history[0][told]),
-            f"told the first {told} trials again, it must ask for the same next point, {history[0][told]}, "
-            f"but asks for {resumed}",
+            f"after tell of the first {told} trials, ask must return the same next point, {history[0][told]}, "
+            f"got {resumed}",
         )
 
 
@@ -152,7 +174,7 @@ def _trial_run(search: Search, dimension: int, seed: int, budget: int) -> tuple[
         # Every fourth evaluation fails.
         value = np.nan if number % 4 == 3 else float(np.sin(3 * point).sum())
         failed = points[np.isnan(values)]
-        _require(not (failed == point).all(axis=1).any(), f"a failed point must not be asked again: {point[0]}")
+        _require(not (failed == point).all(axis=1).any(), f"ask must not return a failed point again, got {point[0]}")
         search.tell(point, [value])
         points, values = np.concatenate([points, point]), np.append(values, value)
     return points, values
@@ -162,12 +184,13 @@ Fault = Literal["raise", "nan", "short", "wrong shape"]
 
 
 class FaultyRig:
-    """A system that does what another does, slowly, and fails where it is told to: for trying out what happens.
+    """A system that runs another one and fails at chosen executions, for tests of how a campaign handles failures.
 
     Args:
-        system: what it does where it does not fail.
-        faults: which execution, counted from 0, fails in which way.
-        delay: seconds that each execution takes on top.
+        system: the system that runs every execution.
+        faults: the fault of each execution that fails, by its number from 0: ``"raise"``, ``"nan"`` (all states are
+            NaN), ``"short"`` (the last step is missing) or ``"wrong shape"`` (all states but the first are missing).
+        delay: seconds to wait before each execution.
     """
 
     def __init__(self, system: System, faults: Mapping[int, Fault] | None = None, delay: float = 0.0) -> None:
@@ -177,7 +200,11 @@ class FaultyRig:
         self._executions = 0
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run one task, or fail."""
+        """Run one task, with the fault of this execution if it has one.
+
+        Raises:
+            RuntimeError: if the fault of this execution is ``"raise"``.
+        """
         fault = self.faults.get(self._executions)
         self._executions += 1
         time.sleep(self.delay)
@@ -197,7 +224,7 @@ class FaultyRig:
 
 
 class _WithoutJacobian:
-    """A model of which only the steps are seen, so that its Jacobian is found by differences."""
+    """A model without its own Jacobian, so that ``linearize`` takes central differences."""
 
     def __init__(self, model: Model) -> None:
         self._model = model
