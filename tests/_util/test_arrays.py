@@ -119,7 +119,7 @@ HALF = np.ma.masked_array([1.0, 2.0], mask=[False, True])
 
 @pytest.mark.parametrize("value", [HALF, [HALF, HALF], ([1.0], [HALF]), np.ma.masked, [1.0, np.ma.masked]])
 def test_what_is_masked_is_refused_and_not_taken_from_below_the_mask(value: object) -> None:
-    with pytest.raises(InputError, match=r"^x must have a number everywhere, and some are masked"):
+    with pytest.raises(InputError, match=r"^x must be numbers without masked entries; fill in"):
         as_floats("x", value)  # type: ignore[arg-type]
 
 

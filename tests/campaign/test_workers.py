@@ -405,7 +405,7 @@ def test_the_first_interrupt_ends_after_the_running_executions(tmp_path: Path, w
     os.killpg(process.pid, signal.SIGINT)
     _, stderr = process.communicate(timeout=30)
     assert process.returncode != 0
-    assert "ending after what is running" in stderr
+    assert "ending after the running executions" in stderr
     states = [trial.state for trial in Store(store).trials()]
     assert set(states) == {"completed"}
     assert 2 <= len(states) < 40

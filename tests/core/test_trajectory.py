@@ -228,7 +228,7 @@ def test_a_masked_array_is_no_part_of_a_trajectory(walk: Trajectory, name: str) 
     content[name] = np.ma.masked_array(
         content[name], mask=np.arange(content[name].size).reshape(content[name].shape) == 1
     )
-    with pytest.raises(InputError, match=f"{name} must have a number everywhere, and some are masked"):
+    with pytest.raises(InputError, match=f"{name} must be numbers without masked entries"):
         Trajectory(**content)
 
 

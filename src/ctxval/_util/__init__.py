@@ -1,1 +1,1 @@
-"""What knows nothing of validation: arrays, files, texts, processes."""
+"""Helpers for arrays, files, texts and processes. Nothing here knows of validation."""

@@ -1,6 +1,6 @@
 """Float64 arrays with clear errors, and linear algebra on one thread.
 
-Small dense algebra is slower on many BLAS threads, and its last bits then depend on how many there are.
+Small dense algebra is slower on many BLAS threads, and its last bits depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Rows = npt.NDArray[np.intp]
 ArrayLike = npt.ArrayLike
 
 _LISTED = 100
-"""Numbers that a message lists."""
+"""Largest number of values that an error message lists."""
 
 _SHOWN = reprlib.Repr()
 _SHOWN.maxlist = _SHOWN.maxtuple = 20
@@ -33,11 +33,11 @@ def as_floats(name: str, value: ArrayLike) -> Array:
     """Return ``value`` as a float64 array.
 
     Raises:
-        InputError: it is not numeric, or some of it is masked.
+        InputError: if the value is not numeric, or has masked entries.
     """
     if _is_masked(value):
         raise InputError(
-            f"{name} must have a number everywhere, and some are masked; fill them in, or write NaN for them."
+            f"{name} must be numbers without masked entries; fill in the masked entries, or replace them with NaN."
         )
     try:
         if np.iscomplexobj(value):
@@ -48,7 +48,7 @@ def as_floats(name: str, value: ArrayLike) -> Array:
 
 
 def _is_masked(value: object) -> bool:
-    """Return whether numbers are masked, of which numpy would silently take what is below the mask."""
+    """Return whether a value has masked entries; ``numpy.asarray`` would silently return the numbers below the mask."""
     if isinstance(value, list | tuple):
         return any(_is_masked(item) for item in value if isinstance(item, list | tuple | np.ma.MaskedArray))
     return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
@@ -58,7 +58,7 @@ def as_finite(name: str, value: ArrayLike) -> Array:
     """Return ``value`` as a float64 array without NaN and infinity.
 
     Raises:
-        InputError: it is not numeric, or not finite.
+        InputError: if the value is not numeric, or not finite.
     """
     array = as_floats(name, value)
     finite = np.isfinite(array)
@@ -74,7 +74,7 @@ def require_shape(name: str, array: Array, expected: tuple[int, ...]) -> Array:
     """Return ``array`` if its last axes are ``expected``.
 
     Raises:
-        ShapeError: they are not; the message names both shapes.
+        ShapeError: if the last axes differ; the message names both shapes.
     """
     if array.shape[array.ndim - len(expected) :] != expected or array.ndim < len(expected):
         wanted = ", ".join(["...", *map(str, expected)])
@@ -86,8 +86,8 @@ def as_weight(name: str, value: ArrayLike) -> Array:
     """Return a square weight matrix from a matrix or from its diagonal.
 
     Raises:
-        ShapeError: it is neither.
-        InputError: it is not finite, not symmetric, or has a negative eigenvalue.
+        ShapeError: if the value is neither a square matrix nor a diagonal.
+        InputError: if the matrix is not finite, not symmetric, or has a negative eigenvalue.
     """
     array = as_finite(name, value)
     if array.ndim == 1:
@@ -116,7 +116,7 @@ def as_norm_order(value: float) -> float:
     """Return the order of a norm.
 
     Raises:
-        InputError: it is none of 1, 2 and infinity.
+        InputError: if the value is not 1, 2 or infinity.
     """
     if value not in (1, 2, np.inf):
         raise InputError(f"norm must be 1, 2 or inf, got {value!r}.")
@@ -129,6 +129,6 @@ def _thread_pools() -> ThreadpoolController:
 
 
 def single_threaded() -> AbstractContextManager[Any]:
-    """Bound BLAS to one thread while the context lasts."""
+    """Limit BLAS to one thread inside the context."""
     limits: AbstractContextManager[Any] = _thread_pools().limit(limits=1)
     return limits

@@ -1,4 +1,4 @@
-"""What a function or class computes: a digest of its syntax tree, and the outer names that it uses."""
+"""The code of a function or class: a digest of its syntax tree, and the outer names that it uses."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from typing import Any
 _OWN = __name__.partition(".")[0]
 
 _SKIPPED = ("ctx", "kind", "type_comment", "returns", "annotation")
-"""Fields of a syntax tree that say nothing of what is computed."""
+"""Fields of a syntax tree that do not affect the computation."""
 
 _Function = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 
 
 @dataclass(frozen=True)
 class Code:
-    """What identifies the code of a function or class.
+    """The identity of the code of a function or class.
 
     Attributes:
-        digest: of its syntax tree, without its name, its docstrings, its annotations and its place.
-        names: dotted names in it that are looked up outside, such as ``np.sin`` and ``GAIN``.
+        digest: digest of the syntax tree, without the name, docstrings, annotations and the place in the file.
+        names: dotted names that the code looks up outside itself, such as ``np.sin`` and ``GAIN``.
     """
 
     digest: str
@@ -38,12 +38,12 @@ class Code:
 
 
 def is_own(value: Any) -> bool:
-    """Return whether a function or class is one of this package's."""
+    """Return whether a function or class belongs to this package."""
     return _top_level(value) == _OWN
 
 
 def is_library(value: Any) -> bool:
-    """Return whether a module, function or class is of an installed package, of Python, or of no file at all."""
+    """Return whether a module, function or class belongs to an installed package or to Python, or has no file."""
     module = value if inspect.ismodule(value) else sys.modules.get(getattr(value, "__module__", None) or "")
     if module is None:
         return False
@@ -54,7 +54,7 @@ def is_library(value: Any) -> bool:
 
 
 def same_package(value: Any, other: Any) -> bool:
-    """Return whether a module, function or class is of the same top-level package as another."""
+    """Return whether two modules, functions or classes belong to the same top-level package."""
     return _top_level(value) == _top_level(other)
 
 
@@ -88,9 +88,9 @@ def module_digest(source: str) -> str:
 
 
 def bytecode_digest(value: Any) -> str | None:
-    """Return a digest of a function's or class's names and constants, for one whose source cannot be read.
+    """Return a digest of the names and constants of a function or class. It serves if the source cannot be read.
 
-    The instructions are left out, as they differ between versions of Python.
+    The instructions are left out because they differ between versions of Python. Returns None if there is no code.
     """
     if isinstance(value, type):
         functions = {name: functions_in(item) for name, item in vars(value).items()}
@@ -166,7 +166,7 @@ def _covers(node: ast.expr, place: tuple[int | None, int | None, int | None, int
     if line is None or last_line is None or column is None or last_column is None:
         return True
     if (line, column) == (last_line, last_column):
-        return True  # what the compiler has put there, as at the start of a function
+        return True  # an instruction that the compiler added, such as the one at the start of a function
     end = (node.end_lineno or 0, node.end_col_offset or 0)
     return (node.lineno, node.col_offset) <= (line, column) and (last_line, last_column) <= end
 
@@ -193,7 +193,7 @@ def _classes(node: ast.AST, path: str) -> Iterator[tuple[str, ast.AST]]:
 
 
 def _plain(node: Any, *, top: bool = False) -> Any:
-    """Return a tree as tuples, the same for every version of Python: fields that are empty are left out."""
+    """Return a tree as tuples. Empty fields are left out, so that every version of Python gives the same tuples."""
     if isinstance(node, list):
         return [_plain(item) for item in node]
     if not isinstance(node, ast.AST):
@@ -215,7 +215,7 @@ def _without_docstring(node: ast.AST, body: Any) -> Any:
 
 
 def _loaded(code: types.CodeType) -> set[str]:
-    """Return the global names that a function looks up, also by the functions in it."""
+    """Return the global names that a function and the functions inside it look up."""
     names = {step.argval for step in dis.get_instructions(code) if step.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
     inner = (_loaded(item) for item in code.co_consts if isinstance(item, types.CodeType))
     return names.union(*inner)
@@ -234,7 +234,7 @@ def _loaded_outside_functions(node: ast.AST) -> set[str]:
 
 
 def functions_in(item: Any) -> list[types.FunctionType]:
-    """Return the Python functions of an attribute of a class: a method, a property, and what they wrap."""
+    """Return the Python functions of a class attribute: a method, the functions of a property, wrapped functions."""
     found: list[types.FunctionType] = []
     seen: list[Any] = []
     waiting = [item]
@@ -252,12 +252,12 @@ def functions_in(item: Any) -> list[types.FunctionType]:
 
 def _names(node: ast.AST) -> set[str]:
     found = {name for child in _computing(node) if (name := _dotted(child)) is not None}
-    # Of "np.linalg.norm" the shorter "np.linalg" and "np" are part.
+    # "np.linalg" and "np" are left out if "np.linalg.norm" is there.
     return {name for name in found if not any(other.startswith(f"{name}.") for other in found)}
 
 
 def _computing(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield a node and those in it, but for annotations."""
+    """Yield a node and all nodes below it, except annotations."""
     yield node
     for field, value in ast.iter_fields(node):
         for child in value if isinstance(value, list) else [value]:

@@ -1,4 +1,4 @@
-"""A plain function over all cores of this computer."""
+"""Parallel evaluation of a plain function on all cores of this computer."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _inherited: Callable[[Any], Any]
 
 
 def on_all_cores(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
-    """Return what a function makes of each part, in their order, many at a time where processes can be forked.
+    """Return the result of a function for each part, in the order of the parts; in parallel if processes can be forked.
 
-    The function is inherited and need not be picklable; the parts and the results must be.
+    The child processes inherit the function, so it need not be picklable; the parts and the results must be.
     """
     workers = min(_cores(), len(parts))
     if workers < 2 or not can_fork():
@@ -31,18 +31,18 @@ def on_all_cores(function: Callable[[Part], Result], parts: Sequence[Part]) -> l
     try:
         with pool, forking():
             return list(pool.map(_call, parts))
-    except BrokenProcessPool:  # what ends a process may do so for want of memory
+    except BrokenProcessPool:  # the system may have ended a process because memory was short
         return [function(part) for part in parts]
 
 
 def can_fork() -> bool:
-    """Return whether a process can be forked without harm: a child then inherits what cannot be pickled."""
+    """Return whether a process can be forked safely; a forked child inherits objects that cannot be pickled."""
     return sys.platform == "linux" and "fork" in multiprocessing.get_all_start_methods()
 
 
 @contextmanager
 def forking() -> Iterator[None]:
-    """Start processes without a warning of the thread that a progress display has."""
+    """Suppress Python's warning about forking while threads run; a progress display has a thread."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         yield
@@ -54,7 +54,7 @@ def _cores() -> int:
 
 def _inherit(function: Callable[[Any], Any]) -> None:
     global _inherited
-    # Ctrl-C reaches every process of a terminal; what it ends is decided by the campaign.
+    # Ctrl-C reaches every process of a terminal, but the campaign alone decides what ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _inherited = function
 

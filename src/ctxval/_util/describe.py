@@ -1,7 +1,7 @@
-"""Plain descriptions of objects: how a store knows the experiment that it belongs to.
+"""Plain descriptions of objects, by which a store recognises the experiment that it belongs to.
 
-What is described is what is computed: values, and of a user's functions and classes the syntax tree without
-docstrings and annotations, with the outer values that it uses. Where a module lies does not matter.
+A description covers what an object computes: its values, and for functions and classes of users the syntax tree
+without docstrings and annotations, with the outer values that the code uses. The location of a module does not matter.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from ctxval._util.code_digest import Code, bytecode_digest, code_of, is_library,
 _DEPTH = 6
 _LISTED = 100
 _TOLERANCE = 1e-6
-"""Floats that a least-squares fit gives on two machines differ by less than this."""
+"""Relative tolerance of floats: the results of a least-squares fit on two machines differ by less than this."""
 
 _MISSING = object()
 
 
 def describe(value: Any, depth: int = _DEPTH, *, private: bool = False) -> Any:
-    """Return what identifies an object, as JSON: its type and its public values, or what its ``describe()`` says.
+    """Return the identity of an object as JSON: its type and its public values, or the result of its ``describe()``.
 
     Args:
         value: the object.
-        depth: how deep what is inside it is described.
-        private: also describe attributes whose names begin with an underscore.
+        depth: number of levels of nested objects that are described.
+        private: describe attributes too if their names begin with an underscore.
     """
     return _Description(private).of(value, depth)
 
 
 class _Description:
-    """One description, in which the code of each function and class stands once."""
+    """One description, in which the code of each function and class appears once."""
 
     def __init__(self, private: bool) -> None:
         self.private = private
@@ -69,7 +69,7 @@ class _Description:
         if isinstance(value, Mapping):
             return {str(key): self.of(item, depth - 1) for key, item in value.items()}
         if isinstance(value, set | frozenset):
-            # Sorted: the order of a set of strings changes from process to process.
+            # Sorted, because the order of a set of strings changes from process to process.
             return sorted((self.of(item, depth - 1) for item in value), key=repr)
         if isinstance(value, Sequence):
             return [self.of(item, depth - 1) for item in value]
@@ -85,7 +85,7 @@ class _Description:
                 "keywords": self.of(value.keywords, depth - 1),
             }
         wrapped = getattr(value, "__wrapped__", None)
-        if callable(wrapped) and not inspect.isfunction(value) and not is_library(value):  # as by functools.cache
+        if callable(wrapped) and not inspect.isfunction(value) and not is_library(value):  # e.g. functools.cache
             return {"function": _name(value), "wrapped": self.of(wrapped, depth - 1)}
         owner = getattr(value, "__self__", None)
         bound = {"of": self.of(owner, depth - 1)} if owner is not None and not inspect.ismodule(owner) else {}
@@ -103,7 +103,7 @@ class _Description:
             fields = {k: v for k, v in _attributes(value).items() if self.private or not str(k).startswith("_")}
         described = {str(key): self.of(item, depth - 1) for key, item in fields.items()}
         if not fields and self.private:
-            with contextlib.suppress(Exception):  # what is an array to numpy, such as a network's weights
+            with contextlib.suppress(Exception):  # an object that numpy can convert, such as a network's weights
                 described["values"] = _describe_array(np.asarray(value, dtype=np.float64))
         return {"type": type(value).__qualname__, **described, **self._class_code(type(value))}
 
@@ -115,7 +115,7 @@ class _Description:
         return {"code": found} if found else {}
 
     def _code(self, value: Any) -> dict[str, Any]:
-        """Return the digest of a user's function or class, and what it uses, however deep; each once."""
+        """Return the digest of a user's function or class, and everything that it uses, at any depth, each once."""
         if is_own(value) or is_library(value) or id(value) in self._known:
             return {}
         self._known.add(id(value))
@@ -137,7 +137,7 @@ class _Description:
 
 
 def _is_tool(value: Any) -> bool:
-    """Return whether a value that code uses is a tool of Python's library, such as a logger or a lock, and no data."""
+    """Return whether a value is not data but an object of Python's standard library, such as a logger or a lock."""
     module = type(value).__module__.partition(".")[0]
     return module != "builtins" and module in sys.stdlib_module_names and not isinstance(value, _DATA)
 
@@ -146,7 +146,7 @@ _DATA = (str, numbers.Number, Mapping, Sequence, set, frozenset, functools.parti
 
 
 def _closed_over(function: Any) -> dict[str, Any]:
-    """Return what a function closes over; a variable that has no value yet is left out."""
+    """Return the variables that a function closes over; variables without a value are left out."""
     if not inspect.isfunction(function):
         return {}
     found = {}
@@ -157,7 +157,11 @@ def _closed_over(function: Any) -> dict[str, Any]:
 
 
 def _own_description(value: Any) -> Mapping[str, Any] | None:
-    """Return what an object says of itself; None if it says nothing that can be used, or means something else by it."""
+    """Return the result of an object's own ``describe()``.
+
+    Returns None if there is no such method, if it fails or returns no mapping, or if it belongs to another library,
+    in which ``describe`` means something else.
+    """
     cls = type(value)
     if not callable(getattr(cls, "describe", None)) or (is_library(cls) and not is_own(cls)):
         return None
@@ -169,7 +173,7 @@ def _own_description(value: Any) -> Mapping[str, Any] | None:
 
 
 def _outer(value: Any, code: Code) -> list[tuple[str, Any]]:
-    """Return the outer names that code uses, and what they stand for."""
+    """Return the outer names that code uses, with their values."""
     outside = _globals_of(value)
     found = []
     for dotted in code.names:
@@ -177,7 +181,7 @@ def _outer(value: Any, code: Code) -> list[tuple[str, Any]]:
         item = outside.get(root, _MISSING)
         seen = root
         for attribute in attributes:
-            # Of an object more than the module's own names is not its code but its value.
+            # Only attributes of modules are resolved; an attribute of an object is part of the object's value.
             if not inspect.ismodule(item) or not hasattr(item, attribute):
                 break
             item, seen = getattr(item, attribute), f"{seen}.{attribute}"
@@ -194,7 +198,7 @@ def _globals_of(value: Any) -> Mapping[str, Any]:
 
 
 def _name(value: Any) -> str:
-    """Return a callable's name, with its module if it is of a library."""
+    """Return the name of a callable, with its module if it belongs to a library."""
     if not hasattr(value, "__qualname__"):
         return repr(value)
     module = getattr(value, "__module__", None)
@@ -212,7 +216,7 @@ def _describe_array(array: np.ndarray[Any, Any]) -> Any:
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         finite = np.nan_to_num(array, nan=0.0, posinf=0.0, neginf=0.0)
         return {"not finite": _describe_array(np.flatnonzero(~np.isfinite(array))), "finite": _describe_array(finite)}
-    # The projection tells apart arrays of the same values in another order.
+    # The projection differs between arrays that have the same values in another order.
     projection = float(array.ravel() @ np.cos(np.arange(array.size)))
     summary = {"mean": float(array.mean()), "std": float(array.std()), "projection": projection}
     return {"shape": list(array.shape), **summary}
@@ -228,7 +232,13 @@ def _attributes(value: Any) -> dict[str, Any]:
 
 
 def rounded(value: Any, digits: int, least: float = 0.0) -> Any:
-    """Return a description without the last digits of its floats, in which machines differ; up to least they are 0."""
+    """Return a description with its floats rounded, because machines differ in the last digits.
+
+    Args:
+        value: the description.
+        digits: number of significant digits that are kept.
+        least: magnitude up to which a float becomes 0.
+    """
     if isinstance(value, float):
         return "0" if abs(value) <= least else f"{value:.{digits}g}"
     if isinstance(value, dict):
@@ -237,16 +247,16 @@ def rounded(value: Any, digits: int, least: float = 0.0) -> Any:
 
 
 def first_difference(stored: Any, present: Any, path: str = "") -> str | None:
-    """Return where two descriptions first differ, as ``"path: stored, present"``; None where they agree.
+    """Return a sentence about the first difference of two descriptions. Returns None if they agree.
 
-    Floats agree within a relative 1e-6, so that a model fitted again on another machine is the same model. Of a
-    function that has a digest the name does not matter.
+    Floats agree within a relative 1e-6, so that a model fitted again on another machine is the same model. The name of
+    a function does not matter if the function has a digest.
     """
     return next((sentence for _, sentence in differences(stored, present, path)), None)
 
 
 def differences(stored: Any, present: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Yield every place in which two descriptions differ, each with a sentence, as :func:`first_difference` does."""
+    """Yield the path and a sentence for each difference of two descriptions; see :func:`first_difference`."""
     if isinstance(stored, dict) and isinstance(present, dict):
         for key in [*stored, *(key for key in present if key not in stored)]:
             yield from _at_key(stored, present, key, path)

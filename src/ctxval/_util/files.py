@@ -1,7 +1,7 @@
-"""Files of others, read with bounds: regular files alone, and no more bytes of them than stated.
+"""Bounded reading of files from elsewhere: only regular files are read, and only up to a stated number of bytes.
 
-A FIFO would wait for its writer, a device such as ``/dev/zero`` never ends, and a few crafted bytes can stand for many.
-The message of every error here is the reason alone, for the caller to put behind the file's name.
+A FIFO would wait for its writer, a device such as ``/dev/zero`` never ends, and a few crafted bytes can unpack to many.
+The message of every error here is only the reason; the caller puts the name of the file before it.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from typing import Any, BinaryIO
 from ctxval.errors import InputError
 
 MOST_BYTES = 256 * 2**20
-"""Bytes that a file may have: 33 million numbers of a trajectory."""
+"""Largest size of a file in bytes, enough for 33 million numbers of a trajectory."""
 
 MOST_JSON = 16 * 2**20
-"""Bytes that a JSON file may have, which takes twenty times its size when it is read."""
+"""Largest size of a JSON file in bytes; reading it takes twenty times as much memory."""
 
 MOST_ROW = 2**20
-"""Characters that a row of a CSV file may have."""
+"""Largest number of characters in a row of a CSV file."""
 
 _KINDS = {
     stat.S_IFDIR: "it is a folder",
@@ -36,14 +36,14 @@ _KINDS = {
 
 
 def open_regular(path: str | Path, most: int = MOST_BYTES) -> BinaryIO:
-    """Open a regular file for reading, perhaps through a symbolic link; never wait for anything.
+    """Open a regular file for reading, also through a symbolic link; never block.
 
     Args:
         path: the file.
-        most: bytes that it may have.
+        most: largest size of the file in bytes.
 
     Raises:
-        InputError: there is no such file, it is something else, such as a FIFO or a device, or it is too large.
+        InputError: if the file does not exist, is not a regular file (a FIFO, a device), or is too large.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
@@ -69,7 +69,7 @@ def require_regular_file(path: str | Path) -> None:
     """Check that a path names a regular file that can be opened.
 
     Raises:
-        InputError: it does not.
+        InputError: if the file does not exist, is not a regular file, or cannot be opened.
     """
     open_regular(path).close()
 
@@ -78,7 +78,7 @@ def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
     """Return the content of a regular file.
 
     Raises:
-        InputError: it cannot be opened or read, or has more bytes than ``most``.
+        InputError: if the file cannot be opened or read, or has more bytes than ``most``.
     """
     with open_regular(path, most) as file:
         try:
@@ -95,7 +95,7 @@ def read_json(path: str | Path) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        InputError: it cannot be read, is not JSON in UTF-8, too large or nested too deeply.
+        InputError: if the file cannot be read, is not JSON in UTF-8, is too large, or is nested too deeply.
     """
     content = read_bytes(path, MOST_JSON)
     try:
@@ -107,10 +107,10 @@ def read_json(path: str | Path) -> Any:
 
 
 def csv_rows(path: str | Path, most: int = MOST_BYTES) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows of a CSV file that are not blank, each with the number of the line at which it ends.
+    """Yield the rows of a CSV file that are not blank, each with the number of its last line.
 
     Raises:
-        InputError: it cannot be read, is not CSV in UTF-8, or has a row that is too long.
+        InputError: if the file cannot be read, is not CSV in UTF-8, or has a row that is too long.
     """
     with open_regular(path, most) as file, io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text:
         lines = _Lines(text, most)
@@ -125,10 +125,10 @@ def csv_rows(path: str | Path, most: int = MOST_BYTES) -> Iterator[tuple[int, li
 
 
 class _Lines:
-    """The lines of a text, of which a row may have several.
+    """The lines of a text; a row of CSV may extend over several lines.
 
     Attributes:
-        in_row: characters since the last row, which whoever reads rows sets to 0.
+        in_row: number of characters since the end of the last row; the reader of rows resets it to 0.
     """
 
     def __init__(self, text: io.TextIOWrapper, most: int) -> None:
@@ -148,5 +148,5 @@ class _Lines:
         if self.left < 0:
             raise InputError("it grew while it was read")
         if "\0" in line:
-            raise InputError("it has NUL bytes, and is not text in UTF-8")
+            raise InputError("it is not text in UTF-8: it has NUL bytes")
         return line

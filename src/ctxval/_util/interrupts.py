@@ -1,4 +1,4 @@
-"""What may end a process while it executes: Ctrl-C in two steps, and exits that a system asks for."""
+"""Interruptions of an execution: Ctrl-C in two steps, and calls that would end the process."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from typing import NoReturn
 
 
 class Interrupts:
-    """Within it, SIGINT waits for the end of what is shielded, and a second one does not.
+    """A context in which the first SIGINT waits for the end of shielded code, and a second one stops at once.
 
-    It takes effect in the main thread, where nobody else handles the signal; elsewhere everything stays as it is.
+    It has an effect only in the main thread, and only if no other handler of SIGINT is installed.
 
     Attributes:
-        asked: whether the running executions are the last ones.
+        asked: whether SIGINT was received, so that the running executions are the last ones.
     """
 
     def __init__(self) -> None:
@@ -46,12 +46,12 @@ class Interrupts:
         self.announce()
 
     def announce(self) -> None:
-        """Say that the running executions are waited for."""
-        sys.stderr.write("\nending after what is running; once more to stop at once\n")
+        """Print that the campaign ends after the running executions."""
+        sys.stderr.write("\nending after the running executions; press Ctrl-C again to stop at once\n")
 
     @contextmanager
     def shielded(self) -> Iterator[None]:
-        """Let what is inside come to its end at the first SIGINT."""
+        """Let the code inside finish after the first SIGINT."""
         before, self._shielded = self._shielded, True
         try:
             yield
@@ -59,19 +59,20 @@ class Interrupts:
             self._shielded = before
 
     def raise_if_asked(self) -> None:
-        """End here if that was asked for meanwhile.
+        """Stop here if SIGINT was received.
 
         Raises:
-            KeyboardInterrupt: it was.
+            KeyboardInterrupt: if SIGINT was received.
         """
         if self.asked:
             raise KeyboardInterrupt
 
 
 def raised_by_signal(error: BaseException) -> bool:
-    """Return whether an exception comes from outside, by a signal that ends processes, and not from the code itself.
+    """Return whether the handler of a signal that ends processes raised an exception, rather than the code itself.
 
-    An ordinary exception never does: a handler that raises one, of an alarm for instance, is the code's own.
+    For an ordinary exception this is false: a handler that raises one, for instance that of an alarm, belongs to the
+    code.
     """
     if isinstance(error, Exception):
         return False
@@ -95,7 +96,7 @@ def _function_of(handler: object) -> FunctionType | None:
 def exits_as_exceptions() -> Iterator[None]:
     """Turn ``os._exit`` of this process into an exception; forked processes may exit.
 
-    A recursion limit that is set inside is taken back, as little of this package would run under a small one.
+    The recursion limit is restored afterwards, because this package needs more than a small one.
     """
     ours, leave, depth = os.getpid(), os._exit, sys.getrecursionlimit()
 

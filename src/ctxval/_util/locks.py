@@ -1,4 +1,4 @@
-"""Locks that go with their process, however that ends."""
+"""File locks that are released when their process ends, however it ends."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ if sys.platform == "linux":
     import fcntl
 
 LOCKS_FILE_ITSELF = sys.platform == "linux"
-"""Whether a file can be locked while SQLite uses it: locks of ``flock`` and of SQLite do not exclude each other."""
+"""Whether a file can be locked while SQLite uses it. On Linux ``flock`` does not interfere with the locks of SQLite."""
 
 
 class LockedError(OSError):
-    """The lock is held, by this process or another."""
+    """The lock is held already, by this process or another one."""
 
 
 class FileLock:
-    """The exclusive lock of a file, whatever name it is opened by; a forked process does not inherit it.
+    """The exclusive lock of a file, whatever path the file is opened by; a forked process does not inherit the lock.
 
-    On Linux the file may be a database in use. Elsewhere it must be a file of nothing else, as it is locked by a
-    transaction of SQLite.
+    On Linux the file may be a database in use. On other systems the lock is a transaction of SQLite, so the file must
+    have no other use.
 
     Args:
-        path: the file; made if it does not exist.
+        path: the file; it is created if it does not exist.
 
     Raises:
-        OSError: the file cannot be opened.
+        OSError: if the file cannot be opened.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -39,13 +39,13 @@ class FileLock:
         """Take the lock; it is held until it is released or the process ends.
 
         Raises:
-            LockedError: it is held already.
-            OSError: this file cannot be locked.
+            LockedError: if the lock is held already.
+            OSError: if this file cannot be locked.
         """
         self._lock.acquire()
 
     def release(self) -> None:
-        """Release the lock; the file stays open, as closing it would end SQLite's own locks of it in this process."""
+        """Release the lock. The file stays open: closing it would release this process's SQLite locks of the file."""
         self._lock.release()
 
     def close(self) -> None:

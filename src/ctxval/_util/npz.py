@@ -1,7 +1,7 @@
-"""NPZ files of others: the header of every array is read and judged before its numbers are.
+"""Safe reading of NPZ files from elsewhere: the header of an array is checked before its numbers are read.
 
-``numpy.load`` takes as much memory as a header asks for, evaluates the header as a literal of Python, and raises a
-long list of exceptions for damaged bytes. Here a header is matched, never evaluated.
+``numpy.load`` takes as much memory as a header asks for, evaluates the header as a literal of Python, and raises many
+kinds of exceptions for damaged bytes. Here a header is matched by regular expressions, never evaluated.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ import numpy.typing as npt
 from ctxval.errors import InputError
 
 MOST_BYTES = 256 * 2**20
-"""Bytes that the arrays which are read from one file may have together, each number as a float64."""
+"""Largest total size in bytes of the arrays that are read from one file, with each number as a float64."""
 
 _MOST_ARRAYS = 1000
 _MOST_HEADER = 10_000
-"""Bytes of a header; numpy allows as many."""
+"""Largest size of a header in bytes, as in numpy."""
 
 _DTYPE = re.compile(r"""['"]descr['"]\s*:\s*['"](?:([<>|=]?[fiub])([1248])|([<>|=]?U|\|?S)(\d{1,9}))['"]""")
 _ORDER = re.compile(r"""['"]fortran_order['"]\s*:\s*(True|False)""")
@@ -35,7 +35,7 @@ _SHAPE = re.compile(r"""['"]shape['"]\s*:\s*\(([\dL,\s]*)\)""")
 
 @dataclass(frozen=True)
 class _Header:
-    """What an array says of itself."""
+    """The header of an array; ``length`` is its size in bytes."""
 
     dtype: np.dtype[np.generic]
     shape: tuple[int, ...]
@@ -48,23 +48,23 @@ class _Header:
 
 
 class Archive:
-    """The arrays of an NPZ file, of which none is read before it is asked for. Nothing in the file is ever run.
+    """The arrays of an NPZ file. An array is read when it is requested, and nothing in the file is ever run.
 
-    The message of every error is the reason alone, for the caller to put behind the file's name.
+    The message of every error is only the reason; the caller puts the name of the file before it.
 
     Args:
         content: the bytes of the file.
-        most: bytes that the arrays which are read may have together, each number as a float64.
+        most: largest total size in bytes of the arrays that are read, with each number as a float64.
 
     Attributes:
-        names: of the arrays.
+        names: the names of the arrays.
 
     Raises:
-        InputError: this is no archive of arrays.
+        InputError: if the bytes are not an archive of arrays.
     """
 
     def __init__(self, content: bytes, most: int = MOST_BYTES) -> None:
-        if content.count(b"PK\x01\x02") > _MOST_ARRAYS:  # the mark of an entry, each of which takes memory
+        if content.count(b"PK\x01\x02") > _MOST_ARRAYS:  # the mark of an entry; each entry takes memory
             raise InputError(f"it has more than {_MOST_ARRAYS} entries")
         with _damage():
             self._zip = zipfile.ZipFile(io.BytesIO(content))
@@ -83,10 +83,10 @@ class Archive:
         return name in self._entries
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """Return an array's shape; its numbers are not read.
+        """Return the shape of an array, without reading its numbers.
 
         Raises:
-            InputError: there is no such array, or it is none of numbers or text.
+            InputError: if there is no such array, or it holds neither numbers nor text.
         """
         return self._header(name).shape
 
@@ -94,7 +94,7 @@ class Archive:
         """Return an array of real numbers.
 
         Raises:
-            InputError: there is no such array, it is of something else, damaged, or too large.
+            InputError: if there is no such array, or it does not hold real numbers, is damaged, or is too large.
         """
         header = self._header(name)
         if header.dtype.kind not in "fiub":
@@ -109,7 +109,7 @@ class Archive:
         """Return an array that is one text.
 
         Raises:
-            InputError: there is no such array, it is of something else, damaged, or too large.
+            InputError: if there is no such array, or it is not one text, is damaged, or is too large.
         """
         header = self._header(name)
         if header.dtype.kind not in "US" or header.count != 1:
@@ -117,7 +117,7 @@ class Archive:
         self._take(name, 2 * header.dtype.itemsize)
         with _damage():
             data = bytes(self._data(name, header))
-        # Replaced: a surrogate could not be written anywhere.
+        # Surrogates are replaced, because no file or terminal can hold them.
         order = {"<": "little", ">": "big"}.get(header.dtype.byteorder, sys.byteorder)
         encoding = "utf-8" if header.dtype.kind == "S" else f"utf-32-{order[0]}e"
         return data.decode(encoding, "replace").rstrip("\0")
@@ -133,11 +133,11 @@ class Archive:
     def _opened(self, name: str) -> IO[bytes]:
         info = self._entries[name]
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise InputError("it is compressed by another method than numpy's")
+            raise InputError("its compression method must be one that numpy writes, stored or deflated")
         return self._zip.open(info)
 
     def _take(self, name: str, size: int) -> None:
-        """Take this many bytes from those that may be read."""
+        """Count these bytes as read; refuse the array if they are more than are left."""
         if size > self._left:
             raise InputError(
                 f"its array {name} of shape {self._headers[name].shape} is too large: {self._left} bytes may be read"
@@ -147,15 +147,15 @@ class Archive:
     def _data(self, name: str, header: _Header) -> bytearray:
         size = header.count * header.dtype.itemsize
         if self._entries[name].file_size != header.length + size:
-            raise InputError(f"its array {name} is not as long as it says")
+            raise InputError(f"its array {name} is not as long as its header states")
         data, filled = bytearray(size), 0
         with self._opened(name) as file:
             file.read(header.length)
-            while chunk := file.read(2**20):  # to the end, where the checksum is compared
+            while chunk := file.read(2**20):  # to the end, because zipfile compares the checksum there
                 data[filled : filled + len(chunk)] = chunk
                 filled += len(chunk)
         if filled != size:
-            raise InputError(f"its array {name} is not as long as it says")
+            raise InputError(f"its array {name} is not as long as its header states")
         return data
 
 
@@ -164,14 +164,14 @@ def _read_header(name: str, file: IO[bytes]) -> _Header:
     start = file.read(8)
     width = {1: 2, 2: 4, 3: 4}.get(start[6] if len(start) == 8 else 0)
     if start[:6] != b"\x93NUMPY" or width is None:
-        raise InputError(f"its entry {name} is no array")
+        raise InputError(f"its entry {name} is not an array")
     length = int.from_bytes(file.read(width), "little")
     if length > _MOST_HEADER:
-        raise InputError(f"its array {name} has a header of {length} bytes")
+        raise InputError(f"its array {name} has a header of {length} bytes, more than {_MOST_HEADER}")
     text = file.read(length).decode("utf-8", "replace")
     dtype, order, shape = (pattern.search(text) for pattern in (_DTYPE, _ORDER, _SHAPE))
     if dtype is None or order is None or shape is None:
-        raise InputError(f"its array {name} is neither of real numbers nor of text")
+        raise InputError(f"its array {name} holds neither real numbers nor text")
     sizes = tuple(int(size.strip().rstrip("L")) for size in shape[1].split(",") if size.strip())
     kind = "".join(part for part in dtype.groups() if part)
     return _Header(np.dtype(kind), sizes, "F" if order[1] == "True" else "C", 8 + width + length)
@@ -179,10 +179,10 @@ def _read_header(name: str, file: IO[bytes]) -> _Header:
 
 @contextlib.contextmanager
 def _damage() -> Iterator[None]:
-    """Turn what zipfile, zlib and numpy raise for damaged or hostile bytes, a long list, into one error."""
+    """Turn the many exceptions of zipfile, zlib and numpy for damaged or hostile bytes into one error."""
     try:
         yield
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"it is no whole NPZ archive ({type(error).__name__})") from error
+        raise InputError(f"it is not a complete NPZ archive ({type(error).__name__})") from error

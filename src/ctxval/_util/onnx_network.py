@@ -1,4 +1,4 @@
-"""A network from an ONNX file: what learned models and trained policies share."""
+"""A network from an ONNX file, for learned models and trained policies."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from ctxval.errors import InputError, ModelError, ShapeError
 _TYPES: dict[str, type[np.float32] | type[np.float64]] = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 
 _MOST_BYTES = 2**34
-"""Bytes of a network's weights: what is no regular file is refused, a large one is not."""
+"""Largest size of a network's weights in bytes; it refuses endless files, not large networks."""
 
 Width = int | None
-"""Numbers in one row; None where the file leaves it open."""
+"""Number of values in one row; None if the file leaves it open."""
 
 
 class OnnxNetwork:
     """A network that maps rows of numbers to rows of numbers, on one thread of the processor.
 
-    Its inputs and its output have one row each task, shapes ``(N, k)``; where the file fixes N to 1, or the shapes are
-    ``(k,)``, it is called row by row. An ONNX file holds no code.
+    Its inputs and its output have one row for each task, shapes ``(N, k)``. If the file fixes N to 1, or the shapes are
+    ``(k,)``, the network is called row by row. An ONNX file holds no code.
 
     Args:
         source: the file, or its bytes.
 
     Attributes:
-        widths: numbers in a row of each input, None where the file leaves it open.
-        width: those of the output.
-        precision: rounding of the network's numbers, relative: 1e-7 or 2e-16.
+        widths: the number of values in a row of each input; None if the file leaves it open.
+        width: the number of values in a row of the output; None if the file leaves it open.
+        precision: the relative rounding of the network's numbers: 1e-7 in single, 2e-16 in double precision.
 
     Raises:
-        InputError: onnxruntime is not installed, or this is no network of real numbers in rows.
+        InputError: if onnxruntime is not installed, or the file is not a network of real numbers in rows.
     """
 
     def __init__(self, source: str | Path | bytes) -> None:
         contents = [source] if isinstance(source, bytes) else _contents(Path(source))
-        # One file goes to other processes as its bytes; with a second one, only its path finds that.
+        # A single file goes to other processes as its bytes. Weights in a second file are found only by the path.
         self._source: bytes | str = contents[0] if len(contents) == 1 else str(Path(str(source)).absolute())
         self._digest = hashlib.sha256(b"".join(contents)).hexdigest()[:16]
         self._session = _session(self._source)
@@ -56,19 +56,19 @@ class OnnxNetwork:
         self._looped = any(flat or count is not None for flat, count, _ in rows)
         fixed = {count for _, count, _ in rows if count is not None}
         if fixed - {1}:
-            raise InputError(f"the network must take any number of rows or one, it takes {max(fixed)}.")
+            raise InputError(f"the network must take any number of rows or one row, got {max(fixed)} rows.")
         self.precision = max(float(np.finfo(_TYPES[node.type]).eps) for node in nodes)
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this network in a store."""
+        """Return the description that identifies this network in a store."""
         return {"onnx": self._digest}
 
     def __call__(self, *inputs: Array) -> Array:
-        """Return the first output for inputs ``(..., k)``, one for each of the network's; shape ``(..., l)``.
+        """Return the first output ``(..., l)`` of the network for one array ``(..., k)`` for each of its inputs.
 
         Raises:
-            ShapeError: there are not as many inputs as the network's, or a row has another width.
-            ModelError: the network cannot be evaluated.
+            ShapeError: if the number of inputs or the width of a row differs from the network's.
+            ModelError: if the network cannot be evaluated.
         """
         if len(inputs) != len(self.widths):
             raise ShapeError(f"the network has {len(self.widths)} inputs, {', '.join(self.names)}, got {len(inputs)}.")
@@ -93,7 +93,7 @@ class OnnxNetwork:
         }
         try:
             return np.asarray(self._session.run(None, feeds)[0], dtype=np.float64)
-        except Exception as error:  # onnxruntime has no common base of its own
+        except Exception as error:  # onnxruntime's exceptions have no base class of their own
             raise ModelError(f"the network cannot be evaluated: {error}") from error
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -104,7 +104,7 @@ class OnnxNetwork:
 
 
 def _contents(path: Path) -> list[bytes]:
-    """Return the bytes of the file, and of its weights if they stand beside it, as PyTorch may leave them."""
+    """Return the bytes of the file, and of the file of weights that PyTorch may write beside it."""
     weights = path.with_name(f"{path.name}.data")
     try:
         return [read_bytes(file, most=_MOST_BYTES) for file in (path, weights) if file == path or file.exists()]
@@ -118,20 +118,20 @@ def _session(source: bytes | str) -> Any:
     except ImportError as error:
         raise InputError('onnxruntime is not installed: pip install "ctxval[onnx]".') from error
     options = onnxruntime.SessionOptions()
-    # One thread: small networks are slower on many, and the last bits then depend on how many there are.
+    # Small networks are slower on many threads, and their last bits depend on the number of threads.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
     try:
         return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
     except Exception as error:
-        raise InputError(f"this cannot be read as an ONNX network: {error}") from error
+        raise InputError(f"the file cannot be read as an ONNX network: {error}") from error
 
 
 def _rows(node: Any) -> tuple[bool, Width, Width]:
-    """Return whether an input or output is one flat row, the number of rows and the numbers in a row, if fixed."""
+    """Return whether an input or output is one flat row, and its numbers of rows and of values in a row, if fixed."""
     if node.type not in _TYPES or not isinstance(node.shape, list) or len(node.shape) not in (1, 2):
         raise InputError(
-            f"the network's {node.name!r} must be real numbers (N, k) or (k,), it is {node.type} of shape {node.shape}."
+            f"the network's {node.name!r} must be real numbers (N, k) or (k,), got {node.type} of shape {node.shape}."
         )
     *count, width = (size if isinstance(size, int) else None for size in node.shape)
     return not count, count[0] if count else None, width

@@ -1,4 +1,4 @@
-"""Folders for a while. What a killed process leaves of them is removed when the next one is made."""
+"""Temporary folders. The folders that a killed process left behind are removed when the next one is made."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ctxval._util.locks import FileLock
 
 _PREFIX = "ctxval-"
 _OWNED = "lock"
-"""The file that is locked as long as the process lives that made the folder."""
+"""Name of the file that the process that made the folder keeps locked as long as it lives."""
 
 
 class TemporaryFolder:
-    """A new folder, of this process alone to remove.
+    """A new temporary folder, which only this process removes.
 
     Attributes:
-        path: where it is.
+        path: the path of the folder.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class TemporaryFolder:
         self.path.mkdir()
 
     def remove(self) -> None:
-        """Remove the folder with all that is in it."""
+        """Remove the folder with everything in it."""
         if self._lock is not None:
             self._lock.close()
         shutil.rmtree(self._around, ignore_errors=True)
@@ -38,7 +38,7 @@ class TemporaryFolder:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Give a new folder, which is removed in the end."""
+    """Yield the path of a new folder, which is removed at the end of the context."""
     folder = TemporaryFolder()
     try:
         yield folder.path
@@ -47,14 +47,17 @@ def temporary_folder() -> Iterator[Path]:
 
 
 def _owned(folder: Path) -> FileLock | None:
-    """Return the lock that says whose a folder is; None on a disk without locks, where nobody else ever removes it."""
+    """Return the lock that marks a folder as in use.
+
+    Returns None on a disk without locks; no other process removes a folder that has no lock file.
+    """
     unnamed = folder / "new"
     try:
         held = FileLock(unnamed)
         held.acquire()
     except OSError:
         return None
-    # Nobody sees the file before it is locked.
+    # The file gets its name only after it is locked, so that no other process finds it unlocked.
     unnamed.rename(folder / _OWNED)
     return held
 
