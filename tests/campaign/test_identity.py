@@ -369,7 +369,7 @@ def test_what_is_measured_by_the_old_distance_at_the_same_time_is_kept_beside(tm
     campaign(path, make_validation(distance=Scaled(scale=100.0)), remeasure=True)
     stale.store.signature = lambda: before  # type: ignore[method-assign]  # it has looked just before
     stale.store._require_unchanged = Store(path)._require_unchanged  # type: ignore[method-assign]
-    with pytest.raises(StoreMismatchError, match=r"was changed meanwhile.*kept in .*a\.trial-0\.npz"):
+    with pytest.raises(StoreMismatchError, match=r"changed since the campaign was opened.*kept in .*a\.trial-0\.npz"):
         stale.tell(opened, whole)
 
 

@@ -205,7 +205,7 @@ def test_what_is_no_file_is_no_store(tmp_path: Path) -> None:
 def test_an_unreadable_file_is_one_sentence(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store.chmod(0)
     monkeypatch.setattr(os, "access", lambda *_: False)  # root reads everything
-    with pytest.raises(StoreAccessError, match="not readable for you"):
+    with pytest.raises(StoreAccessError, match="you do not have permission to read it"):
         Store.existing(store)
 
 
@@ -245,7 +245,7 @@ def test_a_journal_that_names_another_file_deletes_nothing(store: Path, tmp_path
     victim = tmp_path / "thesis.tex"
     victim.write_text("chapter 1\n")
     (tmp_path / "a.sqlite-journal").write_bytes(journal(store, names=victim))
-    assert "is of several files; move it away" in said(store)
+    assert "belongs to several databases; move it away" in said(store)
     assert len(recover(store).trials) == 5
     assert victim.exists()
 

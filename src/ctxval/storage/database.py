@@ -17,26 +17,26 @@ from ctxval.storage.disks import make_folder, on_network, warn_of_network
 from ctxval.storage.migrations import MIGRATIONS
 
 _APPLICATION = 0x63747876
-"""SQLite's application_id of our files, the letters "ctxv": how a file says that it is one of ours."""
+"""SQLite's application_id of a store, the letters "ctxv"; it marks a file as a store of ctxval."""
 
 _WAIT = 0.02
-"""Seconds between two attempts to become the sole writer."""
+"""Seconds between two attempts to take the lock."""
 
 
 class Database:
-    """A file of SQLite with the tables of a store, of the newest version.
+    """A SQLite file with the tables of a store; opening it brings the tables to the newest version.
 
     Attributes:
-        path: the file; None keeps the tables in memory.
-        name: what the store is called in messages.
+        path: the absolute path of the file; None if the tables are in memory.
+        name: the name of the store in messages.
 
     Raises:
-        StoreAccessError: the file cannot be opened or written.
-        ForeignStoreError: the file is no store, or one of a newer version.
+        StoreAccessError: if the file cannot be opened or written.
+        ForeignStoreError: if the file is not a store, or a store of a newer version.
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
-        # Absolute, as what is executed may change the folder of the process.
+        # Absolute, because an executed system may change the current folder of the process.
         self.path = None if path is None else Path(path).absolute()
         self.name = "the store in memory" if path is None else str(path)
         self._lock: FileLock | None = None
@@ -62,24 +62,24 @@ class Database:
             self._lock.close()
 
     def execute(self, statement: str, values: tuple[Any, ...] = ()) -> sqlite3.Cursor:
-        """Execute one statement; inside :meth:`transaction` or :meth:`translated_errors`."""
+        """Execute one statement. Call this inside :meth:`transaction` or :meth:`translated_errors`."""
         return self._connection.execute(statement, values)
 
     @contextmanager
     def rows(self, statement: str) -> Iterator[sqlite3.Cursor]:
-        """Read rows one by one, because a damaged file may have no end of them."""
+        """Read rows one by one, because a damaged file may yield rows without end."""
         with self.translated_errors(), closing(self._connection.execute(statement)) as cursor:
             yield cursor
 
     @contextmanager
     def sole_writer(self, wait: float = 0.0) -> Iterator[None]:
-        """Keep other processes from running this store; the lock goes with the process, however it ends.
+        """Prevent other processes from running this store. The lock is released when the process ends, however it ends.
 
         Args:
             wait: seconds to wait for another process that is about to end.
 
         Raises:
-            StoreAccessError: another process is running it.
+            StoreAccessError: if another process is running the store.
         """
         if self.path is None or self._locked:
             yield
@@ -111,7 +111,7 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Make all that is executed inside one transaction, on the disk at its end."""
+        """Execute the statements inside as one transaction, which is on the disk at its end."""
         with self.translated_errors():
             self._connection.execute("BEGIN IMMEDIATE")
             try:
@@ -124,11 +124,11 @@ class Database:
 
     @contextmanager
     def translated_errors(self) -> Iterator[None]:
-        """Turn errors of SQLite and of the file into one sentence that names the store."""
+        """Turn errors of SQLite and of the file into exceptions of ctxval that name the store."""
         try:
             yield
         except sqlite3.IntegrityError as error:
-            raise StoreAccessError(f"{self.name} was written by another process meanwhile: {error}.") from error
+            raise StoreAccessError(f"{self.name} was written by another process at the same time: {error}.") from error
         except sqlite3.OperationalError as error:
             raise StoreAccessError(f"{self.name} cannot be used as a store: {error}.") from error
         except sqlite3.DatabaseError as error:
@@ -140,7 +140,7 @@ class Database:
             raise StoreAccessError(f"{self.name} cannot be used as a store: {error}.") from error
 
     def damaged(self, what: str) -> ForeignStoreError:
-        """Return the error of a store in which something cannot be read."""
+        """Return the error that part of the store cannot be read; ``what`` says which part."""
         return ForeignStoreError(f"{self.name} is damaged: {what}; `ctxval export` saves what is readable.")
 
     # Opening
@@ -155,7 +155,7 @@ class Database:
             # A store is one file.
             self._connection.execute("PRAGMA journal_mode = DELETE")
         # FULL does not sync the folder after a journal is removed: a power cut may bring the journal back, and SQLite
-        # then takes back the last transaction.
+        # then undoes the last transaction.
         self._connection.execute("PRAGMA synchronous = EXTRA")
         for number in range(version, len(MIGRATIONS)):
             self._migrate(number)
@@ -164,7 +164,7 @@ class Database:
         title, script = MIGRATIONS[number]
         with self.transaction():
             if self._connection.execute("PRAGMA user_version").fetchone()[0] > number:
-                return  # another process was faster
+                return  # another process has done this migration
             if number == 0:
                 self._connection.execute(f"PRAGMA application_id = {_APPLICATION}")
             for statement in script.split(";"):
@@ -176,12 +176,12 @@ class Database:
 
 
 def _lockable(path: Path) -> Path:
-    """Return what is locked for a store: the file itself by its real name, or a file beside it where that cannot be."""
+    """Return the file to lock for a store: the store by its real path, or a file beside it if that cannot be locked."""
     real = path.resolve()
     itself = LOCKS_FILE_ITSELF and not on_network(real)
     return real if itself else real.with_name(f"{real.name}.lock")
 
 
 def now() -> str:
-    """Return the time in UTC, as stores have it."""
+    """Return the present time in UTC, in the format of stores."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -1,4 +1,4 @@
-"""Which disks a store is safe on, and folders that a power cut does not take back."""
+"""Warnings about disks on which a store is not safe, and folders that survive a power cut."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from pathlib import Path
 
 
 class StoreWarning(UserWarning):
-    """A store may not survive where it is."""
+    """The disk of a store may lose or damage it."""
 
 
 _NETWORKS = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "afs", "ncpfs", "fuse.sshfs", "fuse.rclone")
-"""File systems of other machines, on which locks and flushes cannot be relied on."""
+"""File systems of other machines, whose locks and flushes are not reliable."""
 
 
 def file_system(path: Path, mounts: str) -> str:
-    """Return the type of the file system that a path is on, of a table of mounts as /proc/mounts is."""
+    """Return the type of the file system that holds a path, by a table of mounts in the format of /proc/mounts."""
     lines = [line.split() for line in mounts.splitlines()]
     places = [(Path(line[1].replace("\\040", " ")), line[2]) for line in lines if len(line) > 2]
     holding = [(len(place.parts), kind) for place, kind in places if path.is_relative_to(place)]
@@ -32,15 +32,15 @@ def _kind_of(path: Path) -> str:
 
 
 def on_network(path: Path) -> bool:
-    """Return whether a path is on a file system of another machine, as far as this one says."""
+    """Return whether a path is on a file system of another machine, as far as this machine knows."""
     return _kind_of(path) in _NETWORKS
 
 
 def warn_of_network(path: Path) -> None:
-    """Warn of a store on a file system of another machine."""
+    """Warn if a store is on a file system of another machine."""
     if on_network(path):
         warnings.warn(
-            f"{path} is on a network file system ({_kind_of(path)}), whose locks and flushes cannot be relied on: keep "
+            f"{path} is on a network file system ({_kind_of(path)}), whose locks and flushes are not reliable; keep "
             "the store on a disk of this computer.",
             StoreWarning,
             stacklevel=4,
@@ -48,7 +48,7 @@ def warn_of_network(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, and those that it is in, where there is none yet; a power cut does not take it back."""
+    """Make a folder and its missing parents so that they survive a power cut."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     for place in missing:
@@ -56,7 +56,7 @@ def make_folder(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Write the names in a folder to the disk, where the operating system can."""
+    """Flush the directory entries of a folder to the disk, if the operating system supports it."""
     with contextlib.suppress(OSError):
         opened = os.open(folder, os.O_RDONLY)
         try:

@@ -1,4 +1,7 @@
-"""What makes a store, and brings one of an older version up: titles and statements of SQLite, in order."""
+"""The SQLite statements that create a store or update an older one, in order, each with its title.
+
+A store keeps the titles, and the layout of its tables is compared with these statements: never change an entry.
+"""
 
 from __future__ import annotations
 

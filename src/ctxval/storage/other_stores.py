@@ -1,4 +1,7 @@
-"""Other stores of the same experiment beside one: a verdict that is chosen among several is wrong more often."""
+"""Search for other stores of the same experiment beside a store.
+
+A verdict that is chosen among several stores is wrong more often than one verdict.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +17,23 @@ from ctxval.storage import schema
 
 _SUFFIXES = (".sqlite", ".sqlite3", ".db")
 _MOST_FILES = 500
-"""Files of a folder that are looked at."""
+"""Largest number of files in a folder that are checked."""
 
 _HEADER = 72
-"""Bytes of a SQLite file up to its application's mark, which is the last of them."""
+"""Bytes at the start of a SQLite file; the last four of them are its application_id."""
 
 _MARK = b"ctxv"
 
 _LONGEST = 2**24
-"""Characters of a description that are read."""
+"""Largest number of characters of a description that is read."""
 
 _UNREADABLE = (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
 
 def other_stores(path: Path) -> list[Path]:
-    """Return the other stores in the folder of one with trials of the same validation, by whatever search and seed.
+    """Return the other stores in a store's folder with trials of the same validation, of any search and seed.
 
-    Nothing is built, run or written; a file that cannot be read is passed over.
+    Nothing is built, run or written. Files that cannot be read are skipped.
     """
     try:
         own = _validation_of(path)
@@ -48,26 +51,26 @@ def _is_of(path: Path, own: dict[str, Any]) -> bool:
 
 
 def _validation_of(path: Path) -> dict[str, Any]:
-    """Return what a store says of its validation.
+    """Return a store's description of its validation.
 
     Raises:
-        ValueError: it says nothing of it, or has no trial that was executed.
-        sqlite3.Error, OSError: it cannot be read.
+        ValueError: if the store has no description of its validation, or no executed trial.
+        sqlite3.Error, OSError: if the store cannot be read.
     """
     with path.open("rb") as file:
         header = file.read(_HEADER)
     if not header.startswith(b"SQLite format 3\0") or header[-4:] != _MARK:
-        raise ValueError(f"{path} is no store")
-    uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"  # no lock is taken and no journal played back
+        raise ValueError(f"{path} is not a store")
+    uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"  # takes no lock and replays no journal
     with closing(sqlite3.connect(uri, uri=True, factory=schema.Guarded)) as connection:
         if not {"key", "value", "executed"} <= _columns(connection):
-            raise ValueError(f"{path} is no store")
+            raise ValueError(f"{path} is not a store")
         row = connection.execute(
             "SELECT value FROM experiment WHERE key = 'validation' AND length(value) <= ?", (_LONGEST,)
         ).fetchone()
         executed = connection.execute("SELECT EXISTS (SELECT 1 FROM trials WHERE executed)").fetchone()[0]
     if row is None or not executed:
-        raise ValueError(f"{path} has no trials of an experiment")
+        raise ValueError(f"{path} has no executed trials of an experiment")
     found = json.loads(row[0])
     if not isinstance(found, dict):
         raise ValueError(f"{path} does not describe its validation")

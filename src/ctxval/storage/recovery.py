@@ -1,4 +1,4 @@
-"""What can be read of a store, whole or damaged, as CSV and JSON."""
+"""Recovery of the readable parts of a store, whole or damaged, and their export as CSV and JSON."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from ctxval.storage.rows import CHECKED, COLUMNS, read_json, read_trajectory, re
 from ctxval.storage.store import Side, Store
 
 _PROBED = 10_000
-"""Numbers of rows that are tried where the file does not say how many there are."""
+"""Number of row numbers to try if the file does not tell how many rows there are."""
 
 _SMALLEST = 16
-"""Bytes that a row takes at least."""
+"""Smallest size of a row in bytes."""
 
 _JOURNAL_CHECKS = 20
-"""How often it is checked whether another process has removed its journal."""
+"""Number of checks whether another process has removed its journal."""
 _CHECK_INTERVAL = 0.05
 """Seconds between two of these checks."""
 
 _DEPTH = 100
-"""Levels of what is written as JSON: more than is ever read."""
+"""Largest number of nested levels written as JSON; it is larger than the depth that is ever read."""
 
 _TABLES = ("experiment", "settings", "history", "trials", "trajectories")
 
@@ -45,13 +45,13 @@ _UNREADABLE = (sqlite3.Error, CtxvalError, ValueError, TypeError, OverflowError,
 
 @dataclass(eq=False)
 class Recovered:
-    """What was readable.
+    """The readable parts of a store.
 
     Attributes:
-        trials: by number.
-        trajectories: by number and side.
+        trials: the trials by number.
+        trajectories: the trajectories by the number of their trial and their side.
         about: the tables experiment, settings and history.
-        damaged: a sentence for each thing that was not readable.
+        damaged: a sentence for each part that could not be read.
     """
 
     trials: dict[int, Trial] = field(default_factory=dict)
@@ -61,10 +61,10 @@ class Recovered:
 
 
 def recover(path: Path) -> Recovered:
-    """Read what is readable of a store; the file is not changed where it is damaged, or has a journal.
+    """Read the readable parts of a store. The file is not changed if it is damaged or has a journal.
 
     Raises:
-        StoreAccessError: there is no such file, or it cannot be read at all.
+        StoreAccessError: if there is no such file, or it cannot be read at all.
     """
     schema.require_file(path)
     if not path.is_file():
@@ -85,7 +85,7 @@ def recover(path: Path) -> Recovered:
 
 @contextmanager
 def _played_back(path: Path, found: Recovered) -> Iterator[Path]:
-    """Give the file to read: the store, or a copy into which the journal of a process that died was played back."""
+    """Yield the file to read: the store, or a copy into which the journal of a dead process was replayed."""
     journals = _left_journals(path)
     if not journals:
         try:
@@ -97,7 +97,7 @@ def _played_back(path: Path, found: Recovered) -> Iterator[Path]:
     with temporary_folder() as folder:
         copy = folder / "store.sqlite"
         try:
-            # In place it might destroy what is readable, should the journal be another database's.
+            # On a copy, because the journal of another database would destroy readable data.
             for file, ending in journals.items():
                 shutil.copyfile(file, f"{copy}{ending}")
             Store.existing(copy).close()
@@ -108,19 +108,22 @@ def _played_back(path: Path, found: Recovered) -> Iterator[Path]:
 
 
 def _left_journals(path: Path) -> dict[Path, str]:
-    """Return the store and the journals beside it, with their endings; empty where there is none for long."""
+    """Return the store and the journals beside it, with their endings; empty if no journal stays.
+
+    A journal that disappears during the checks belonged to a process that was writing.
+    """
     for _ in range(_JOURNAL_CHECKS):
         journals = schema.beside(path)
         if not journals:
             return {}
-        time.sleep(_CHECK_INTERVAL)  # it may be of a process that is writing
+        time.sleep(_CHECK_INTERVAL)
     real = str(path.resolve())
     return {path: ""} | {journal: str(journal).removeprefix(real) for journal in journals}
 
 
 def _read(connection: sqlite3.Connection, size: int, found: Recovered) -> None:
     try:
-        # Or SQLite refuses a file that is shorter than it says.
+        # Without this SQLite refuses a file that is shorter than its header states.
         connection.execute("PRAGMA writable_schema = ON")
         unchecked = connection.execute("PRAGMA user_version").fetchone()[0] < CHECKED
         tables = schema.plain_tables(connection, _TABLES)
@@ -141,7 +144,7 @@ def _read(connection: sqlite3.Connection, size: int, found: Recovered) -> None:
 
 @dataclass(eq=False)
 class _Reader:
-    """Reads tables row by row, each by its place, so that one row that is damaged does not hide the next."""
+    """Reads tables row by row, each row by its number, so that a damaged row does not hide the next one."""
 
     connection: sqlite3.Connection
     tables: dict[str, set[str]]
@@ -157,7 +160,7 @@ class _Reader:
                 self._note(f"the table {table}, {key}: {error}")
 
     def history(self) -> Iterator[dict[str, Any]]:
-        """Return what was changed in the store; versions before it was kept have none."""
+        """Yield the changes of the store; older versions of stores have no table of them."""
         for at, what, why, content in self.rows("history", ["at", "what", "why", "content"]):
             try:
                 yield {"at": str(at), "what": str(what), "why": str(why), "content": read_json(content, finite=False)}
@@ -165,7 +168,7 @@ class _Reader:
                 self._note(f"the table history, {at}: {error}")
 
     def rows(self, table: str, columns: list[str]) -> Iterator[tuple[Any, ...]]:
-        """Return the readable rows of a table; columns that older versions have not are None."""
+        """Yield the readable rows of a table; a column that an older version does not have is None."""
         if table not in self.tables:
             return
         wanted = ", ".join(name if name in self.tables[table] else f"NULL AS {name}" for name in columns)
@@ -187,7 +190,7 @@ class _Reader:
             places.update(place for (place,) in self.connection.execute(f"SELECT rowid FROM {table} NOT INDEXED"))
         except _UNREADABLE as error:
             self._note(f"the table {table}: {error}")
-            # What is behind the damage is found by its number, of which a file has not more than it has room for.
+            # Rows behind the damage are found by their numbers; the size of the file limits how many there can be.
             places |= set(range(min(self._last(table) + 1, self.size // _SMALLEST)))
         return sorted(places)
 
@@ -226,7 +229,7 @@ class _Reader:
 
 
 def _rows(places: list[int]) -> str:
-    """Name rows, in the order of their places; one that is probed on damaged pages is one of thousands."""
+    """Return a name for rows; a damaged page may make thousands of them unreadable."""
     if len(places) == 1:
         return f"row {places[0]}"
     return f"{len(places)} rows from {places[0]} to {places[-1]}"
@@ -236,7 +239,7 @@ def export(found: Recovered, folder: Path) -> list[Path]:
     """Write trials.csv, trials.json and a CSV file of each trajectory.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: if the folder cannot be written.
     """
     try:
         (folder / "trajectories").mkdir(parents=True, exist_ok=True)
@@ -263,7 +266,7 @@ def _write_table(path: Path, found: Recovered) -> None:
 
 
 def _cell(value: Any) -> Any:
-    """Return a value as a cell; a text does nothing in a spreadsheet or in a terminal."""
+    """Return a value as a cell of CSV; texts are made harmless for spreadsheets and terminals."""
     return guarded(visible(value)) if isinstance(value, str) else value
 
 

@@ -1,4 +1,4 @@
-"""A trial and a trajectory as rows of tables, with checksums."""
+"""Conversion of trials and trajectories to rows of tables and back, with checksums."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ COLUMNS = (
     "number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds, note, because, "
     "unmeasured"
 )
-"""Of a trial, as :func:`read_trial` takes them."""
+"""Columns of a trial, in the order that :func:`read_trial` takes."""
 
 
 CHECKED = 6
-"""The schema version since which every row has a checksum; bringing a store to it writes those that are missing."""
+"""The schema version from which on every row has a checksum; the migration to it writes the missing ones."""
 
 ENDED = "state = ?, distance = ?, failure = ?, executed = ?, unmeasured = ?"
-"""What :func:`ended_row` fills in."""
+"""The assignments that take the values of :func:`ended_row`."""
 
 
 def ended_row(trial: Trial) -> tuple[Any, ...]:
@@ -37,7 +37,7 @@ def ended_row(trial: Trial) -> tuple[Any, ...]:
 
 
 def _states(trial: Trial) -> tuple[str, int]:
-    # Tables of version 0.1.0 take three states; what has no distance yet stands there as failed, and has a mark.
+    # Tables of version 0.1.0 allow three states, so an unmeasured trial is stored as failed, with a mark.
     return ("failed", 1) if trial.state == "unmeasured" else (trial.state, 0)
 
 
@@ -52,33 +52,36 @@ def row_of(trial: Trial) -> tuple[Any, ...]:
 
 
 def real(value: float | None) -> float | None:
-    """Return a number as SQLite gives it back."""
+    """Return a number as the float that SQLite returns for it."""
     return None if value is None else float(value)
 
 
 def checksum_of(row: tuple[Any, ...]) -> int:
-    """Return the checksum of a row, as it is stored."""
+    """Return the checksum of a row of values in the order in which they are stored."""
     return zlib.crc32(repr(row).encode("utf-8", "backslashreplace"))
 
 
 def trial_checksum(row: tuple[Any, ...]) -> int:
-    """Return the checksum of a trial's row; as before there were the last two columns where they say nothing."""
+    """Return the checksum of a trial's row.
+
+    The last two columns are left out if they are empty, because older versions do not have them.
+    """
     return checksum_of(row if any(row[-2:]) else row[:-2])
 
 
 def read_trial(row: tuple[Any, ...], checksum: Any, *, unchecked: bool = False) -> Trial | None:
-    """Return the trial of a row; None where it is damaged, or is none that could have been stored.
+    """Return the trial of a row. Returns None if the row is damaged, or if its values are not those of a trial.
 
     Args:
         row: the values of the columns.
-        checksum: of the row.
-        unchecked: whether it is of a version of the store without checksums.
+        checksum: the stored checksum of the row.
+        unchecked: accept a row without a checksum, from a version of the store that had none.
     """
     number, origin, state, point, names, attempts, executed, distance, failure, seconds, note, because, unmeasured = row
     if not (unchecked and checksum is None) and trial_checksum(row) != checksum:
         return None
     try:
-        unit_point, parameters, thought = read_json(point), read_json(names), read_json(note or "null", finite=False)
+        unit_point, parameters, notes = read_json(point), read_json(names), read_json(note or "null", finite=False)
     except InputError:
         return None
     valid = (
@@ -89,19 +92,19 @@ def read_trial(row: tuple[Any, ...], checksum: Any, *, unchecked: bool = False) 
         distance is None or (isinstance(distance, float) and 0 <= distance < np.inf),
         seconds is None or (isinstance(seconds, float) and 0 <= seconds < np.inf),
         (state == "completed") == (distance is not None) and (state != "open" or not executed),
-        isinstance(failure, str | None) and isinstance(thought, dict | None) and isinstance(because, str | None),
+        isinstance(failure, str | None) and isinstance(notes, dict | None) and isinstance(because, str | None),
         unmeasured in (None, 0) or (unmeasured == 1 and state == "failed" and executed),
     )
     if not all(valid):
         return None
     ended: State = "unmeasured" if unmeasured else state
     where = np.array(unit_point, dtype=np.float64)
-    known = Trial(number, origin, ended, where, parameters, attempts, bool(executed), note=thought, because=because)
+    known = Trial(number, origin, ended, where, parameters, attempts, bool(executed), note=notes, because=because)
     return replace(known, distance=distance, failure=failure, seconds=seconds)
 
 
 _STATES = ("open", "completed", "failed")
-"""As they stand in the table."""
+"""The states of trials in the table."""
 
 
 def _count(value: Any) -> bool:
@@ -109,7 +112,7 @@ def _count(value: Any) -> bool:
 
 
 _MOST = 2**53
-"""Beyond what anybody counts."""
+"""Counts at or above this are refused as damage."""
 
 
 def _number(value: Any) -> bool:
@@ -122,29 +125,29 @@ def _numbers(value: Any) -> bool:
 
 
 def follows(trial: Trial, earlier: list[Trial]) -> bool:
-    """Return whether a trial may be the next one after these."""
+    """Return whether a trial has the next number and the same task space as the earlier trials."""
     same_space = not earlier or trial.unit_point.shape == earlier[0].unit_point.shape
     return trial.number == len(earlier) and same_space
 
 
 def read_json(text: Any, *, finite: bool = True) -> Any:
-    """Return the value of a text of JSON.
+    """Return the value of a JSON text.
 
     Args:
-        text: as a database gives it.
-        finite: refuse what is written like NaN and infinity, as JSON itself does.
+        text: the text, as the database returns it.
+        finite: refuse NaN and infinity, which are not part of JSON.
 
     Raises:
-        InputError: it is no text, or none of JSON.
+        InputError: if the value is not a text, not JSON, or nested too deeply.
     """
     if not isinstance(text, str):
-        raise InputError(f"JSON is text, got {type(text).__name__}.")
+        raise InputError(f"JSON must be text, got {type(text).__name__}.")
     try:
         value = json.loads(text, parse_constant=_refuse_constant if finite else None)
     except (ValueError, RecursionError, MemoryError) as error:
-        raise InputError(f"this is no JSON: {error}.") from error
+        raise InputError(f"the text is not JSON: {error}.") from error
     if not _shallow(value, _DEEPEST):
-        raise InputError(f"JSON is nested at most {_DEEPEST} times here.")
+        raise InputError(f"JSON must be nested at most {_DEEPEST} times.")
     return value
 
 
@@ -159,25 +162,25 @@ def _shallow(value: Any, levels: int) -> bool:
 
 
 def _refuse_constant(name: str) -> NoReturn:
-    raise InputError(f"{name} is no number of JSON.")
+    raise InputError(f"{name} is not a number of JSON.")
 
 
 def read_pairs(rows: Iterable[tuple[Any, Any]]) -> dict[str, Any]:
-    """Return a table of keys and values of JSON.
+    """Return the rows of a table of keys and JSON values as a dictionary.
 
     Raises:
-        InputError: a key is no text or is there twice, or a value is no JSON.
+        InputError: if a key is not a text or occurs twice, or a value is not JSON.
     """
     found: dict[str, Any] = {}
     for key, value in rows:
         if not isinstance(key, str) or key in found:
-            raise InputError(f"a key must be a text that is there once, got {key!r}.")
+            raise InputError(f"a key must be a text that occurs once, got {key!r}.")
         found[key] = read_json(value, finite=False)
     return found
 
 
 def read_trajectory(number: int, side: str, npz: Any, checksum: Any, *, unchecked: bool = False) -> Trajectory | None:
-    """Return the trajectory of a row; None where it is damaged, or another one's."""
+    """Return the trajectory of a row. Returns None if it is damaged, or belongs to another trial or side."""
     if not (unchecked and checksum is None) and checksum_of((number, side, npz)) != checksum:
         return None
     try:
@@ -187,7 +190,7 @@ def read_trajectory(number: int, side: str, npz: Any, checksum: Any, *, unchecke
 
 
 def write_checksums(connection: sqlite3.Connection) -> None:
-    """Write checksums of rows that a version without them stored."""
+    """Write the checksums of rows that a version without checksums stored."""
     for row in connection.execute(f"SELECT {COLUMNS} FROM trials WHERE checksum IS NULL").fetchall():
         connection.execute("UPDATE trials SET checksum = ? WHERE number = ?", (trial_checksum(row), row[0]))
     missing = "SELECT rowid, trial, side FROM trajectories WHERE checksum IS NULL"

@@ -1,7 +1,7 @@
-"""Whether a file is laid out as a store, before anything in it is believed; and a connection that comes to an end.
+"""Checks that a file has exactly the tables of a store, and a connection whose statements always end.
 
-SQLite takes orders from a file: views, triggers, generated columns and defaults are run, and a journal beside it is
-played back. A store has nothing but plain tables, so that whatever else is in a file makes it none.
+SQLite executes parts of a file: it runs views, triggers, generated columns and defaults, and replays a journal beside
+the file. A store has only plain tables, so a file with anything else is refused before its content is used.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from typing import Any
 from ctxval.errors import ForeignStoreError, StoreAccessError
 
 _EVERY = 10_000
-"""Instructions of SQLite between two looks at how many there were."""
+"""Instructions of SQLite between two checks of their number."""
 
 STEPS = 100_000_000
-"""Instructions of SQLite that one statement may take: reading a trial takes about twenty."""
+"""Largest number of SQLite instructions of one statement; reading a trial takes about twenty."""
 
 _OBJECTS = 100
-"""Tables and indexes beyond which nobody needs to look any further."""
+"""Largest number of tables and indexes that are examined; a store has far fewer."""
 
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_SQL_LENGTH: 100_000,
@@ -41,11 +41,11 @@ _LIMITS = {
 _JOURNAL_MAGIC = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
 
 _BESIDE = ("-journal", "-wal", "-shm")
-"""Files that SQLite reads beside a database, without being asked."""
+"""Endings of the files beside a database that SQLite reads by itself."""
 
 
 class Guarded(sqlite3.Connection):
-    """A connection to a file that anybody may have made: none of its statements goes on for ever."""
+    """A connection to an untrusted file, on which every statement ends after a bounded number of instructions."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -57,13 +57,13 @@ class Guarded(sqlite3.Connection):
         self.execute("PRAGMA cell_size_check = ON")
 
     def execute(self, *statement: Any) -> sqlite3.Cursor:
-        """Execute a statement, which may take as long as reading millions of trials."""
+        """Execute a statement; the bound allows reading millions of trials."""
         self._steps.taken = 0
         return super().execute(*statement)
 
 
 class _Steps:
-    """Counts instructions; apart from the connection, which would never be freed if it held itself."""
+    """Counts instructions. It is separate from the connection, which would not be freed if it referred to itself."""
 
     def __init__(self) -> None:
         self.taken = 0
@@ -74,11 +74,11 @@ class _Steps:
 
 
 def require_files(path: Path) -> None:
-    """Check that a store, if there is one, and what SQLite reads beside it are files, and that they touch no others.
+    """Check that a store and the files that SQLite reads beside it are regular files, if they exist.
 
     Raises:
-        StoreAccessError: there is something else, such as a folder, a pipe or a device.
-        ForeignStoreError: its journal names another file, which SQLite would delete.
+        StoreAccessError: if one of them is something else, such as a folder, a pipe or a device.
+        ForeignStoreError: if the journal names another file, which SQLite would delete.
     """
     require_file(path)
     real = os.path.realpath(path)
@@ -88,14 +88,16 @@ def require_files(path: Path) -> None:
         if mode is not None and not stat.S_ISREG(mode):
             raise StoreAccessError(f"{path} cannot be read as a store: {beside} is {_kind(mode)}; move it away.")
     if _names_another(Path(f"{real}-journal")):
-        raise ForeignStoreError(f"{path} cannot be read as a store: {real}-journal is of several files; move it away.")
+        raise ForeignStoreError(
+            f"{path} cannot be read as a store: {real}-journal belongs to several databases; move it away."
+        )
 
 
 def require_file(path: Path) -> None:
-    """Check that a path is a file or nothing.
+    """Check that a path is a regular file or does not exist.
 
     Raises:
-        StoreAccessError: it is something else, or nobody can say.
+        StoreAccessError: if the path is something else, or cannot be examined.
     """
     try:
         mode = _mode(path)
@@ -122,11 +124,11 @@ def _kind(mode: int) -> str:
         stat.S_IFCHR: "a device",
         stat.S_IFBLK: "a device",
     }
-    return kinds.get(stat.S_IFMT(mode), "no file")
+    return kinds.get(stat.S_IFMT(mode), "not a file")
 
 
 def _names_another(journal: Path) -> bool:
-    """Return whether a journal is of a transaction over several files; one of a store never is."""
+    """Return whether a journal belongs to a transaction over several databases, which a store never makes."""
     try:
         with journal.open("rb") as file:
             file.seek(-len(_JOURNAL_MAGIC), os.SEEK_END)
@@ -136,14 +138,14 @@ def _names_another(journal: Path) -> bool:
 
 
 def beside(path: Path) -> list[Path]:
-    """Return the journals of a database that another process left."""
+    """Return the journals beside a database; another process left them or is writing them."""
     real = os.path.realpath(path)
     return [found for ending in _BESIDE if (found := Path(real + ending)).is_file()]
 
 
 @contextmanager
 def snapshot(connection: sqlite3.Connection) -> Iterator[None]:
-    """Read at one moment, whatever other processes write meanwhile."""
+    """Make all reads inside see the file at one moment, whatever other processes write."""
     connection.execute("BEGIN")
     try:
         yield
@@ -153,22 +155,22 @@ def snapshot(connection: sqlite3.Connection) -> Iterator[None]:
 
 
 def version(connection: sqlite3.Connection, name: str, application: int, scripts: Sequence[str]) -> int:
-    """Return the version of a file's tables, after a check that they are those of a store and nothing else is there.
+    """Return the version of a file's tables, after a check that the file has exactly the tables of a store.
 
     Args:
-        connection: to the file.
-        name: of the store.
-        application: the mark of our files.
-        scripts: that bring a store from each version to the next; version 0 is an empty file.
+        connection: the connection to the file.
+        name: the name of the store in messages.
+        application: the application_id of stores.
+        scripts: the statements that bring a store from each version to the next; version 0 is an empty file.
 
     Raises:
-        ForeignStoreError: it is no store, or one of a newer version.
+        ForeignStoreError: if the file is not a store, or a store of a newer version.
     """
     mark = connection.execute("PRAGMA application_id").fetchone()[0]
     found = int(connection.execute("PRAGMA user_version").fetchone()[0])
     if mark == application and found > len(scripts):
         raise ForeignStoreError(
-            f"{name} has schema version {found}, made by a newer ctxval; this one reads up to {len(scripts)}."
+            f"{name} has schema version {found} of a newer ctxval; this version reads up to {len(scripts)}."
         )
     differs = difference(connection, tuple(scripts[: max(found, 0)]))
     if found == 0 and differs is None:
@@ -177,12 +179,17 @@ def version(connection: sqlite3.Connection, name: str, application: int, scripts
         raise ForeignStoreError(f"{name} is a database, but not a ctxval store.")
     if differs is not None or found < 0:
         what = f"its schema version is {found}" if found < 0 else differs
-        raise ForeignStoreError(f"{name} is no ctxval store: {what}; `ctxval export` saves what is readable.")
+        raise ForeignStoreError(f"{name} is not a ctxval store: {what}; `ctxval export` saves what is readable.")
     return found
 
 
 def plain_tables(connection: sqlite3.Connection, names: Iterable[str]) -> dict[str, set[str]]:
-    """Return those of these tables that can be read row by row without running anything, with their columns."""
+    """Return the names of the columns of each table that can be read row by row without running anything in the file.
+
+    Args:
+        connection: the connection to the file.
+        names: the names of the tables to look for.
+    """
     wanted, found = set(names), {}
     for kind, name, _, definition in itertools.islice(connection.execute(_MASTER), _OBJECTS):
         if (
@@ -199,7 +206,7 @@ def plain_tables(connection: sqlite3.Connection, names: Iterable[str]) -> dict[s
 
 
 def difference(connection: sqlite3.Connection, scripts: tuple[str, ...]) -> str | None:
-    """Return how the tables of a file differ from those that these scripts make; None if they do not."""
+    """Return how the tables of a file differ from those that these scripts make. Returns None if they agree."""
     expected, found = _expected(scripts), {}
     for place, (kind, name, table, definition) in enumerate(connection.execute(_MASTER)):
         if place == _OBJECTS:
@@ -233,5 +240,5 @@ def _expected(scripts: tuple[str, ...]) -> dict[tuple[str, str], tuple[str, str]
 
 
 def _bare(definition: object) -> str:
-    """Return a definition without what versions of SQLite write differently: spaces and quotes."""
+    """Return a definition without spaces and quotes, which versions of SQLite write differently."""
     return re.sub(r'[\s"`\[\]]', "", str(definition)).lower()

@@ -1,4 +1,4 @@
-"""Trials in SQLite: one file that survives the death of the process at any moment."""
+"""Trials in a SQLite file, which stays intact if the process dies at any moment."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from ctxval.storage.rows import (
 Side = Literal["model", "system"]
 
 _DRAWS = "draws"
-"""Key of the table experiment that is no part of the description."""
+"""Key in the table experiment that is not part of the description of the experiment."""
 
 
 class Store:
-    """A file of trials, of one experiment.
+    """A file with the trials of one experiment.
 
-    Every change is one transaction, on the disk before the call returns.
+    Every change is one transaction, which is on the disk before the call returns.
 
     Args:
-        path: the file; made if it does not exist. None keeps the trials in memory.
+        path: the file; it is created if it does not exist. None keeps the trials in memory.
 
     Raises:
-        StoreAccessError: the file cannot be opened or written.
-        ForeignStoreError: the file is no store, or one of a newer version.
+        StoreAccessError: if the file cannot be opened or written.
+        ForeignStoreError: if the file is not a store, or a store of a newer version.
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
@@ -51,12 +51,12 @@ class Store:
 
     @property
     def path(self) -> Path | None:
-        """The file; None in memory."""
+        """The absolute path of the file; None if the trials are in memory."""
         return self._database.path
 
     @property
     def name(self) -> str:
-        """What the store is called in messages."""
+        """The name of the store in messages."""
         return self._database.name
 
     @classmethod
@@ -64,13 +64,14 @@ class Store:
         """Open a store that must exist already.
 
         Raises:
-            StoreAccessError: there is no such file, or it is none that can be read.
+            StoreAccessError: if there is no such file, or it cannot be read.
+            ForeignStoreError: if the file is not a store, or a store of a newer version.
         """
         schema.require_files(Path(path))
         if not os.path.exists(path):
             raise StoreAccessError(f"there is no store at {path}.")
         if not os.access(path, os.R_OK):
-            raise StoreAccessError(f"{path} cannot be read as a store: it is not readable for you.")
+            raise StoreAccessError(f"{path} cannot be read as a store: you do not have permission to read it.")
         if not os.path.getsize(path):
             raise ForeignStoreError(f"{path} is an empty file, not a store.")
         return cls(path)
@@ -80,27 +81,27 @@ class Store:
         self._database.close()
 
     def sole_writer(self, wait: float = 0.0) -> AbstractContextManager[None]:
-        """Keep other processes from running this store; the lock goes with the process, however it ends.
+        """Prevent other processes from running this store. The lock is released when the process ends, however it ends.
 
         Args:
             wait: seconds to wait for another process that is about to end.
 
         Raises:
-            StoreAccessError: another process is running it.
+            StoreAccessError: if another process is running the store.
         """
         return self._database.sole_writer(wait)
 
     # The experiment
 
     def describe_first(self, description: dict[str, Any]) -> dict[str, Any]:
-        """Write which experiment the trials are of, unless that is written already; return what is stored."""
+        """Store the description of the experiment if there is none yet; return the stored description."""
         with self._database.transaction():
             if not self.description():
                 self._write_description(description)
         return self.description()
 
     def describe_anew(self, description: dict[str, Any], change: Change) -> None:
-        """Replace which experiment the trials are of, and keep in the history what has changed and why."""
+        """Replace the description of the experiment, and record in the history what has changed and why."""
         with self._database.transaction():
             self._write_description(description)
             self._insert_change(change)
@@ -115,17 +116,17 @@ class Store:
         return {key: value for key, value in self._pairs("experiment").items() if key != _DRAWS}
 
     def draws(self) -> int | None:
-        """Return what the randomness of independent draws depends on besides the seed; None if nothing is stored."""
+        """Return the number that seeds independent draws together with the seed. Returns None if none is stored."""
         kept = self._pairs("experiment").get(_DRAWS)
         return kept if isinstance(kept, int) else None
 
     def keep_draws(self, number: int) -> None:
-        """Write what the randomness of independent draws depends on, once and for all."""
+        """Store the number that seeds independent draws; a number that is stored already stays."""
         with self._database.transaction():
             self._database.execute("INSERT OR IGNORE INTO experiment VALUES (?, ?)", (_DRAWS, json.dumps(number)))
 
     def keep_settings(self, settings: dict[str, Any]) -> None:
-        """Write how to make the experiment again, for commands that are given the store alone."""
+        """Store the settings that make the experiment again, for commands that get only the store."""
         if self.settings() == json.loads(json.dumps(settings)):
             return
         with self._database.transaction():
@@ -134,7 +135,7 @@ class Store:
                 self._database.execute("INSERT INTO settings VALUES (?, ?)", (key, json.dumps(value)))
 
     def settings(self) -> dict[str, Any]:
-        """Return how to make the experiment again; empty where it was not made by a command."""
+        """Return the settings that make the experiment again; empty if no command made the store."""
         return self._pairs("settings")
 
     def _pairs(self, table: str) -> dict[str, Any]:
@@ -147,10 +148,14 @@ class Store:
     # The history
 
     def history(self) -> list[Change]:
-        """Return what was changed in the store after it was written, and why, in order."""
+        """Return the later changes of the store in order, each with its reason.
+
+        Raises:
+            ForeignStoreError: if the history is damaged.
+        """
         with self._database.rows("SELECT what, why, content, at FROM history ORDER BY number") as found:
             try:
-                return [Change(str(what), str(why), rows.read_json(told), str(at)) for what, why, told, at in found]
+                return [Change(str(what), str(why), rows.read_json(text), str(at)) for what, why, text, at in found]
             except InputError as error:
                 raise self._database.damaged("its history cannot be read") from error
 
@@ -163,12 +168,16 @@ class Store:
     def remeasure(
         self, trials: Sequence[Trial], description: dict[str, Any], change: Change, seen: tuple[int, int, int]
     ) -> bool:
-        """Store trials whose distances were computed anew, with the description of the distance, in one piece.
+        """Store trials with new distances, and the description of the new distance, in one transaction.
 
-        What they were stays in the history.
+        Args:
+            trials: the trials with their new distances.
+            description: the description of the experiment with the new distance.
+            change: the entry for the history, with the previous distances.
+            seen: the :meth:`signature` of the store when the trials were read.
 
         Returns:
-            False if the store is not as :meth:`signature` was when the trials were read; nothing is stored then.
+            False if the store has changed since then, so that nothing is stored; True otherwise.
         """
         with self._database.transaction():
             if self.signature() != seen:
@@ -183,15 +192,18 @@ class Store:
         return True
 
     def _require_unchanged(self, changes: int | None) -> None:
-        """Refuse what a campaign would write that has not seen a change of the experiment.
+        """Check that the experiment of the store has not changed since a campaign opened it.
+
+        Args:
+            changes: the number of changes that the campaign knows; None skips the check.
 
         Raises:
-            StoreMismatchError: the store has other changes than the campaign has seen.
+            StoreMismatchError: if the store has another number of changes.
         """
         if changes is not None and self.signature()[2] != changes:
             raise StoreMismatchError(
-                f"{self.name} was changed meanwhile, by remeasure or by a change that was accepted; open the campaign "
-                "again, with the experiment as it is now."
+                f"{self.name} has changed since the campaign was opened, by remeasure or by accept_change; open the "
+                "campaign again with the present experiment."
             )
 
     # Trials
@@ -204,7 +216,7 @@ class Store:
             self._write_trajectory(trial.number, "model", model_trajectory)
 
     def record_failed_plan(self, trial: Trial, *, changes: int | None = None) -> None:
-        """Store a new trial that failed before S was touched."""
+        """Store a new trial that failed before an execution of S."""
         with self._database.transaction():
             self._require_unchanged(changes)
             self._insert(trial)
@@ -217,7 +229,7 @@ class Store:
         *,
         changes: int | None = None,
     ) -> None:
-        """Store a new trial that has ended already, in one piece."""
+        """Store a new trial that has ended already, in one transaction."""
         with self._database.transaction():
             self._require_unchanged(changes)
             self._insert(trial)
@@ -235,10 +247,15 @@ class Store:
         )
 
     def begin_attempt(self, trial: Trial, *, changes: int | None = None) -> None:
-        """Count one more start of a trial's execution, before it starts; the trial is as it will be then.
+        """Record one more attempt to execute a trial, before the execution starts.
+
+        Args:
+            trial: the trial, with this attempt counted.
+            changes: the number of changes that the campaign knows; None skips the check.
 
         Raises:
-            InputError: the trial is not open any more.
+            InputError: if the trial is no longer open.
+            StoreMismatchError: if the store has another number of changes.
         """
         with self._database.transaction():
             self._require_unchanged(changes)
@@ -250,10 +267,11 @@ class Store:
                 raise self._not_open(trial.number)
 
     def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
-        """Store how an open trial ended.
+        """Store the result of an open trial.
 
         Raises:
-            InputError: the trial is not open; of two that tell, the first one wins.
+            InputError: if the trial is not open; of two results for one trial, the first is stored.
+            StoreMismatchError: if the store has another number of changes than ``changes``.
         """
         with self._database.transaction():
             self._require_unchanged(changes)
@@ -279,7 +297,7 @@ class Store:
         """Return all trials in their order.
 
         Raises:
-            ForeignStoreError: one of them is damaged.
+            ForeignStoreError: if a trial is damaged.
         """
         found: list[Trial] = []
         with self._database.rows(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number") as cursor:
@@ -291,7 +309,7 @@ class Store:
         return found
 
     def signature(self) -> tuple[int, int, int]:
-        """Return how many trials, open trials and changes there are: what another process may have changed."""
+        """Return the numbers of trials, of open trials and of changes, to notice what another process has changed."""
         with self._database.translated_errors():
             row = self._database.execute(
                 "SELECT count(*), coalesce(sum(state = 'open'), 0), (SELECT count(*) FROM history) FROM trials"
@@ -299,15 +317,19 @@ class Store:
         return int(row[0]), int(row[1]), int(row[2])
 
     def trajectory(self, number: int, side: Side) -> Trajectory | None:
-        """Return a stored trajectory of a trial; None if there is none.
+        """Return a stored trajectory of a trial. Returns None if there is none.
+
+        Args:
+            number: the number of the trial.
+            side: ``"model"`` or ``"system"``.
 
         Raises:
-            ForeignStoreError: it is damaged.
+            ForeignStoreError: if the trajectory is damaged.
         """
         where = "FROM trajectories {} WHERE trial = ? AND side = ?"
         with self._database.translated_errors():
             row = self._database.execute(f"SELECT npz, checksum {where.format('')}", (number, side)).fetchone()
-            # A damaged index may hide a row; without it, finding none takes longer.
+            # A damaged index may hide a row. The search without the index is slower, so it runs only if none is found.
             hidden = (
                 row is None
                 and self._database.execute(f"SELECT 1 {where.format('NOT INDEXED')}", (number, side)).fetchone()
