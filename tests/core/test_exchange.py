@@ -111,13 +111,13 @@ def test_a_task_comes_back_bit_for_bit(tmp_path: Path) -> None:
 
 def test_only_affine_feedback_of_one_task_can_be_written(tmp_path: Path) -> None:
     path = tmp_path / "controller.json"
-    with pytest.raises(InputError, match="only affine feedback, such as LQR and iLQR design"):
+    with pytest.raises(InputError, match="only affine feedback, such as that of LQR and iLQR"):
         write_controller(path, lambda t, x: x, dt=0.1)
     batch = controllers.LQR([1.0, 0.1], [0.01]).design(Task(np.zeros((3, 2)), horizon=4, dt=0.1), MODEL)
-    with pytest.raises(ShapeError, match="the controller of one task"):
+    with pytest.raises(ShapeError, match="controller must be for one task"):
         write_controller(path, batch, dt=0.1)
     write_controller(path, batch[1], dt=0.1)
-    with pytest.raises(ShapeError, match="a file holds one task"):
+    with pytest.raises(ShapeError, match="must hold one task"):
         write_task(path, Task(np.zeros((3, 2)), horizon=4, dt=0.1))
 
 
@@ -156,7 +156,7 @@ def content() -> dict[str, Any]:
         ({"gains": [[[1.0, 10**400]]] * 3}, "cannot be read"),
         ({"gains": [1.0]}, r"gains \(H, m, n\), inputs \(H, m\) and states \(H, n\), got \(1,\)"),
         ({"inputs": [[0.0]] * 2}, r"got \(3, 1, 2\), \(2, 1\) and \(3, 2\)"),
-        ({"horizon": 10**9}, "says that its horizon is 1000000000, its gains are 3"),
+        ({"horizon": 10**9}, "its horizon must be the number of its gains, 3, got 1000000000"),
         ({"dt": "0.1"}, "dt must be a positive number of seconds"),
         ({"dt": -1}, "dt must be a positive number of seconds"),
         ({"low": [1.0], "high": [-1.0]}, "low < high"),
@@ -256,5 +256,5 @@ def test_a_fifo_is_no_file(kind: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", ["[1, 2]", "3", '"text"', "null"])
 def test_json_that_is_no_object_is_refused(content: str, tmp_path: Path) -> None:
     (tmp_path / "task.json").write_text(content)
-    with pytest.raises(InputError, match=r"cannot be read as a ctxval task: it must be an object with names"):
+    with pytest.raises(InputError, match=r"cannot be read as a ctxval task: it must be a JSON object"):
         read_task(tmp_path / "task.json")

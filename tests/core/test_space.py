@@ -253,7 +253,7 @@ def test_a_grid_has_both_ends_and_every_combination() -> None:
 
 @pytest.mark.parametrize("per_axis", [1, 0, -2])
 def test_a_grid_of_fewer_than_two_points_an_axis_is_refused(space: TaskSpace, per_axis: int) -> None:
-    with pytest.raises(InputError, match=rf"at least 2 points an axis, got {per_axis}"):
+    with pytest.raises(InputError, match=rf"at least 2 points on each axis, got {per_axis}"):
         space.grid(per_axis)
 
 

@@ -60,7 +60,7 @@ class OnnxNetwork:
         self.precision = max(float(np.finfo(_TYPES[node.type]).eps) for node in nodes)
 
     def describe(self) -> dict[str, Any]:
-        """Return the description that identifies this network in a store."""
+        """Return what identifies this network in a store."""
         return {"onnx": self._digest}
 
     def __call__(self, *inputs: Array) -> Array:

@@ -1,1 +1,1 @@
-"""What is validated: the records, the five contracts, and the map p -> d(p)."""
+"""The records of a validation, the contracts of its parts, and the map p -> d(p)."""

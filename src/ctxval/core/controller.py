@@ -1,4 +1,4 @@
-"""Controllers, and what designs them."""
+"""Controllers, the synthesizers that design them, and limits of inputs."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
 
 Controller = Callable[[int, Array], Array]
-"""``u = pi(t, x)``: step index t, state ``(..., n)`` -> input ``(..., m)``."""
+"""A function ``u = pi(t, x)`` from the index t of the step and the state ``(..., n)`` to the input ``(..., m)``."""
 
 
 @runtime_checkable
 class Synthesizer(Protocol):
-    """Designs a controller for a task on a model.
+    """A method that designs a controller for a task on a model.
 
-    A synthesizer that can design for a batch of tasks in one call says so with an attribute ``batched = True``.
+    A synthesizer that can design for a batch of tasks in one call has an attribute ``batched = True``.
     """
 
     def design(self, task: Task, model: Model) -> Controller:
         """Return the controller pi(x; g_p, M).
 
         Raises:
-            DesignError: there is none.
+            DesignError: if no controller can be designed for the task.
         """
 
 
@@ -42,14 +42,15 @@ _SPELLINGS = (
 
 @dataclass(frozen=True, eq=False, init=False)
 class Limits:
-    """The box that inputs stay in, ``low <= u <= high``.
+    """Limits of the inputs, ``low <= u <= high``.
 
     Attributes:
-        low, high: a number for every input, or one for each, shape ``(m,)``; infinite if there is no limit.
+        low, high: the lower and upper limits: a number for all inputs, or one for each input, shape ``(m,)``; infinite
+            if there is no limit.
 
     Raises:
-        InputError: a limit is NaN, or a low one is not below its high one.
-        ShapeError: they are neither numbers nor as many as each other.
+        InputError: if a limit is NaN, or a lower limit is not below its upper limit.
+        ShapeError: if the limits are neither numbers nor lists of the same length.
     """
 
     low: Array
@@ -74,16 +75,16 @@ class Limits:
 
     @classmethod
     def of(cls, limits: LimitsLike, inputs: int | None = None) -> Limits:
-        """Return limits from what a user gives.
+        """Return limits from any form that users may give.
 
         Args:
             limits: one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and
                 high, numbers or ``(m,)``; or rows ``[low, high]``, one for each input, shape ``(m, 2)``.
-            inputs: m, the shape that the limits are brought to; None leaves numbers as they are.
+            inputs: the number of inputs m, to which single numbers are expanded; None leaves them as they are.
 
         Raises:
-            InputError: they could be read in two ways, are NaN, or a low one is not below its high one.
-            ShapeError: there are not as many as inputs.
+            InputError: if the limits are ambiguous or NaN, or a lower limit is not below its upper limit.
+            ShapeError: if the number of limits is not the number of inputs.
         """
         found = limits if isinstance(limits, Limits) else _read_limits(limits)
         if inputs is None:
@@ -99,7 +100,7 @@ class Limits:
         return {"low": self.low.tolist(), "high": self.high.tolist()}
 
     def clip(self, u: Array) -> Array:
-        """Return inputs ``(..., m)`` within the limits; NaN stays NaN."""
+        """Return inputs ``(..., m)`` clipped to the limits; NaN stays NaN."""
         return np.asarray(np.clip(u, self.low, self.high))
 
     def __repr__(self) -> str:
@@ -132,7 +133,7 @@ def _read_limits(limits: Any) -> Limits:
 
 
 def _flat(listed: list[float]) -> InputError:
-    """Return the error of a flat list, with the ways to write what may be meant."""
+    """Return the error that limits are a flat list, with the forms in which the user can write them instead."""
     ways = []
     if len(listed) == 2 and listed[0] < listed[1]:
         ways.append(f"{_table(*listed)} for {listed[0]:g} to {listed[1]:g} of every input")
@@ -148,21 +149,21 @@ def _table(low: Any, high: Any) -> str:
 
 
 def given_limits(limits: LimitsLike | None) -> float | Limits | None:
-    """Return limits for a number of inputs that is not known yet, checked; one number stays one.
+    """Check limits while the number of inputs is not known yet; return them, with a single number as a number.
 
     Raises:
-        InputError: they cannot be used.
+        InputError: if the limits cannot be used.
     """
     if limits is None:
         return None
     found = Limits.of(limits)
-    # A number is described in stores as a number, as it always was.
+    # Stores of version 0.1.0 describe a single number as a number.
     given_a_number = not isinstance(limits, Limits | Mapping) and np.ndim(limits) == 0
     return float(found.high) if given_a_number else found
 
 
 def describe_limits(limits: float | Limits | None) -> Any:
-    """Return what identifies the limits of a policy in a store: as version 0.1.0 did if that was unambiguous."""
+    """Return what identifies the limits of a policy in a store, in the form of version 0.1.0 if it is unambiguous."""
     if not isinstance(limits, Limits) or not (limits.low.ndim or limits.high.ndim):
         return limits
     return [limits.low.tolist(), limits.high.tolist()]
@@ -170,13 +171,13 @@ def describe_limits(limits: float | Limits | None) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class AffineFeedback:
-    """Time-varying affine feedback ``u = v_t + K_t (x - x_t)``, clipped to its limits where it has any.
+    """Time-varying affine feedback ``u = v_t + K_t (x - x_t)``, clipped to its limits if it has any.
 
     Attributes:
-        gains: K, shape ``(..., H, m, n)``, or ``(H, m, n)`` where the whole batch has the same.
-        inputs: v, shape ``(..., H, m)``.
-        states: x, shape ``(..., H, n)`` or more.
-        limits: the same for every task of a batch.
+        gains: the gains K, shape ``(..., H, m, n)``, or ``(H, m, n)`` if all tasks of the batch share them.
+        inputs: the inputs v, shape ``(..., H, m)``.
+        states: the states x, shape ``(..., H, n)`` or with more times than H.
+        limits: the limits of the inputs, shared by all tasks of the batch; None if there are none.
     """
 
     gains: Array
@@ -201,16 +202,16 @@ class AffineFeedback:
 
 @part(functions={"policy": "(t, x, task) -> u"})
 class Policy:
-    """The same policy for every task: ``policy(t, x, task) -> u``, as a synthesizer.
+    """A synthesizer that uses the same policy ``policy(t, x, task) -> u`` for every task.
 
     Args:
-        policy: called with the step index, states ``(..., n)`` and the task; returns inputs ``(..., m)``.
-        vectorized: False where it only takes one state ``(n,)`` at a time.
-        limits: inputs are clipped to them: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and
-            high, or rows ``[low, high]``, one for each input.
+        policy: function of the step's index, the states ``(..., n)`` and the task; returns the inputs ``(..., m)``.
+        vectorized: False if the policy takes only one state ``(n,)`` at a time.
+        limits: limits to which the inputs are clipped: one number h for -h to h, ``Limits(low=, high=)``, a mapping of
+            low and high, or rows ``[low, high]``, one for each input.
 
     Raises:
-        InputError: the limits could be read in two ways, or are not low < high.
+        InputError: if the limits are ambiguous, or a lower limit is not below its upper limit.
     """
 
     def __init__(
@@ -225,7 +226,7 @@ class Policy:
         self.limits = given_limits(limits)
 
     def design(self, task: Task, model: Model) -> Controller:
-        """Return the policy bound to the task; the model is not asked."""
+        """Return the policy bound to the task; the model is not used."""
         return _BoundPolicy(self.policy, task, self.limits)
 
     def describe(self) -> dict[str, Any]:
@@ -238,7 +239,7 @@ class Policy:
 
 @dataclass(frozen=True, eq=False)
 class _BoundPolicy:
-    """A policy for one task or a batch; unlike a lambda it can go to another process."""
+    """A policy for one task or a batch; unlike a lambda it can be pickled for another process."""
 
     policy: Callable[[int, Array, Task], Array]
     task: Task

@@ -1,4 +1,4 @@
-"""What every distance offers."""
+"""The contracts of distances between the trajectories of M and S."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class Distance(Protocol):
 
 @runtime_checkable
 class ComposedDistance(Protocol):
-    """A distance that is a plain function of a short vector; a search learns more from the vector than from d."""
+    """A distance that is a function of a short error vector; a search learns more from the vector than from d."""
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the vector, shape ``(..., k)`` over the batch."""
+        """Return the error vector, shape ``(..., k)`` over the batch."""
 
     def compose(self, error: Array) -> Array:
-        """Return the distance of vectors ``(..., k)``, shape ``(...)``."""
+        """Return the distances of error vectors ``(..., k)``, shape ``(...)``."""

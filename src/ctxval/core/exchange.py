@@ -1,7 +1,7 @@
-"""Tasks and controllers as files, for a rig or a program that is not this one.
+"""Tasks and controllers as files, for a rig or another program.
 
-A file is JSON, or for a controller also NPZ with the same names; it says by itself what is in it. Numbers come back
-bit for bit. Nothing in such a file is ever run, and one that is damaged or made up gives an :class:`InputError`.
+A file is JSON; a controller can also be NPZ with the same names. The file names its own format. Numbers are read back
+bit for bit. Nothing in such a file is ever run, and a damaged or forged file raises an :class:`InputError`.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ Names = Mapping[str, str]
 _UNREADABLE = (
     *(ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, MemoryError, RecursionError),
 )
-"""What is raised for content of other types than are expected."""
+"""Exceptions that content of unexpected types raises."""
 
 
 @dataclass(frozen=True, eq=False)
 class ControllerFile:
-    """A controller as it was read from a file.
+    """A controller that was read from a file.
 
     Attributes:
-        controller: the feedback of one task.
-        dt: seconds in a step.
-        states, inputs: names and units, in the order of the components.
+        controller: the feedback for one task.
+        dt: length of a step, seconds.
+        states, inputs: the names of the states and inputs with their units, in the order of the components.
     """
 
     controller: AffineFeedback
@@ -62,20 +62,23 @@ def write_controller(
     """Write the controller of one task as ``.json`` or ``.npz``.
 
     Args:
-        path: the file; its suffix says which kind.
-        controller: affine feedback, such as LQR and iLQR design.
-        dt: seconds in a step.
+        path: the file; its suffix, ``.json`` or ``.npz``, determines the format.
+        controller: affine feedback, as LQR and iLQR design it.
+        dt: length of a step, seconds.
         states, inputs: names and units of the components; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
 
     Raises:
-        InputError: the controller is of another kind, of a batch or not finite, or the file cannot be written.
+        InputError: if the controller is not affine feedback or not finite, or the file cannot be written.
+        ShapeError: if the controller is for a batch of tasks, or the number of names differs from that of components.
     """
     if not isinstance(controller, AffineFeedback):
         raise InputError(
-            f"only affine feedback, such as LQR and iLQR design, can be written to a file, got {controller!r}."
+            f"only affine feedback, such as that of LQR and iLQR, can be written to a file, got {controller!r}."
         )
     if controller.gains.ndim != 3 or controller.inputs.ndim != 2:
-        raise ShapeError(f"a file holds the controller of one task, got gains of shape {controller.gains.shape}.")
+        raise ShapeError(
+            f"the controller must be for one task, with gains of shape (H, m, n), got {controller.gains.shape}."
+        )
     horizon, m, n = controller.gains.shape
     about = {
         "format": CONTROLLER_FORMAT,
@@ -101,7 +104,7 @@ def read_controller(path: str | Path) -> ControllerFile:
     """Read a controller from a ``.json`` or ``.npz`` file.
 
     Raises:
-        InputError: the file is none, or damaged; the message says what is wrong.
+        InputError: if the file is not a controller file or is damaged; the message says what is wrong.
     """
     return _read(Path(path), CONTROLLER_FORMAT, _controller)
 
@@ -109,12 +112,17 @@ def read_controller(path: str | Path) -> ControllerFile:
 def write_task(path: str | Path, task: Task, *, states: Names | None = None) -> None:
     """Write one task as JSON: its initial state, reference, horizon and time step.
 
+    Args:
+        path: the file; it ends in ``.json``.
+        task: one task.
+        states: names and units of the states; ``x0, x1, ...`` by default.
+
     Raises:
-        ShapeError: it is a batch.
-        InputError: the file cannot be written.
+        ShapeError: if the task is a batch, or the number of names differs from the number of states.
+        InputError: if the file cannot be written.
     """
     if task.batch_shape:
-        raise ShapeError(f"a file holds one task, got a batch of shape {task.batch_shape}.")
+        raise ShapeError(f"the file of a task must hold one task, got a batch of shape {task.batch_shape}.")
     about = {
         "format": TASK_FORMAT,
         "version": VERSION,
@@ -129,7 +137,7 @@ def read_task(path: str | Path) -> Task:
     """Read one task from a JSON file.
 
     Raises:
-        InputError: the file is none, or damaged; the message says what is wrong.
+        InputError: if the file is not a task file or is damaged; the message says what is wrong.
     """
     return _read(Path(path), TASK_FORMAT, _task)
 
@@ -153,7 +161,7 @@ def _read(path: Path, expected: str, build: Callable[[Mapping[str, Any]], Conten
     try:
         content = _npz_content(path) if path.suffix == ".npz" else read_json(path)
         if not isinstance(content, Mapping):
-            raise InputError("it must be an object with names.")
+            raise InputError("it must be a JSON object.")
         if content["format"] != expected:
             raise InputError(f"its format must be {expected!r}, got {str(content['format'])[:40]!r}.")
         if content["version"] != VERSION:
@@ -179,7 +187,7 @@ def _controller(content: Mapping[str, Any]) -> ControllerFile:
         )
     horizon, m, n = gains.shape
     if content["horizon"] != horizon:
-        raise InputError(f"it says that its horizon is {str(content['horizon'])[:40]}, its gains are {horizon}.")
+        raise InputError(f"its horizon must be the number of its gains, {horizon}, got {str(content['horizon'])[:40]}.")
     limits = None
     if content.get("low") is not None or content.get("high") is not None:
         limits = Limits.of(Limits(_bound(content["low"], -np.inf), _bound(content["high"], np.inf)), m)
@@ -201,7 +209,7 @@ def _task(content: Mapping[str, Any]) -> Task:
 
 
 def _listed(array: Array) -> Any:
-    """Return an array as JSON, in which an infinite limit is null."""
+    """Return an array as lists for JSON, with null for infinite limits."""
     return [value if np.isfinite(value) else None for value in array.tolist()] if array.ndim == 1 else array.tolist()
 
 

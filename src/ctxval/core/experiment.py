@@ -1,4 +1,4 @@
-"""A validation with a name, the budget that suits it, and its truth if that can be known."""
+"""A validation with a name, a default budget and threshold, and a way to find d* if there is one."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from ctxval.core.validation import Validation
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """What ``ctxval run`` runs.
+    """A validation with its defaults, as ``ctxval run`` runs it.
 
     Attributes:
-        name: a short name, for files and displays.
+        name: a short name for files and displays.
         validation: the map p -> d(p).
-        budget: executions of S, unless said otherwise.
-        threshold: tau, unless said otherwise; no verdict without one.
-        truth: finds d*, for simulated systems.
-        units: the distance's units.
-        states, inputs: names of the states and inputs with their units, for pictures.
+        budget: the default number of executions of S.
+        threshold: the default threshold tau; without a threshold there is no verdict.
+        truth: a function that finds d*, for simulated systems; None if there is none.
+        units: the units of the distance.
+        states, inputs: names of the states and inputs with their units, for files and pictures.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Experiment:
     def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
         """Return the names of n states and m inputs with their units, for files.
 
-        They are those of the experiment, or of its system; ``x0, x1, ...`` and ``u0, u1, ...`` where neither says.
+        They are the names of the experiment, else those of its system, else ``x0, x1, ...`` and ``u0, u1, ...``.
         """
         system = self.validation.system
         return (
@@ -61,7 +61,7 @@ def _named(labels: tuple[str, ...], own: object, letter: str, count: int) -> dic
 
 
 def labels_of(named: Mapping[str, str]) -> tuple[str, ...]:
-    """Return ``name [unit]`` for each name and its unit, the name alone where there is none."""
+    """Return ``name [unit]`` for each name, or the name alone if it has no unit."""
     return tuple(f"{name} [{unit}]" if unit else name for name, unit in named.items())
 
 

@@ -19,8 +19,8 @@ Step = Callable[[Array, Array], Array]
 class Model(Protocol):
     """A learned abstraction M of the system, cheap to run.
 
-    A model that can differentiate itself also has ``jacobian(x, u) -> (A, B)``, shapes ``(..., n, n)`` and
-    ``(..., n, m)``, or without the batch axes where they do not depend on x and u.
+    A model may also have ``jacobian(x, u) -> (A, B)``, shapes ``(..., n, n)`` and ``(..., n, m)``. If the Jacobian does
+    not depend on x and u, its batch axes may be missing.
     """
 
     def step(self, x: Array, u: Array) -> Array:
@@ -32,8 +32,11 @@ class Function:
     """A plain function ``(x, u) -> x_next`` as a model.
 
     Args:
-        step: called with one state ``(n,)`` and one input ``(m,)`` at a time, unless ``vectorized``, where it is
-            called with whole batches ``(..., n)`` and ``(..., m)``.
+        step: a function of one state ``(n,)`` and one input ``(m,)``.
+        vectorized: True if ``step`` takes whole batches ``(..., n)`` and ``(..., m)``.
+
+    Raises:
+        InputError: if ``step`` is not a function.
     """
 
     def __init__(self, step: Step, *, vectorized: bool = False) -> None:
@@ -57,18 +60,22 @@ class Function:
 
 
 def as_model(model: Model | Step) -> Model:
-    """Return a model as it is, and a plain function as a model."""
+    """Return a model unchanged, and a plain function as a model.
+
+    Raises:
+        InputError: if the value is neither a model nor a function.
+    """
     return model if isinstance(model, Model) else Function(model)
 
 
 def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
     """Return the Jacobians A = df/dx and B = df/du of a model at (x, u).
 
-    Its own ``jacobian`` if it has one, central differences otherwise. Shapes ``(..., n), (..., m) ->
-    (..., n, n), (..., n, m)``; the batch axes may be missing where the Jacobians do not depend on them.
+    They come from the model's own ``jacobian`` if it has one, and from central differences otherwise. Shapes
+    ``(..., n), (..., m) -> (..., n, n), (..., n, m)``; a model whose Jacobian is constant may leave out the batch axes.
 
     Raises:
-        ModelError: they are not finite.
+        ModelError: if the Jacobians are not finite.
     """
     jacobian = getattr(model, "jacobian", None)
     A, B = jacobian(x, u) if jacobian is not None else _central_differences(model, x, u)

@@ -15,9 +15,9 @@ Point = float | list[float]
 
 
 class Parameters:
-    """Task parameters p by name, one task or a batch of tasks.
+    """Task parameters p by name, for one task or a batch of tasks.
 
-    ``p.goal`` is a scalar parameter, shape ``(...)``; ``p.amplitudes`` a vector one, shape ``(..., k)``.
+    A scalar parameter such as ``p.goal`` has shape ``(...)``, a vector parameter such as ``p.amplitudes`` ``(..., k)``.
     """
 
     __slots__ = ("_space", "points")
@@ -48,14 +48,15 @@ class Parameters:
 class TaskSpace:
     """A named box of task parameters.
 
-    Each keyword is ``name=(low, high)`` or ``name=(low, high, "unit")``; arrays as bounds make a vector parameter.
+    Each keyword is ``name=(low, high)`` or ``name=(low, high, "unit")``. Bounds that are arrays define a vector
+    parameter.
 
     >>> space = TaskSpace(goal=(-3.14, 3.14, "rad"), offset=([0, 0], [1, 2]))
     >>> space.names
     ('goal', 'offset[0]', 'offset[1]')
 
     Raises:
-        InputError: no parameter at all; a name that is taken; bounds reversed, equal, NaN or infinite.
+        InputError: if there is no parameter, a name is reserved, or bounds are reversed, equal, NaN or infinite.
     """
 
     def __init__(self, **bounds: tuple[Any, ...]) -> None:
@@ -68,7 +69,9 @@ class TaskSpace:
         highs: list[Array] = []
         for name, bound in bounds.items():
             if name == "points" or name.startswith("_"):
-                raise InputError(f"a task parameter cannot be called {name!r}; that name is taken.")
+                raise InputError(
+                    f"a task parameter must not be called 'points' or begin with an underscore, got {name!r}."
+                )
             low, high, self._units[name] = _bounds(name, bound)
             start = len(names)
             if low.ndim == 0:
@@ -91,12 +94,12 @@ class TaskSpace:
 
     @property
     def units(self) -> dict[str, str]:
-        """The unit of each parameter by its name, empty if it has none."""
+        """The unit of each parameter by its name; empty if it has no unit."""
         return dict(self._units)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """One axis label a scalar parameter: its name and its unit."""
+        """An axis label for each scalar parameter: its name and its unit."""
         units = [self._units[name.partition("[")[0]] for name in self.names]
         return tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, units, strict=True))
 
@@ -113,10 +116,10 @@ class TaskSpace:
         }
 
     def columns(self, name: str) -> int | slice:
-        """Return where a parameter stands in a row of points.
+        """Return the index or the slice of a parameter in a row of points.
 
         Raises:
-            UnknownNameError: the space has no such parameter.
+            UnknownNameError: if the space has no such parameter.
         """
         try:
             return self._columns[name]
@@ -131,10 +134,13 @@ class TaskSpace:
         return (rows - self.low) / (self.high - self.low)
 
     def from_unit(self, unit: ArrayLike) -> Array:
-        """Map points ``(..., d)`` of the unit cube to the space; of numbers that are one point there, the shortest."""
+        """Map points ``(..., d)`` of the unit cube to the space.
+
+        If a number with fewer digits maps to the same point of the unit cube, it is returned.
+        """
         rows = require_shape("points", as_floats("points", unit), (self.dimension,))
         points = np.clip(self.low + rows * (self.high - self.low), self.low, self.high)
-        # What a person typed as 0.2 comes back as 0.2, and not as 0.19999999999999996.
+        # A number that a user gave as 0.2 comes back as 0.2, not as 0.19999999999999996.
         short = np.clip(np.rint(points * self._decimals) / self._decimals + 0.0, self.low, self.high)
         return np.where((short - self.low) / (self.high - self.low) == rows, short, points)
 
@@ -142,7 +148,7 @@ class TaskSpace:
         """Return points ``(..., d)`` of the space as named parameters.
 
         Raises:
-            ShapeError: the last axis is not d.
+            ShapeError: if the last axis is not d.
         """
         return Parameters(self, require_shape("points", as_floats("points", points), (self.dimension,)))
 
@@ -150,9 +156,9 @@ class TaskSpace:
         """Return the point ``(d,)`` with these values by name.
 
         Raises:
-            UnknownNameError: a name is not of this space.
-            ShapeError: a value has not the shape of its parameter.
-            InputError: a name is missing, or a value is outside the box.
+            UnknownNameError: if the space has no parameter of a given name.
+            ShapeError: if a value does not have the shape of its parameter.
+            InputError: if a parameter is missing, or a value is outside the box.
         """
         point = np.full(self.dimension, np.nan)
         for name, value in values.items():
@@ -178,7 +184,7 @@ class TaskSpace:
     def unit_function(self, function: Callable[[Parameters], ArrayLike]) -> Callable[[Array], Array]:
         """Return a function of named parameters as a function of unit-cube points ``(n, d)``.
 
-        A search knows no parameters, only points: this turns a known distance into its prior mean.
+        Searches know only points of the unit cube; a known distance becomes the prior mean of a search in this way.
         """
 
         def of_points(unit: Array) -> Array:
@@ -187,7 +193,7 @@ class TaskSpace:
 
         return of_points
 
-    # Points to look at
+    # Sets of points
 
     def iid(self, n: int, rng: np.random.Generator) -> Array:
         """Return n points drawn independently and uniformly, shape ``(n, d)``."""
@@ -195,19 +201,19 @@ class TaskSpace:
 
     def sobol(self, n: int, seed: int) -> Array:
         """Return n points of a scrambled Sobol sequence, shape ``(n, d)``."""
-        from scipy.stats import qmc  # imported here: it is slow to load, and few need it
+        from scipy.stats import qmc  # imported here, because it is slow to load and seldom needed
 
         sampler = qmc.Sobol(self.dimension, rng=np.random.default_rng(seed))
         return self.from_unit(sampler.random_base2(max(0, int(np.ceil(np.log2(max(n, 1))))))[:n])
 
     def grid(self, per_axis: int) -> Array:
-        """Return a full grid with both ends, shape ``(per_axis ** d, d)``.
+        """Return a full grid that includes both bounds of each axis, shape ``(per_axis ** d, d)``.
 
         Raises:
-            InputError: fewer than 2 points an axis.
+            InputError: if there are fewer than 2 points on each axis.
         """
         if per_axis < 2:
-            raise InputError(f"a grid needs at least 2 points an axis, got {per_axis}.")
+            raise InputError(f"a grid must have at least 2 points on each axis, got {per_axis}.")
         return np.stack(list(self._grid_axes(per_axis)), axis=-1).reshape(-1, self.dimension)
 
     def _grid_axes(self, per_axis: int) -> Iterator[Array]:
@@ -216,7 +222,7 @@ class TaskSpace:
 
 
 def _decimals(low: Array, high: Array) -> Array:
-    """Return, for each column, the power of ten whose multiples have twelve digits; it is exact as a float."""
+    """Return, for each column, the power of ten that scales its values to twelve digits; it is exact as a float."""
     digits = np.ceil(np.log10(np.maximum(np.abs(low), np.abs(high))))
     return np.asarray(10.0 ** np.clip(12 - digits, 0, 22))
 

@@ -11,14 +11,14 @@ from ctxval.core.trajectory import Trajectory
 
 @runtime_checkable
 class System(Protocol):
-    """The true thing: hardware, a simulator, a function.
+    """The true system S: hardware, a simulator, a function.
 
-    A system that can execute a batch of tasks in one call says so with an attribute ``batched = True``.
+    A system that can execute a batch of tasks in one call has an attribute ``batched = True``.
     """
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Run the controller on the task, from the task's initial state to its horizon.
 
         Raises:
-            Exception: whatever goes wrong; the campaign records it as a failed trial with its reason.
+            Exception: if the execution fails; a campaign records it as a failed trial with its reason.
         """

@@ -1,4 +1,4 @@
-"""A task: from where, to where, for how long."""
+"""Control tasks: an initial state, a reference, a horizon and a time step."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ class Task:
     """One control task, or a batch of them.
 
     Args:
-        initial_state: the n components of the first state, each a number or an array ``(...)`` over the batch;
-            or one array ``(..., n)``.
+        initial_state: the first state: a list of n components, each a number or an array ``(...)`` over the batch; or
+            one array ``(..., n)``.
         horizon: number of steps H.
         dt: length of a step, seconds.
         goal: the state to reach, given like ``initial_state``; a goal is a constant reference.
         reference: the states to follow, array ``(..., H + 1, n)``; give this or ``goal``, not both.
 
     Raises:
-        InputError: H is not a positive integer, dt not a positive number, or a value not finite.
-        ShapeError: goal or reference do not fit the initial state.
+        InputError: if H is not a positive integer, dt is not a positive number, or a value is not finite.
+        ShapeError: if the shape of the goal or the reference does not match that of the initial state.
     """
 
     def __init__(self, initial_state: Any, *, horizon: int, dt: float, goal: Any = None, reference: Any = None) -> None:
@@ -33,7 +33,7 @@ class Task:
         if not isinstance(dt, int | float | np.number) or isinstance(dt, bool) or not (np.isfinite(dt) and dt > 0):
             raise InputError(f"dt must be a positive number of seconds, got {dt!r}.")
         if goal is not None and reference is not None:
-            raise InputError("a task has a goal or a reference, not both.")
+            raise InputError("a task must have a goal or a reference, not both.")
         self.horizon = int(horizon)
         self.dt = float(dt)
         state = _components("initial_state", initial_state)
@@ -55,7 +55,8 @@ class Task:
             self.batch_shape: tuple[int, ...] = np.broadcast_shapes(state.shape[:-1], target.shape[:-2])
         except ValueError:
             raise ShapeError(
-                f"goal or reference are of a batch {target.shape[:-2]}, initial_state of another, {state.shape[:-1]}."
+                f"goal or reference and initial_state must have the same batch shape, got {target.shape[:-2]} and "
+                f"{state.shape[:-1]}."
             ) from None
         self.initial_state: Array = np.broadcast_to(state, (*self.batch_shape, n))
         """Shape ``(..., n)``."""
@@ -69,7 +70,7 @@ class Task:
 
     @property
     def times(self) -> Array:
-        """Shape ``(H + 1,)``, seconds."""
+        """The times of the states, shape ``(H + 1,)``, seconds."""
         return np.asarray(np.arange(self.horizon + 1) * self.dt)
 
     def __getitem__(self, index: int) -> Task:
@@ -100,7 +101,9 @@ def _components(name: str, value: Any) -> Array:
         try:
             return np.stack(np.broadcast_arrays(*parts), axis=-1)
         except ValueError:
-            raise ShapeError(f"components of {name} do not fit: shapes {[part.shape for part in parts]}.") from None
+            raise ShapeError(
+                f"the components of {name} must have the same batch shape, got {[part.shape for part in parts]}."
+            ) from None
     array = as_floats(name, value)
     if array.ndim == 0 or array.size == 0:
         raise ShapeError(f"{name} must be a list of components or an array (..., n), got {value!r}.")

@@ -1,4 +1,4 @@
-"""Trajectories of a closed loop, the transitions in them, and their files."""
+"""Trajectories of closed loops, their transitions, and their files."""
 
 from __future__ import annotations
 
@@ -24,12 +24,15 @@ COMPLETE = "complete"
 
 @dataclass(frozen=True, eq=False)
 class Transitions:
-    """Recorded steps of a system: at state x, input u led to x_next.
+    """Recorded steps of a system: in state x, the input u led to x_next.
 
-    Shapes ``(N, n)``, ``(N, m)``, ``(N, n)``.
+    Attributes:
+        x: the states, shape ``(N, n)``.
+        u: the inputs, shape ``(N, m)``.
+        x_next: the next states, shape ``(N, n)``.
 
     Raises:
-        ShapeError: the three do not fit together.
+        ShapeError: if the shapes of the three arrays do not match.
     """
 
     x: Array
@@ -51,7 +54,7 @@ class Transitions:
 
     @staticmethod
     def joined(parts: Sequence[Transitions]) -> Transitions:
-        """Return several sets of transitions as one."""
+        """Return several sets of transitions as one set."""
         return Transitions(
             np.concatenate([part.x for part in parts]),
             np.concatenate([part.u for part in parts]),
@@ -64,16 +67,16 @@ class Transitions:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """What a closed loop did, for one task or a batch of tasks.
+    """The times, states and inputs of a closed loop, for one task or a batch of tasks.
 
     Attributes:
-        times: shape ``(H + 1,)``, seconds.
-        states: shape ``(..., H + 1, n)``.
-        inputs: shape ``(..., H, m)``.
-        ended: how it ended: ``"complete"``, or the reason why it stopped before its horizon.
+        times: the times of the states, shape ``(H + 1,)``, seconds.
+        states: the states, shape ``(..., H + 1, n)``.
+        inputs: the inputs, shape ``(..., H, m)``.
+        ended: ``"complete"``, or the reason why the trajectory ended before its horizon.
 
     Raises:
-        ShapeError: the three arrays do not fit together.
+        ShapeError: if the shapes of the three arrays do not match.
     """
 
     times: Array
@@ -108,12 +111,12 @@ class Trajectory:
         return np.asarray(whole)
 
     def __getitem__(self, index: int) -> Trajectory:
-        """Return one trajectory of the batch; how the batch ended is said of those that are not finite."""
+        """Return one trajectory of the batch; the batch's ``ended`` applies to trajectories that are not finite."""
         one = Trajectory(self.times, self.states[index], self.inputs[index])
         return one if self.ended == COMPLETE or one.finite.all() else replace(one, ended=self.ended)
 
     def transitions(self) -> Transitions:
-        """Return every step as a transition, all tasks of a batch in one."""
+        """Return all steps of all tasks of the batch as one set of transitions."""
         n, m = self.states.shape[-1], self.inputs.shape[-1]
         return Transitions(
             self.states[..., :-1, :].reshape(-1, n), self.inputs.reshape(-1, m), self.states[..., 1:, :].reshape(-1, n)
@@ -135,16 +138,16 @@ class Trajectory:
     ) -> Trajectory:
         """Read a trajectory from NPZ bytes or an NPZ file; no code in it is ever run.
 
-        Sizes are compared before any number is read.
+        The sizes are checked before any number is read.
 
         Args:
-            source: the bytes, or a regular file.
-            shape: that the states of a complete trajectory must have, ``(H + 1, n)``; None for any.
-            most: bytes that the file, and the numbers in it, may have.
+            source: the bytes, or the path of a regular file.
+            shape: shape ``(H + 1, n)`` that the states of a complete trajectory must have; None allows any shape.
+            most: largest size in bytes of the file, and of the numbers in it.
 
         Raises:
-            InputError: it is not such a file, or too large.
-            ShapeError: its arrays do not fit together, or to ``shape``.
+            InputError: if the source is not an NPZ file with a trajectory, or is too large.
+            ShapeError: if the shapes of the arrays do not match each other or ``shape``.
         """
         name = "these bytes" if isinstance(source, bytes) else str(source)
         try:
@@ -166,13 +169,18 @@ class Trajectory:
     def to_csv(
         self, path: str | Path, *, states: Sequence[str] | None = None, inputs: Sequence[str] | None = None
     ) -> None:
-        """Write one trajectory as CSV with the columns ``t, x0.., u0..``, or named ones; the last row has no inputs.
+        """Write one trajectory as CSV. The last row has no inputs.
+
+        Args:
+            path: the file.
+            states, inputs: names of the columns of states and inputs; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
+                The column of the times is ``t``.
 
         Raises:
-            ShapeError: it is a batch, or there are not as many names as columns.
+            ShapeError: if the trajectory is a batch, or the number of names differs from that of columns.
         """
         if self.batch_shape:
-            raise ShapeError(f"a CSV file holds one trajectory, got a batch of shape {self.batch_shape}.")
+            raise ShapeError(f"a CSV file must hold one trajectory, got a batch of shape {self.batch_shape}.")
         n, m = self.states.shape[-1], self.inputs.shape[-1]
         header = ["t", *_column_names("x", states, n), *_column_names("u", inputs, m)]
         with open(path, "w", newline="", encoding="utf-8") as file:
@@ -190,25 +198,26 @@ class Trajectory:
         inputs: Sequence[str] | None = None,
         most_rows: int | None = None,
     ) -> Trajectory:
-        """Read one trajectory from CSV with the columns ``t, x0.., u0..``, or with named ones.
+        """Read one trajectory from CSV with the columns ``t, x0.., u0..``, or with named columns.
 
-        Units in brackets, as in ``angle [rad]``, may be left out, but must agree where both have one. Further columns
-        do not matter, nor do the inputs in the last row.
+        Units in brackets, as in ``angle [rad]``, may be left out. If a name and its column both have a unit, the units
+        must agree. Other columns are ignored, and so are the inputs in the last row.
 
         Args:
             path: the file.
-            states, inputs: names of the columns, with units or without; those that are numbered are taken where none of
-                the names is there.
-            most_rows: more rows than these are refused before they are read; None for as many as fit.
+            states, inputs: names of the columns, with or without units. If the file has none of the names, the
+                numbered columns ``x0, x1, ...`` and ``u0, u1, ...`` are read.
+            most_rows: largest number of rows below the header; a file with more rows is refused. None allows any
+                number up to the largest size of a file.
 
         Raises:
-            InputError: the file cannot be read, is no regular file or too large, a column is missing or has another
-                unit, or a cell is no number.
+            InputError: if the file cannot be read, is not a regular file or is too large, if a column is missing or has
+                another unit, or if a cell is not a number.
         """
         rows = _csv_rows(path)
         header = [unguarded(name) for name in next(rows, (0, []))[1]]
         columns = {_bare(name): name for name in header if _bare(name)}
-        # Time stands in its own column; a state may be called "time" all the same.
+        # A column "t" comes first, because a state may be called "time".
         time = columns.get("t") or columns.get("time")
         x, u = _chosen(path, columns, "x", states), _chosen(path, columns, "u", inputs)
         if header and (time is None or not x):
@@ -219,21 +228,21 @@ class Trajectory:
         return _Columns(path, header, [time or "", *x], u).read(rows, most_rows)
 
     def resampled(self, times: Array) -> Trajectory:
-        """Return one recorded trajectory at other times after its first: states between, inputs as last applied.
+        """Return one recorded trajectory at other times: states interpolated linearly, inputs held.
 
         Args:
-            times: shape ``(H + 1,)``, seconds, from 0 on.
+            times: seconds after the first time of the recording, from 0, shape ``(H + 1,)``.
 
         Raises:
-            InputError: it is a batch, its own times do not increase, or it ends before the last of them.
+            InputError: if the trajectory is a batch, its times do not increase, or it ends before the last new time.
         """
         own, wanted = self.times - self.times[0], as_floats("times", times)
         if self.batch_shape or not (np.diff(own) > 0).all():
-            raise InputError("only one trajectory whose times increase can be resampled.")
+            raise InputError("only a single trajectory with increasing times can be resampled.")
         if not own[-1] >= wanted[-1] - _TIMES * (wanted[1] - wanted[0]):
             raise InputError(f"the recording ends after {own[-1]:g} s, and {wanted[-1]:g} s are needed.")
         states = np.stack([np.interp(wanted, own, column) for column in self.states.T], axis=-1)
-        # A sample that was meant for a time may have been taken just after it.
+        # A sample that belongs to a time may have been recorded just after it.
         slack = 1e-6 * (wanted[1] - wanted[0])
         held = np.clip(np.searchsorted(own, wanted[:-1] + slack, side="right") - 1, 0, self.horizon - 1)
         return Trajectory(wanted, states, self.inputs[held], self.ended)
@@ -244,14 +253,14 @@ class Trajectory:
 
 
 _TIMES = 0.01
-"""By how much the times of a recording may miss a task's, in steps."""
+"""Largest difference between the times of a recording and those of its task, in steps."""
 
 
 def require_times(trajectory: Trajectory, times: Array) -> None:
-    """Check that a trajectory has these times ``(H + 1,)``, counted from its first.
+    """Check that a trajectory has these times ``(H + 1,)``, counted from its first time.
 
     Raises:
-        InputError: it has another number of them or another step; the message says which.
+        InputError: if the number of times or the time step differs; the message gives the first difference.
     """
     dt = times[1] - times[0]
     if len(trajectory.times) != len(times):
@@ -273,7 +282,7 @@ _ARRAYS = ("times", "states", "inputs")
 
 
 def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tuple[int, ...]) -> None:
-    """Check that the shapes are those of one trajectory."""
+    """Check that these shapes match as times, states and inputs of one trajectory."""
     if (
         len(times) != 1
         or len(states) < 2
@@ -304,13 +313,13 @@ def _csv_rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
 
 
 class _Columns:
-    """The columns of a file that are wanted, whose cells become numbers row by row.
+    """The selected columns of a CSV file, read row by row as numbers.
 
     Args:
-        path: for messages.
+        path: the file, for messages.
         header: the names of all columns.
-        always: names of the columns that have a number in every row.
-        held: names of those that need none in the last row.
+        always: the names of the columns that have a number in every row.
+        held: the names of the columns that may have no number in the last row.
     """
 
     def __init__(self, path: str | Path, header: list[str], always: list[str], held: list[str]) -> None:
@@ -346,7 +355,7 @@ class _Columns:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names for a message, not more of them than can be read."""
+    """Return names for a message; long names and long lists are cut."""
     return ", ".join(name[:60] for name in names[:20]) + (", ..." if len(names) > 20 else "")
 
 
@@ -372,13 +381,13 @@ def _require_unit(path: str | Path, column: str, wanted: str) -> None:
     has, needs = _unit(column), _unit(wanted)
     if has and needs and has != needs:
         raise InputError(
-            f"{path} has {_bare(column)} in {has}, and {needs} is needed; convert it, or if only the unit is written "
-            "in another way, write it so or leave it out."
+            f"{path} has {_bare(column)} in {has}, and {needs} is needed; convert it, or leave the unit out of the "
+            "header if only its spelling differs."
         )
 
 
 def _unit(name: str) -> str:
-    """Return a column's unit, empty where it has none; signs of products do not matter."""
+    """Return the unit of a column without signs of products; empty if it has no unit."""
     return re.sub(r"[\s*·.]", "", name.partition("[")[2].rpartition("]")[0])
 
 

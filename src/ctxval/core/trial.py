@@ -1,4 +1,4 @@
-"""A trial: one p with everything known of it; and what was changed in the trials of a store."""
+"""Trials, each one task p with all its results; and changes of a store's trials."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from ctxval._util.representation import call, line, lines, record, table
 from ctxval.core.space import Point
 
 Origin = Literal["iid", "initial", "acquisition", "covering", "manual"]
-"""Why a trial was chosen. Only iid trials enter a scenario bound."""
+"""The reason why a trial was chosen. Only iid trials enter a scenario bound."""
 
 State = Literal["open", "completed", "failed", "unmeasured"]
-"""Unmeasured: S was executed and its trajectory is stored, but the distance gave nothing usable."""
+"""The state of a trial. Unmeasured: S was executed and its trajectory is stored, but d has no usable value."""
 
 
 TOLD_ALONE = "its distance was told without a trajectory, and the distance has changed since: execute the task again."
-"""Why a trial is unmeasured that can never be measured."""
+"""The failure of a trial that was reported without a trajectory, so that a new distance cannot be computed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One p with everything known of it.
+    """One task p with all its results.
 
     Attributes:
-        number: from 0, in the order of asking.
-        origin: why it was chosen: iid, initial, acquisition, covering (nothing had come near to it, or the bound
-            was put to the test there) or manual.
+        number: number of the trial, from 0, in the order in which the search proposed them.
+        origin: the reason why p was chosen: iid, initial, acquisition, covering (p was far from all other trials, or
+            tests the bound) or manual.
         state: open, completed, failed, or unmeasured.
         unit_point: p in the unit cube, shape ``(d,)``.
         parameters: p by name.
-        attempts: how often its execution was started.
-        executed: whether an execution of S ended, well or badly; this is what the budget counts.
-        distance: d(p), if completed.
-        failure: why it failed, or why its distance could not be measured.
-        seconds: how long the execution took.
-        note: what the search thought when it chose the point, plain enough for JSON; it is reminded of it on resuming.
-        because: what was changed on the system after an earlier trial of the same task had ended otherwise.
+        attempts: number of times that the execution was started.
+        executed: whether an execution of S ended, successfully or not; the budget counts these.
+        distance: d(p); None if the trial is not completed.
+        failure: the reason why the trial failed or its distance could not be measured; None otherwise.
+        seconds: duration of the execution in seconds, if known.
+        note: values for JSON that the search attached when it chose p; it gets them back when a campaign resumes.
+        because: what was changed on the system since an earlier trial of the same task that had another result.
     """
 
     number: int
@@ -77,13 +77,13 @@ class Trial:
 
 @dataclass(frozen=True)
 class Change:
-    """What was changed in a store after it was written.
+    """A later change of a store.
 
     Attributes:
         what: the kind of change.
-        why: the reason that was given.
-        content: what it was before, or what differs, plain enough for JSON.
-        at: when, in UTC; empty until it is stored.
+        why: the reason that the user gave.
+        content: the previous values, or the differences, as values for JSON.
+        at: the time of the change in UTC; empty until it is stored.
     """
 
     what: str

@@ -1,4 +1,4 @@
-"""The true maximum d*, for systems that are simulated and so may be executed as often as one likes."""
+"""The true maximum d* of simulated systems, which can be executed any number of times."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _STEP = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The largest distance over the task space, as well as a method can find it.
+    """The largest distance over the task space that a method found.
 
     Attributes:
-        distance: d*.
-        parameters: a task that attains it.
-        method: how it was found.
+        distance: the largest distance d*.
+        parameters: the parameters of a task that has this distance.
+        method: a description of the method that found it.
     """
 
     distance: float
@@ -50,15 +50,15 @@ class Truth:
 
 
 def grid_truth(validation: Validation, per_axis: int = 2001, refinements: int = 6) -> Truth:
-    """Return the maximum on a dense grid, refined around its best points. Executes S for each grid point.
+    """Return the maximum on a dense grid, refined around its best points. S is executed for each grid point.
 
     Args:
         validation: the map p -> d(p).
-        per_axis: grid points on each axis.
-        refinements: how often a finer grid is laid around the best points.
+        per_axis: number of grid points on each axis.
+        refinements: number of refinements, each with a finer grid around the best points.
 
     Raises:
-        InputError: every execution failed.
+        InputError: if every execution failed.
     """
     space = validation.space
     points = space.grid(per_axis)
@@ -96,23 +96,23 @@ def search_truth(
     generations: int = 150,
     climbs: int = 60,
 ) -> Truth:
-    """Return the best value known after a large search, for spaces with too many dimensions for a grid.
+    """Return the largest distance that a large search finds, for spaces with too many dimensions for a grid.
 
-    Differential evolution (Storn and Price 1997), a climb from its best point, and climbs from random ones, as
-    evolution can agree with itself on a basin that is wide but not the highest; repeated with other random numbers
-    until the two best repeats agree. Executes S some hundred thousand times, in batches.
+    Each repeat runs differential evolution (Storn and Price 1997), climbs from its best point, and climbs from random
+    points, because repeats of evolution alone can agree on a basin that is wide but not the highest. The search ends
+    when the two best repeats agree. S is executed some hundred thousand times, in batches.
 
     Args:
         validation: the map p -> d(p).
-        seed: of the random numbers.
+        seed: seed of the random numbers.
         agreement: relative difference of the two best repeats at which the search ends.
-        repeats: how many there are at most.
-        population: points in a generation, for each dimension.
-        generations: the most in one repeat.
-        climbs: from random starts, each the best of sixteen points, in one repeat.
+        repeats: largest number of repeats.
+        population: number of points in a generation, for each dimension.
+        generations: largest number of generations in one repeat.
+        climbs: number of climbs from random starts in one repeat; each starts at the best of sixteen random points.
 
     Raises:
-        InputError: every execution failed.
+        InputError: if every execution failed.
     """
     search = _TruthSearch(validation, population, generations, climbs)
     found: list[tuple[float, Array]] = []
@@ -139,7 +139,7 @@ class _TruthSearch:
         self.evaluations = 0
 
     def values(self, unit_points: Array) -> Array:
-        """Return d at points ``(N, d)`` of the cube, minus infinity where the execution fails."""
+        """Return d at points ``(N, d)`` of the cube; minus infinity if the execution fails."""
         self.evaluations += len(unit_points)
         values = self.validation.distances(self.validation.space.from_unit(unit_points))
         return np.where(np.isnan(values), -np.inf, values)
@@ -148,7 +148,7 @@ class _TruthSearch:
         """Return the largest value of one search, and its point ``(d,)``."""
         tops = [self._evolve(rng)] + [self._random_start(rng) for _ in range(self.climbs)]
         points = np.array([self._climb(*top) for top in tops])
-        # A loop that diverges amplifies the rounding of a batch: what counts is the task executed alone.
+        # A diverging loop amplifies the rounding of a batch, so the distance of the task executed alone counts.
         alone = np.array([self.values(point[None])[0] for point in points])
         return float(alone.max()), points[np.argmax(alone)]
 
@@ -196,14 +196,14 @@ class _TruthSearch:
 
 
 def _gap(found: list[tuple[float, Array]]) -> float:
-    """Return by what share of the best value the second best differs; infinity where there are not two."""
+    """Return the relative difference of the two best values; infinity if there are fewer than two."""
     values = sorted((value for value, _ in found if math.isfinite(value)), reverse=True)
     if len(values) < 2:
         return math.inf
     return (values[0] - values[1]) / values[0] if values[0] > 0 else 0.0
 
 
-# A truth found once
+# Stored truths
 
 
 def cached_truth(
@@ -211,28 +211,28 @@ def cached_truth(
 ) -> Truth:
     """Return a truth from its file in a folder, or find it and write that file.
 
-    The file's name is a hash of what identifies the validation and the method. A stored truth is believed only where
-    executing S once more, at its task, gives its distance again.
+    The name of the file is a hash of the identity of the validation and of the method. A stored truth is used only if a
+    new execution of S on its task gives the stored distance again.
 
     Args:
         validation: the map p -> d(p).
-        compute: finds the truth; its settings, such as those of ``functools.partial(search_truth, seed=1)``, are
-            part of the hash.
-        folder: made if it is missing.
+        compute: a function that finds the truth; its settings, such as those of
+            ``functools.partial(search_truth, seed=1)``, are part of the hash.
+        folder: the folder of the files; it is created if it does not exist.
     """
     path = Path(folder) / f"{_fingerprint(validation, compute)}.json"
     stored = _read_truth(path, validation)
     if stored is not None:
         return stored
     truth = compute(validation)
-    # A folder that cannot be written costs the next caller time, but not this one the answer.
+    # If the folder cannot be written, this call still returns the truth; the next call must find it again.
     with suppress(OSError):
         _write_truth(path, truth, validation)
     return truth
 
 
 def _fingerprint(validation: Validation, compute: Callable[[Validation], Truth]) -> str:
-    # The signature has the defaults that the description of a function leaves out.
+    # The signature adds the default values, which the description of a function leaves out.
     known = [validation.describe(), describe(compute), str(inspect.signature(compute))]
     return hashlib.sha256(json.dumps(rounded(known, 9), sort_keys=True).encode()).hexdigest()[:32]
 
@@ -250,7 +250,7 @@ def _read_truth(path: Path, validation: Validation) -> Truth | None:
 
 
 def _write_truth(path: Path, truth: Truth, validation: Validation) -> None:
-    """Write a file that is whole or not there, also when two processes write it at once."""
+    """Write the file atomically: it is complete or missing, even if two processes write it at once."""
     parameters = validation.space.describe_point(truth.parameters.points)
     content = {"distance": truth.distance, "parameters": parameters, "method": truth.method}
     path.parent.mkdir(parents=True, exist_ok=True)
