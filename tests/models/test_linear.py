@@ -75,7 +75,7 @@ def test_a_fitted_model_keeps_its_data() -> None:
 
 
 def test_too_few_transitions_are_refused_with_their_rank() -> None:
-    with pytest.raises(InputError, match=r"3 transitions of 2 states and 1 inputs have rank 3 where 4 is needed"):
+    with pytest.raises(InputError, match=r"3 transitions of 2 states and 1 inputs have rank 3, and 4 is needed"):
         Linear.fit(record(draw_model(2, 1, 0), 3, 0))
     assert np.isfinite(Linear.fit(record(draw_model(2, 1, 0), 3, 0), intercept=False).A).all()
 

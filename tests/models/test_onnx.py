@@ -138,7 +138,7 @@ def test_shapes_must_fit() -> None:
     model = Onnx(network())
     with pytest.raises(ShapeError, match="input 'xu' takes 3 numbers, got 4"):
         model.step(np.zeros(2), np.zeros(2))
-    with pytest.raises(ShapeError, match="must return 1 states like those it takes, got 2"):
+    with pytest.raises(ShapeError, match="must return as many states as it takes, 1, got 2"):
         model.step(np.zeros(1), np.zeros(2))
     with pytest.raises(ShapeError, match="input 'u' takes 1 numbers, got 2"):
         Onnx(network(two_inputs=True)).step(np.zeros(2), np.zeros(2))
@@ -165,7 +165,7 @@ def test_other_networks_and_files_are_refused(tmp_path: Path) -> None:
         Onnx(tmp_path / "fifo.onnx")
     content = onnx.load_from_string(network(two_inputs=True))
     content.graph.input.append(helper.make_tensor_value_info("extra", DOUBLE, ["N", 1]))
-    with pytest.raises(InputError, match="as one or two inputs, the network has x, u, extra"):
+    with pytest.raises(InputError, match="as one or two inputs, but the network has x, u, extra"):
         Onnx(content.SerializeToString())
     whole = helper.make_graph(
         [helper.make_node("Identity", ["i"], ["y"])],

@@ -90,5 +90,5 @@ def test_what_cannot_be_used_is_refused() -> None:
     model = ScikitLearn.fit(Ridge(), data)
     with pytest.raises(ShapeError, match="fitted on 3 features, got 2 states and 2 inputs"):
         model.step(np.zeros(2), np.zeros(2))
-    with pytest.raises(ShapeError, match=r"must predict 1 states like those it takes, got shape \(1, 2\)"):
+    with pytest.raises(ShapeError, match=r"must predict as many states as it takes, 1, got shape \(1, 2\)"):
         model.step(np.zeros(1), np.zeros(2))

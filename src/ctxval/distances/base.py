@@ -1,4 +1,4 @@
-"""What the ready-made distances share: a norm, and the states that count."""
+"""The base class and a helper of the ready-made distances: a norm, and a selection of states."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from ctxval.core.trajectory import Trajectory
 
 
 def selected(states: Array, components: Sequence[int] | None) -> Array:
-    """Return the states ``(..., k)`` that count; all of them if ``components`` is None."""
+    """Return the selected states ``(..., k)``; all states if ``components`` is None."""
     return states if components is None else states[..., list(components)]
 
 
 @dataclass(frozen=True)
 class ErrorNorm(ABC):
-    """Norm of a vector that the trajectories of one task give.
+    """Norm of an error vector of the trajectories of one task.
 
     Attributes:
-        norm: 1, 2 or infinity.
-        components: indices of the states that count; all of them by default.
+        norm: order of the norm: 1, 2 or infinity.
+        components: indices of the states that are compared; all states by default.
 
     Raises:
-        InputError: the norm is another one.
+        InputError: if the order of the norm is not 1, 2 or infinity.
     """
 
     norm: float = 1
@@ -36,10 +36,10 @@ class ErrorNorm(ABC):
 
     @abstractmethod
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the vector whose norm the distance is, shape ``(..., k)``."""
+        """Return the error vector, shape ``(..., k)``; the distance is its norm."""
 
     def compose(self, error: Array) -> Array:
-        """Return the norm of vectors ``(..., k)``, shape ``(...)``."""
+        """Return the norms of error vectors ``(..., k)``, shape ``(...)``."""
         return vector_norm(error, self.norm)
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:

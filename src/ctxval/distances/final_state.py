@@ -17,10 +17,13 @@ class FinalState(ErrorNorm):
     """Norm of the difference between the final states (the paper's eq. 5, with ``norm=1``).
 
     Attributes:
-        norm: 1, 2 or infinity.
-        components: indices of the states that count; all of them by default.
+        norm: order of the norm: 1, 2 or infinity.
+        components: indices of the states that are compared; all states by default.
+
+    Raises:
+        InputError: if the order of the norm is not 1, 2 or infinity.
     """
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the difference, shape ``(..., k)``."""
+        """Return the difference between the final states, shape ``(..., k)``."""
         return selected(system_trajectory.final_state - model_trajectory.final_state, self.components)

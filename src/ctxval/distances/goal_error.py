@@ -1,4 +1,4 @@
-"""How far the system ends from its goal."""
+"""The distance between the final state of S and the goal."""
 
 from __future__ import annotations
 
@@ -14,13 +14,16 @@ from ctxval.distances.base import ErrorNorm, selected
 @part()
 @dataclass(frozen=True)
 class GoalError(ErrorNorm):
-    """Norm of the difference between the system's final state and the goal: both aspects of Remark 1 in one.
+    """Norm of the difference between the system's final state and the goal: both aspects of Remark 1 in one distance.
 
     Attributes:
-        norm: 1, 2 or infinity.
-        components: indices of the states that count; all of them by default.
+        norm: order of the norm: 1, 2 or infinity.
+        components: indices of the states that are compared; all states by default.
+
+    Raises:
+        InputError: if the order of the norm is not 1, 2 or infinity.
     """
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the difference, shape ``(..., k)``."""
+        """Return the difference between the final state of S and the goal, shape ``(..., k)``."""
         return selected(system_trajectory.final_state - task.goal, self.components)

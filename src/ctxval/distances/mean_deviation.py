@@ -17,11 +17,14 @@ from ctxval.distances.base import selected
 @part()
 @dataclass(frozen=True)
 class MeanDeviation:
-    """Mean over the times 1..H of the norm of the difference between the states, e.g. an average in metres.
+    """Mean over the times 1..H of the norm of the difference between the states, such as an average in metres.
 
     Attributes:
-        norm: 1, 2 or infinity, over the states at one time.
-        components: indices of the states that count; all of them by default.
+        norm: order of the norm over the states at one time: 1, 2 or infinity.
+        components: indices of the states that are compared; all states by default.
+
+    Raises:
+        InputError: if the order of the norm is not 1, 2 or infinity.
     """
 
     norm: float = 2

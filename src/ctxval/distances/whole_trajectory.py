@@ -17,15 +17,18 @@ from ctxval.distances.base import selected
 @part()
 @dataclass(frozen=True)
 class WholeTrajectory:
-    """Norm of the difference between whole trajectories, as one long vector.
+    """Norm of the difference between whole trajectories, taken as one long vector.
 
-    ``norm=inf`` is the distance of the paper's OLDT and CCDT; ``norm=2, per_step=True`` is the one printed for the
-    Dubins car, ``1/H ||xi_S - xi_M||_2``.
+    With ``norm=inf`` it is the distance of the paper's OLDT and CCDT. With ``norm=2, per_step=True`` it is the formula
+    printed for the Dubins car, ``1/H ||xi_S - xi_M||_2``.
 
     Attributes:
-        norm: 1, 2 or infinity, over times and states together.
-        components: indices of the states that count; all of them by default.
-        per_step: divide by the horizon H.
+        norm: order of the norm over times and states together: 1, 2 or infinity.
+        components: indices of the states that are compared; all states by default.
+        per_step: whether the norm is divided by the horizon H.
+
+    Raises:
+        InputError: if the order of the norm is not 1, 2 or infinity.
     """
 
     norm: float = np.inf

@@ -13,7 +13,7 @@ from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
 _LARGEST_CONDITION = 1e8
-"""Half of the digits of a double: beyond it the weights are those of rounding and of noise."""
+"""Largest condition number, half of the digits of a double; beyond it rounding and noise determine the weights."""
 
 
 @part()
@@ -21,13 +21,14 @@ class Linear:
     """The model ``x_next = A x + B u + c``.
 
     Args:
-        A: shape ``(n, n)``.
-        B: shape ``(n, m)``.
-        c: shape ``(n,)``; zero by default.
-        data: the transitions that it was learned from, if any.
+        A: matrix of the states, shape ``(n, n)``.
+        B: matrix of the inputs, shape ``(n, m)``.
+        c: constant term, shape ``(n,)``; zero by default.
+        data: the transitions that the model was learned from, if any.
 
     Raises:
-        ShapeError: the shapes do not fit together.
+        ShapeError: if the shapes of A, B and c do not match.
+        InputError: if a value is not finite.
     """
 
     def __init__(self, A: ArrayLike, B: ArrayLike, c: ArrayLike | None = None, data: Transitions | None = None) -> None:
@@ -44,10 +45,15 @@ class Linear:
 
     @classmethod
     def fit(cls, data: Transitions, *, intercept: bool = True) -> Linear:
-        """Fit A, B and, with an intercept, c by least squares on recorded transitions.
+        """Fit A, B and c by least squares on recorded transitions.
+
+        Args:
+            data: the recorded transitions.
+            intercept: whether c is fitted; otherwise it is zero.
 
         Raises:
-            InputError: the data do not determine the model, or so badly that rounding decides, or are not finite.
+            InputError: if the data are not finite, or determine the model not at all or with too large a condition
+                number.
         """
         n, m = data.x.shape[1], data.u.shape[1]
         if not all(np.isfinite(array).all() for array in (data.x, data.u, data.x_next)):
@@ -59,7 +65,7 @@ class Linear:
         if rank < regressors.shape[1]:
             raise InputError(
                 f"the data do not determine a linear model: {len(data)} transitions of {n} states and {m} inputs "
-                f"have rank {rank} where {regressors.shape[1]} is needed; excite every state and input."
+                f"have rank {rank}, and {regressors.shape[1]} is needed; excite every state and input."
             )
         _require_identifiable(regressors, n, m)
         return cls(weights[:n].T, weights[n : n + m].T, weights[n + m] if intercept else None, data)
@@ -69,7 +75,7 @@ class Linear:
         return np.asarray(x @ self.A.T + u @ self.B.T + self.c)
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return A and B, the same everywhere."""
+        """Return A and B, which are the same for all states and inputs."""
         return self.A, self.B
 
     def describe(self) -> dict[str, Any]:
@@ -82,7 +88,7 @@ class Linear:
 
 
 def _require_identifiable(regressors: Array, n: int, m: int) -> None:
-    """Check that no regressor is nearly a combination of the others, whatever units they are in."""
+    """Check that no regressor is nearly a linear combination of the others, independently of units."""
     scaled = regressors / np.linalg.norm(regressors, axis=0)
     with single_threaded():
         _, sizes, directions = np.linalg.svd(scaled, full_matrices=False)

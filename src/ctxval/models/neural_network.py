@@ -17,19 +17,19 @@ from ctxval.models.scaling import IncrementScaling
 
 
 class FeedforwardReLU:
-    """A network of ReLU layers and a linear last layer that predicts the increment of the state.
+    """A network with ReLU layers and a linear last layer that predicts the increment of the state.
 
     Layer i maps z to ``z @ weights[i] + biases[i]``, in the standardised units of the scaling.
 
     Args:
-        weights: one matrix a layer, shapes ``(n + m, h), (h, h'), ..., (h'', n)``.
-        biases: one vector a layer.
-        scaling: of the state-input pair and of the increment.
-        data: the transitions that it was learned from, if any.
+        weights: one matrix for each layer, shapes ``(n + m, h), (h, h'), ..., (h'', n)``.
+        biases: one vector for each layer.
+        scaling: the scaling of the state-input pair and of the increment.
+        data: the transitions that the model was learned from, if any.
 
     Raises:
-        ShapeError: the layers do not fit together or the scaling.
-        InputError: a value is not finite.
+        ShapeError: if the shapes of the layers do not match each other or the scaling.
+        InputError: if a value is not finite.
     """
 
     def __init__(
@@ -56,10 +56,15 @@ class FeedforwardReLU:
     def from_sklearn(
         cls, regressor: Any, scaling: IncrementScaling, data: Transitions | None = None
     ) -> FeedforwardReLU:
-        """Return a fitted ``sklearn.neural_network.MLPRegressor`` of ReLU units as a model, without sklearn in it.
+        """Return the network of a fitted ``sklearn.neural_network.MLPRegressor`` as a model that does not need sklearn.
+
+        Args:
+            regressor: the fitted regressor, with ReLU units.
+            scaling: the scaling of the state-input pair and of the increment.
+            data: the transitions that the regressor was fitted on, if known.
 
         Raises:
-            InputError: its units are of another kind.
+            InputError: if the units of the network are not ReLU.
         """
         if regressor.activation != "relu" or regressor.out_activation_ != "identity":
             raise InputError(f"the network must have ReLU units, got {regressor.activation!r}.")
@@ -75,17 +80,17 @@ class FeedforwardReLU:
         restarts: int = 4,
         iterations: int = 1000,
     ) -> FeedforwardReLU:
-        """Train networks on recorded transitions with scikit-learn's MLPRegressor and L-BFGS; keep the best.
+        """Train networks on recorded transitions with scikit-learn's MLPRegressor and L-BFGS; return the best one.
 
         Args:
-            data: the transitions.
-            hidden: units in each hidden layer.
-            seed: of the first weights.
-            restarts: how many networks are trained; the one with the smallest loss on the data is kept.
-            iterations: of one training, at most.
+            data: the recorded transitions.
+            hidden: number of units in each hidden layer.
+            seed: seed of the initial weights.
+            restarts: number of networks to train; the one with the smallest loss on the data is returned.
+            iterations: largest number of iterations of one training.
 
         Raises:
-            InputError: scikit-learn is not installed, the data are not finite, or a number is not positive.
+            InputError: if scikit-learn is not installed, the data are not finite, or a number is not positive.
         """
         if restarts < 1 or iterations < 1:
             raise InputError(f"restarts and iterations must be positive, got {restarts!r} and {iterations!r}.")
@@ -102,7 +107,7 @@ class FeedforwardReLU:
         return self.scaling.step(x, z @ self.weights[-1] + self.biases[-1])
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return A ``(..., n, n)`` and B ``(..., n, m)``; at a kink, that of the inactive side."""
+        """Return A ``(..., n, n)`` and B ``(..., n, m)``; at a kink the unit counts as inactive."""
         z = self.scaling.inputs(x, u)
         gradient = np.broadcast_to(np.eye(z.shape[-1]), (*z.shape, z.shape[-1]))
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
@@ -135,11 +140,11 @@ def _trained(data: Transitions, scaling: IncrementScaling, hidden: tuple[int, ..
     regressor = MLPRegressor(
         hidden_layer_sizes=hidden,
         solver="lbfgs",
-        alpha=1e-6,  # next to no penalty: so few weights do not overfit thousands of transitions
+        alpha=1e-6,  # almost no penalty, because so few weights do not overfit thousands of transitions
         max_iter=iterations,
         max_fun=2 * iterations,
         random_state=seed,
     )
     with single_threaded(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # the limit of iterations is meant
+        warnings.simplefilter("ignore", ConvergenceWarning)  # stopping at the limit of iterations is intended
         return regressor.fit(scaling.inputs(data.x, data.u), scaling.targets(data))

@@ -16,20 +16,20 @@ from ctxval.errors import InputError, ShapeError
 
 @part(files=("source",))
 class Onnx:
-    """A network from an ONNX file as a model, of any toolbox that writes one.
+    """A network from an ONNX file as a model; any toolbox may have written the file.
 
-    The network takes the state and the input as two inputs in this order, or as one with the state first. It runs
-    with onnxruntime; nothing in the file is executed as code.
+    The network takes the state and the input as two inputs in this order, or as one input with the state first. It
+    runs with onnxruntime; nothing in the file is executed as code.
 
-    A network in single precision rounds so coarsely that differences of 1e-5 are noise: its Jacobian is taken by
-    central differences over wider distances, of which some three digits are right.
+    In single precision the rounding hides differences of 1e-5. The Jacobian is therefore taken by central differences
+    with wider steps, which give about three correct digits.
 
     Args:
         source: the file, or its bytes.
         increments: whether the network returns ``x_next - x`` instead of ``x_next``.
 
     Raises:
-        InputError: onnxruntime is not installed, or this is no such network.
+        InputError: if onnxruntime is not installed, or the file is not a network with one or two inputs.
     """
 
     def __init__(self, source: str | Path | bytes, *, increments: bool = False) -> None:
@@ -37,19 +37,19 @@ class Onnx:
         self.increments = increments
         if len(self.network.widths) not in (1, 2):
             raise InputError(
-                f"a model must take (x, u) as one or two inputs, the network has {', '.join(self.network.names)}."
+                f"a model must take (x, u) as one or two inputs, but the network has {', '.join(self.network.names)}."
             )
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
 
         Raises:
-            ShapeError: the network has other numbers of states or inputs.
+            ShapeError: if the numbers of states or inputs differ from the network's.
         """
         output = self.network(*self._arguments(x, u))
         if output.shape[-1] != x.shape[-1]:
             raise ShapeError(
-                f"the network must return {x.shape[-1]} states like those it takes, got {output.shape[-1]}."
+                f"the network must return as many states as it takes, {x.shape[-1]}, got {output.shape[-1]}."
             )
         return x + output if self.increments else output
 

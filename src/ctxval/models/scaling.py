@@ -17,8 +17,8 @@ class IncrementScaling:
     """The model ``x_next = x + shift_out + scale_out * f(((x, u) - shift_in) / scale_in)`` around a regressor f.
 
     Attributes:
-        shift_in, scale_in: of the state-input pair, shapes ``(n + m,)``.
-        shift_out, scale_out: of the increment, shapes ``(n,)``.
+        shift_in, scale_in: shift and scale of the state-input pair, shapes ``(n + m,)``.
+        shift_out, scale_out: shift and scale of the increment, shapes ``(n,)``.
     """
 
     shift_in: Array
@@ -31,7 +31,7 @@ class IncrementScaling:
         """Return the scaling that gives recorded transitions zero mean and unit variance.
 
         Raises:
-            InputError: the data are not finite, or none.
+            InputError: if there are no data, or they are not finite.
         """
         if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
             raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
@@ -41,24 +41,24 @@ class IncrementScaling:
 
     @property
     def mean_pair(self) -> tuple[Array, Array]:
-        """The state ``(n,)`` and the input ``(m,)`` in the middle of the data."""
+        """The mean state ``(n,)`` and the mean input ``(m,)`` of the data."""
         n = len(self.shift_out)
         return self.shift_in[:n], self.shift_in[n:]
 
     def inputs(self, x: Array, u: Array) -> Array:
-        """Return what f takes, shape ``(..., n + m)``, of states ``(..., n)`` and inputs ``(..., m)``."""
+        """Return the inputs of f, shape ``(..., n + m)``, for states ``(..., n)`` and inputs ``(..., m)``."""
         return standardised_pairs(x, u, self.shift_in, self.scale_in)
 
     def targets(self, data: Transitions) -> Array:
-        """Return what f is to return for recorded transitions, shape ``(N, n)``."""
+        """Return the target outputs of f for recorded transitions, shape ``(N, n)``."""
         return (data.x_next - data.x - self.shift_out) / self.scale_out
 
     def step(self, x: Array, output: Array) -> Array:
-        """Return the next states ``(..., n)`` of what f returned, ``(..., n)``."""
+        """Return the next states ``(..., n)`` for outputs ``(..., n)`` of f."""
         return x + self.shift_out + self.scale_out * output
 
     def jacobian(self, gradient: Array) -> tuple[Array, Array]:
-        """Return A ``(..., n, n)`` and B ``(..., n, m)`` of the gradient of f, ``(..., n, n + m)``."""
+        """Return A ``(..., n, n)`` and B ``(..., n, m)`` for the Jacobian ``(..., n, n + m)`` of f."""
         n = len(self.shift_out)
         whole = self.scale_out[:, None] * gradient / self.scale_in
         whole[..., :n] += np.eye(n)
@@ -69,7 +69,7 @@ class IncrementScaling:
 
 
 def standardised_pairs(x: Array, u: Array, shift: Array, scale: Array) -> Array:
-    """Return ``((x, u) - shift) / scale``, shape ``(..., n + m)``, of states ``(..., n)`` and inputs ``(..., m)``."""
+    """Return ``((x, u) - shift) / scale``, shape ``(..., n + m)``, for states ``(..., n)`` and inputs ``(..., m)``."""
     batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
     n = x.shape[-1]
     z = np.empty((*batch, n + u.shape[-1]))

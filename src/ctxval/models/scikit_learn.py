@@ -1,4 +1,4 @@
-"""A regressor of scikit-learn as a learned model."""
+"""A scikit-learn regressor as a learned model."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from ctxval.errors import InputError, ShapeError
 
 @part()
 class ScikitLearn:
-    """A fitted regressor of scikit-learn as a model: a pipeline, a forest, ridge regression, a Gaussian process.
+    """A fitted scikit-learn regressor as a model: a pipeline, a forest, ridge regression, a Gaussian process.
 
-    Its features are the state, then the input. Where it is smooth its Jacobian is taken by differences; a forest or
-    nearest neighbours are constant in between, and LQR and iLQR see a Jacobian of zero.
+    Its features are the state, then the input. Its Jacobian is taken by central differences, so the regressor must be
+    smooth for LQR and iLQR: a forest or nearest neighbours are piecewise constant, and their Jacobian is zero.
 
     Args:
-        regressor: with ``predict``, from features ``(N, n + m)`` to ``(N, n)``.
-        increments: whether it predicts ``x_next - x`` instead of ``x_next``.
-        data: the transitions that it was learned from, if any.
+        regressor: the fitted regressor, whose ``predict`` maps features ``(N, n + m)`` to ``(N, n)``.
+        increments: whether the regressor predicts ``x_next - x`` instead of ``x_next``.
+        data: the transitions that the regressor was fitted on, if any.
 
     Raises:
-        InputError: the regressor is not fitted, or is none.
+        InputError: if the value is not a regressor, or is not fitted.
     """
 
     def __init__(self, regressor: Any, *, increments: bool = True, data: Transitions | None = None) -> None:
@@ -40,17 +40,17 @@ class ScikitLearn:
 
     @classmethod
     def fit(cls, regressor: Any, data: Transitions, *, increments: bool = True) -> ScikitLearn:
-        """Fit a regressor on recorded transitions; it is fitted itself, not a copy of it.
+        """Fit a regressor on recorded transitions. The regressor itself is fitted, not a copy.
 
         Raises:
-            InputError: the data are not finite, or it is no regressor.
+            InputError: if there are no data, they are not finite, or the value is not a regressor.
         """
         if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
             raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
         if not callable(getattr(regressor, "fit", None)):
             raise InputError(f"the regressor must have fit and predict, got {regressor!r}.")
         targets = data.x_next - data.x if increments else data.x_next
-        # Of one column scikit-learn wants none.
+        # scikit-learn expects a single target as a vector, not as a column.
         regressor.fit(np.concatenate([data.x, data.u], axis=1), targets[:, 0] if targets.shape[1] == 1 else targets)
         return cls(regressor, increments=increments, data=data)
 
@@ -58,7 +58,7 @@ class ScikitLearn:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
 
         Raises:
-            ShapeError: the regressor was fitted on other numbers of states and inputs.
+            ShapeError: if the regressor was fitted on other numbers of states and inputs.
         """
         n, width = x.shape[-1], x.shape[-1] + u.shape[-1]
         if width != self.features:
@@ -70,12 +70,12 @@ class ScikitLearn:
         pairs[..., :n], pairs[..., n:] = x, u
         output = np.asarray(self.regressor.predict(pairs.reshape(-1, width)), dtype=np.float64)
         if output.shape not in ((int(np.prod(batch)), n), *([(int(np.prod(batch)),)] if n == 1 else [])):
-            raise ShapeError(f"the regressor must predict {n} states like those it takes, got shape {output.shape}.")
+            raise ShapeError(f"the regressor must predict as many states as it takes, {n}, got shape {output.shape}.")
         output = output.reshape(*batch, n)
         return x + output if self.increments else output
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this model in a store: its kind and what it predicts at some points."""
+        """Return what identifies this model in a store: its kind and its predictions at some points."""
         probes = np.random.default_rng(0).normal(size=(3, self.features))
         return {
             "regressor": type(self.regressor).__qualname__,

@@ -1,4 +1,4 @@
-"""State-space models of python-control as learned models."""
+"""State-space models of python-control or scipy as learned models."""
 
 from __future__ import annotations
 
@@ -14,17 +14,19 @@ from ctxval.models.linear import Linear
 
 @part()
 def state_space(system: Any, dt: float) -> Linear:
-    """Return the linear model, with its Jacobian, of a ``StateSpace`` of python-control or of scipy.
+    """Return a ``StateSpace`` of python-control or of scipy as a linear model with its Jacobian.
 
-    The model's state is the system's; C and D play no part. A continuous system is discretised exactly for inputs
+    The model has the state of the system; C and D are not used. A continuous system is discretised exactly for inputs
     that are held over a step.
 
     Args:
-        system: with A, B and dt: 0 or None for a continuous one, True for a discrete one of any time step.
-        dt: seconds in a step of the tasks.
+        system: the system, with A, B and its own dt: 0 or None for a continuous system, True for a discrete system
+            with any time step.
+        dt: length of a step of the tasks, seconds.
 
     Raises:
-        InputError: it is no such system, or a discrete one with another time step.
+        InputError: if the value is not such a system, or a discrete system with another time step.
+        ShapeError: if the shapes of A and B do not match.
     """
     if not all(hasattr(system, name) for name in ("A", "B")):
         raise InputError(f"a state-space model must have A and B, got {system!r}.")
