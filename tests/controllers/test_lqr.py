@@ -156,5 +156,5 @@ def test_weights_of_other_inputs_than_the_model_has_are_refused() -> None:
     task = Task([1.0, 0.0], goal=[0.0, 0.0], horizon=3, dt=0.1)
     model = Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]])
     for synthesizer in (LQR([1, 1], [1, 2]), StationaryLQR([1, 1], [1, 2])):
-        with pytest.raises(InputError, match="R weighs 2 inputs, and the model has 1"):
+        with pytest.raises(InputError, match="R must weigh the model's 1 inputs, got a weight of 2"):
             synthesizer.design(task, model)

@@ -86,7 +86,7 @@ def test_it_is_described_as_in_stores_of_version_0_1_0() -> None:
 
 
 def test_other_networks_and_observations_are_refused() -> None:
-    with pytest.raises(InputError, match="must have one input, the observations; the network has x, y"):
+    with pytest.raises(InputError, match="must have one input, the observations, but the network has x, y"):
         OnnxPolicy(policy(inputs=2))
     with pytest.raises(ShapeError, match="input 'x' takes 2 numbers, got 3"):
         OnnxPolicy(policy()).design(Task(np.zeros(3), horizon=2, dt=0.1), CART)(0, np.zeros(3))

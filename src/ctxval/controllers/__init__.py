@@ -1,4 +1,4 @@
-"""Synthesizers: ready-made ways to design a controller on a model."""
+"""Synthesizers: ready-made methods that design a controller on a model."""
 
 from __future__ import annotations
 

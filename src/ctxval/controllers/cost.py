@@ -11,15 +11,16 @@ from ctxval.errors import InputError, ShapeError
 
 
 class QuadraticCost:
-    """``1/2 sum_t (x_t - r_t)' Q (x_t - r_t) + u_t' R u_t``, and ``Q_final`` in place of Q at the horizon.
+    """The cost ``1/2 sum_t (x_t - r_t)' Q (x_t - r_t) + u_t' R u_t``, with ``Q_final`` instead of Q at the horizon.
 
     Args:
-        Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
-        R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``, positive definite.
-        Q_final: like Q; Q itself by default.
+        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
+        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``; positive definite.
+        Q_final: weight of the last state, in the same form as Q; Q by default.
 
     Raises:
-        InputError: a weight is not symmetric positive semidefinite, or R not positive definite.
+        InputError: if a weight is not symmetric positive semidefinite, or R is not positive definite.
+        ShapeError: if a weight is not a square matrix or a diagonal, or Q_final does not have the shape of Q.
     """
 
     def __init__(self, Q: ArrayLike, R: ArrayLike, Q_final: ArrayLike | None = None) -> None:
@@ -35,7 +36,7 @@ class QuadraticCost:
         """Check that the task has as many states as Q.
 
         Raises:
-            ShapeError: it has not.
+            ShapeError: if the number of states differs.
         """
         n = task.initial_state.shape[-1]
         if len(self.Q) != n:

@@ -26,26 +26,30 @@ _SUFFICIENT_DECREASE = 1e-4
 _DAMPING_MIN = 1e-6
 """Smallest damping that is not zero."""
 _DAMPING_MAX = 1e10
-"""Damping above which a task is given up: no step improves it."""
+"""Damping above which the iteration of a task stops, because no step improves its cost."""
 _NEWTON_STEPS = 50
-"""Projected Newton steps at most, for inputs with limits."""
+"""Largest number of projected Newton steps for inputs with limits."""
 _NEWTON_DECREASE = 0.1
 """Share of its linear decrease that a projected Newton step must reach."""
 _NEWTON_SETTLED = 1e-26
 """Share of the largest decrease so far at which projected Newton steps have converged."""
 _ROUNDING = 1e12
-"""The cost over the decrease that is rounding: less leaves the states with a relative error below 1e-10."""
+"""Largest ratio of the old cost to the new one in one step; beyond it rounding errors call for another step.
+
+Below it the relative error of the states is below 1e-10.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class ILQRSolution:
-    """What iLQR found, for one task or a batch.
+    """The solution of iLQR for one task or a batch.
 
     Attributes:
         controller: the feedback around the optimised trajectory.
-        cost: shape ``(...)``.
-        iterations: accepted steps, integers of shape ``(...)``.
-        converged: shape ``(...)``; where false, the limit of iterations was reached or no step improved the cost.
+        cost: the cost of the optimised trajectory, shape ``(...)``.
+        iterations: the number of accepted steps, integers of shape ``(...)``.
+        converged: whether the iteration converged, shape ``(...)``; it did not if the limit of iterations was reached
+            or no step improved the cost.
     """
 
     controller: AffineFeedback
@@ -59,26 +63,26 @@ class ILQRSolution:
 
 @part()
 class ILQR:
-    """Finite-horizon iterative LQR on any model, a whole batch of tasks at once.
+    """Finite-horizon iterative LQR on any model, for a whole batch of tasks at once.
 
-    Minimises a quadratic cost on the deviation from the task's reference. On a linear model without limits it
+    It minimises a quadratic cost on the deviation from the task's reference. On a linear model without limits it
     converges in one iteration, to the Riccati solution.
 
-    It plans with input limits: every backward step minimises over the inputs within them, inputs at a limit get no
-    feedback, and roll-outs are clipped. The controller clips too, on the model and on the system alike.
+    It takes input limits into account: every backward step minimises over the inputs within the limits, inputs at a
+    limit get no feedback, and roll-outs are clipped. The controller clips its inputs on the model and on the system.
 
     Args:
-        Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
-        R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``.
+        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
+        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
         Q_final: weight of the last state; Q by default.
-        iterations: the most steps for one task.
-        tolerance: stop where the next step would lower the cost by less than this share of it.
-        limits: of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or rows
-            ``[low, high]``, one for each input.
+        iterations: largest number of steps for one task.
+        tolerance: the iteration stops if the next step would lower the cost by less than this fraction of it.
+        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
+            rows ``[low, high]``, one for each input.
 
     Raises:
-        InputError: the weights are not positive semidefinite, R not positive definite, iterations or tolerance not
-            positive, or limits not low < high or ambiguous.
+        InputError: if a weight is not positive semidefinite, R is not positive definite, iterations or tolerance are
+            not positive, or the limits are ambiguous or not low < high.
     """
 
     batched = True
@@ -106,14 +110,18 @@ class ILQR:
         return {**fields, **({} if self.limits is None else {"limits": self.limits})}
 
     def design(self, task: Task, model: Model) -> AffineFeedback:
-        """Return the feedback around the optimised trajectory of the model."""
+        """Return the feedback around the optimised trajectory of the model.
+
+        Raises:
+            DesignError: if the model diverges under zero input.
+        """
         return self.solve(task, model).controller
 
     def solve(self, task: Task, model: Model) -> ILQRSolution:
-        """Return the controller with the cost, the iterations and whether it converged, task by task.
+        """Return the controller, and for each task the cost, the number of iterations and whether they converged.
 
         Raises:
-            DesignError: the model diverges before any control is applied.
+            DesignError: if the model diverges under zero input.
         """
         self.cost.require_task(task)
         with np.errstate(all="ignore"):
@@ -144,31 +152,31 @@ class _Descent:
         if not np.isfinite(self.J).all():
             raise DesignError("iLQR cannot start: the model diverges under zero input within the horizon.")
         self.damping = np.zeros(batch)
-        self.refused = np.zeros(batch, dtype=bool)  # the line search failed from the present iterate
+        self.refused = np.zeros(batch, dtype=bool)  # the line search has failed at the present iterate
         self.iterations = np.zeros(batch, dtype=int)
         self.converged = np.zeros(batch, dtype=bool)
 
     def active_rows(self) -> Rows:
-        """Return the tasks that still move."""
+        """Return the tasks whose iteration continues."""
         stuck = self.damping > _DAMPING_MAX
         return np.flatnonzero(~self.converged & ~stuck & (self.iterations < self.settings.iterations))
 
     def advance(self, rows: Rows) -> None:
-        """Take one step for these tasks, or find that they have arrived."""
+        """Take one step for these tasks, or mark them as converged."""
         A, B = linearize(self.model, self.X[:-1, rows], self.U[:, rows])
         policy, change = self._backward(rows, A, B)
         self.K[:, rows] = policy.K if policy.K.ndim == 4 else policy.K[:, None]
         gain = -change.at(np.ones(len(rows)))
         arrived = gain <= self.settings.tolerance * (np.abs(self.J[rows]) + self.settings.tolerance)
-        # A damped step is small by itself: only an undamped one may declare arrival.
+        # A damped step is always small, so only an undamped step may mark a task as converged.
         self.converged[rows] = arrived & (self.damping[rows] == 0)
-        # ... and where that one was refused, no step improves the cost.
+        # If the line search has already refused the undamped step, no step improves the cost.
         self.damping[rows[arrived]] = np.where(self.refused[rows[arrived]], np.inf, 0.0)
         before = self.J[rows]
         moved = self._line_search(rows, policy, change, ~arrived)
         if A.ndim == 2 and B.ndim == 2 and self.limits is None:
-            # The model is linear: the step was the exact minimiser, and its gains hold everywhere. Only where the cost
-            # fell from very far, as on an unstable model, rounding calls for another look.
+            # The model is linear, so the step was the exact minimiser, and its gains hold everywhere. If the cost was
+            # far larger before, as on an unstable model, rounding errors call for another step.
             self.converged[rows[moved]] = (before <= _ROUNDING * self.J[rows])[moved]
 
     def _backward(self, rows: Rows, A: Array, B: Array) -> tuple[_Policy, _Change]:
@@ -202,7 +210,7 @@ class _Descent:
         return _Policy(np.stack(gains[::-1]), np.stack(feedforward[::-1])), _Change(slope, curvature)
 
     def _line_search(self, rows: Rows, policy: _Policy, change: _Change, wanted: Mask) -> Rows:
-        """Accept for each wanted task the longest step that lowers its cost; return which ones moved."""
+        """Accept for each wanted task the longest step that lowers its cost; return the tasks with such a step."""
         waiting = np.flatnonzero(wanted)
         for length in _STEP_LENGTHS:
             if not len(waiting):
@@ -261,7 +269,7 @@ class _Descent:
 
 @dataclass(frozen=True, eq=False)
 class _Policy:
-    """Gains K ``(H, N, m, n)``, or ``(H, m, n)`` where all tasks share them, and feedforward k ``(H, N, m)``."""
+    """Gains K ``(H, N, m, n)``, or ``(H, m, n)`` if all tasks share them, and feedforward k ``(H, N, m)``."""
 
     K: Array
     k: Array

@@ -1,4 +1,4 @@
-"""Linear-quadratic tracking: over the task's horizon by the Riccati recursion, and stationary."""
+"""Linear-quadratic tracking over the task's horizon by the Riccati recursion, and stationary by its algebraic form."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ class LQR:
 
     A nonlinear model is linearised once, at the task's initial state and zero input.
 
-    Limits only clip the inputs, on the model and on the system alike: the gains are those of the problem without
-    limits, and optimal as long as none is reached. iLQR and MPC plan with them.
+    Limits only clip the inputs, on the model and on the system. The gains are those of the problem without limits, and
+    are optimal as long as no limit is reached. iLQR and MPC take limits into account in the design.
 
     Args:
-        Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
-        R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``.
+        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
+        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
         Q_final: weight of the last state; Q by default.
-        limits: of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or rows
-            ``[low, high]``, one for each input.
+        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
+            rows ``[low, high]``, one for each input.
 
     Raises:
-        InputError: the weights are not positive semidefinite, R not positive definite, or the limits
-            are not low < high or ambiguous.
+        InputError: if a weight is not positive semidefinite, R is not positive definite, or the limits are ambiguous
+            or not low < high.
     """
 
     batched = True
@@ -66,22 +66,23 @@ class LQR:
 
 @part()
 class StationaryLQR:
-    """The infinite-horizon linear-quadratic regulator: one gain, from the algebraic Riccati equation.
+    """The infinite-horizon linear-quadratic regulator, with one gain from the algebraic Riccati equation.
 
-    ``u = u_g + K (x - r_t)`` follows the task's reference, with the input u_g that holds the task's goal best in the
-    sense of least squares. The model is linearised there. A goal that no input holds leaves an offset.
+    The feedback ``u = u_g + K (x - r_t)`` follows the task's reference. The input u_g holds the task's goal as well as
+    possible in the sense of least squares, and the model is linearised there. If no input holds the goal, an offset
+    remains.
 
     Limits only clip the inputs, as for :class:`LQR`.
 
     Args:
-        Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
-        R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``.
-        limits: of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or rows
-            ``[low, high]``, one for each input.
+        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
+        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
+        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
+            rows ``[low, high]``, one for each input.
 
     Raises:
-        InputError: the weights are not positive semidefinite, R not positive definite, or the limits
-            are not low < high or ambiguous.
+        InputError: if a weight is not positive semidefinite, R is not positive definite, or the limits are ambiguous
+            or not low < high.
     """
 
     batched = True
@@ -94,13 +95,13 @@ class StationaryLQR:
         """Return the stationary feedback around the reference.
 
         Raises:
-            DesignError: no feedback stabilises the model at the goal.
+            DesignError: if no feedback stabilises the model at the goal.
         """
         self.cost.require_task(task)
         holding = np.zeros((*task.batch_shape, len(self.cost.R)))
         _, B = linearize(model, task.goal, holding)
         _require_inputs(self.cost, B)
-        # One step of Gauss and Newton: exact for models that are affine in the input.
+        # One Gauss-Newton step, which is exact for models that are affine in the input.
         missing = task.goal - model.step(task.goal, holding)
         holding = holding + (np.linalg.pinv(B) @ missing[..., None])[..., 0]
         K = _stationary_gain(self.cost, *linearize(model, task.goal, holding))
@@ -118,7 +119,7 @@ class StationaryLQR:
 
 def _require_inputs(cost: QuadraticCost, B: Array) -> None:
     if B.shape[-1] != len(cost.R):
-        raise InputError(f"R weighs {len(cost.R)} inputs, and the model has {B.shape[-1]}.")
+        raise InputError(f"R must weigh the model's {B.shape[-1]} inputs, got a weight of {len(cost.R)} inputs.")
 
 
 def _stationary_gain(cost: QuadraticCost, A: Array, B: Array) -> Array:

@@ -27,28 +27,28 @@ _STRICT = 1e-6  # quadratic share of the cost of a violation, which keeps the pr
 class MPC:
     """Receding-horizon control that plans with limits, by sequential quadratic programming in CasADi.
 
-    At every step it minimises the quadratic cost of the model's prediction over the next steps, follows the task's
-    reference (held beyond its end), and applies the first input. On a linear model one quadratic program is the exact
-    solution; on others the model is linearised along the prediction, up to ``iterations`` times, with a line search.
-    The input depends on the step and the state alone: nothing is remembered from one call to the next.
+    At every step it minimises the quadratic cost of the model's prediction over the next steps, relative to the task's
+    reference (held beyond its end), and applies the first input. On a linear model one quadratic program gives the
+    exact solution. Other models are linearised along the prediction, up to ``iterations`` times, with a line search.
+    The input depends only on the step and the state: no call depends on an earlier one.
 
-    Input limits are never exceeded. State limits hold for the model's predictions; on a system that differs from the
-    model a state may leave them, and where no inputs lead back at once there is no solution, which is an error, unless
-    a ``violation_cost`` makes them soft.
+    Input limits are never exceeded. State limits hold for the model's predictions. If the system differs from the
+    model, a state may leave them; if no inputs lead back at once, the problem has no solution, which is an error. A
+    ``violation_cost`` makes the state limits soft, so that there is always a solution.
 
     Args:
-        Q: state weight, its diagonal ``(n,)`` or matrix ``(n, n)``.
-        R: input weight, its diagonal ``(m,)`` or matrix ``(m, m)``.
+        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
+        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
         Q_final: weight of the last predicted state; Q by default.
-        steps: how many steps it looks ahead.
-        limits: of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or rows
-            ``[low, high]``, one for each input.
-        state_limits: likewise; infinite where there are none.
-        violation_cost: cost of exceeding the state limits by 1, for each predicted step; None where they are hard.
-        iterations: quadratic programs for one input, at most.
+        steps: number of predicted steps.
+        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
+            rows ``[low, high]``, one for each input.
+        state_limits: limits of the states, in the same forms; infinite for states without limits.
+        violation_cost: cost of exceeding the state limits by 1, for each predicted step; None makes them hard.
+        iterations: largest number of quadratic programs for one input.
 
     Raises:
-        InputError: CasADi is not installed, or a weight, limit or number cannot be used.
+        InputError: if CasADi is not installed, or a weight, limit or number cannot be used.
     """
 
     batched = False
@@ -78,10 +78,10 @@ class MPC:
         _casadi()
 
     def design(self, task: Task, model: Model) -> RecedingHorizon:
-        """Return the controller, which solves its problem again at every step.
+        """Return the controller, which solves an optimal control problem at every step.
 
         Raises:
-            ShapeError: the task is a batch, or has other states than the weights.
+            ShapeError: if the task is a batch, or its number of states differs from that of the weights.
         """
         self.cost.require_task(task)
         if task.batch_shape:
@@ -105,7 +105,7 @@ class RecedingHorizon:
         """Return the input ``(m,)`` at step t.
 
         Raises:
-            DesignError: no inputs keep the prediction within the state limits, or it is not finite.
+            DesignError: if no inputs keep the prediction within the state limits, or the prediction is not finite.
         """
         first: Array = self.plan(t, x)[1][0]
         return first
@@ -114,7 +114,7 @@ class RecedingHorizon:
         """Return the predicted states ``(steps + 1, n)`` and the planned inputs ``(steps, m)``.
 
         Raises:
-            DesignError: as when it is called.
+            DesignError: if no inputs keep the prediction within the state limits, or the prediction is not finite.
         """
         steps = self.settings.steps
         rows = np.minimum(t + 1 + np.arange(steps), self.task.horizon)
@@ -127,7 +127,7 @@ class RecedingHorizon:
 
 
 class _Problem:
-    """The optimal control problem at one step: deviations from a guess of the inputs, improved again and again."""
+    """The optimal control problem at one step, solved by repeated improvement of a guess of the inputs."""
 
     def __init__(self, settings: MPC, model: Model, x: Array, reference: Array) -> None:
         self.settings, self.model, self.x, self.reference = settings, model, x, reference
@@ -167,7 +167,7 @@ class _Problem:
         return X
 
     def _improved(self, X: Array, U: Array, A: Array, B: Array) -> Array | None:
-        """Return the change of the inputs ``(steps, m)`` that is best for the linearised prediction, if any."""
+        """Return the best change of the inputs ``(steps, m)`` for the linearised prediction; None if there is none."""
         steps, m = U.shape
         G = _sensitivities(A, B, steps)  # (steps, n, steps * m)
         QG = self.Q @ G
@@ -189,7 +189,7 @@ class _Problem:
         return change[: steps * m].reshape(steps, m)
 
     def _line_search(self, X: Array, U: Array, change: Array) -> tuple[Array, Array, bool]:
-        """Return states and inputs with a lower merit, and whether they have settled."""
+        """Return states and inputs with a lower merit, and whether the iteration has converged."""
         before = self._merit(X, U)
         for length in _STEP_LENGTHS:
             U_new = self.settings.limits.clip(U + length * change)
@@ -200,7 +200,7 @@ class _Problem:
         return X, U, True
 
     def _merit(self, X: Array, U: Array) -> float:
-        """Return the cost and what exceeds the state limits, weighted so that it pays to keep them."""
+        """Return the merit: the cost plus the weighted violation of the state limits."""
         deviations = X[1:] - self.reference
         cost = 0.5 * (
             ((self.Q @ deviations[..., None])[..., 0] * deviations).sum() + ((U @ self.settings.cost.R) * U).sum()
@@ -227,7 +227,7 @@ def _sensitivities(A: Array, B: Array, steps: int) -> Array:
 def _softened(
     hessian: Array, slope: Array, rows: Array, box: Sequence[Array], gaps: Sequence[Array], cost: float, steps: int
 ) -> tuple[Array, float] | None:
-    """Solve with one more variable a step, by which the state limits may be exceeded."""
+    """Solve with one slack variable for each step, by which the state limits may be exceeded."""
     size, count = len(slope), len(rows)
     whole = np.zeros((size + steps, size + steps))
     whole[:size, :size] = hessian
@@ -246,14 +246,14 @@ def _softened(
 def _quadratic_program(
     hessian: Array, slope: Array, rows: Array, box: Sequence[Array], gaps: Sequence[Array]
 ) -> tuple[Array, float] | None:
-    """Minimise ``1/2 z'Hz + g'z`` within a box and within gaps of ``rows z``.
+    """Minimise ``1/2 z'Hz + g'z`` for z within a box and ``rows z`` within the gaps.
 
-    Return z and the largest multiplier of a row; None where there is no solution.
+    Returns z and the largest multiplier of a row, or None if there is no solution.
     """
     casadi = _casadi()
     dense = casadi.Sparsity.dense
     sizes = {"h": dense(*hessian.shape), "a": dense(len(rows), len(slope))}
-    # DAQP is an active-set method, exact to rounding and quiet.
+    # DAQP is an active-set method, exact up to rounding, and prints nothing.
     solver = casadi.conic("mpc", "daqp", sizes, {"error_on_fail": False})
     solution = solver(h=hessian, g=slope, a=rows, lbx=box[0], ubx=box[1], lba=gaps[0], uba=gaps[1])
     if not solver.stats()["success"]:

@@ -23,22 +23,23 @@ Observe = Callable[[int, Array, Task], Array]
 
 @part(files=("source",), functions={"observe": "(t, x, task) -> observations"})
 class OnnxPolicy:
-    """The same trained network for every task, as a synthesizer; the model is not asked.
+    """A synthesizer that uses the same trained network for every task; the model is not used.
 
     The network takes one row of observations for each task and returns the inputs as its first output, such as the
     means of a stochastic policy. Nothing in the file is executed as code.
 
     Args:
         source: the file, or its bytes.
-        observe: ``(t, x, task) -> observations (..., k)`` from the step's index, states ``(..., n)`` and the task;
-            the states by default.
-        scale: what the network's outputs are multiplied by, a number or ``(m,)``: a policy in ``[-1, 1]`` drives a
-            motor of 5 N m with a scale of 5.
-        limits: inputs are clipped to them: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and
-            high, or rows ``[low, high]``, one for each input.
+        observe: function ``(t, x, task) -> observations (..., k)`` of the step's index, the states ``(..., n)`` and
+            the task; by default the observations are the states.
+        scale: factor of the network's outputs, a number or ``(m,)``: with a scale of 5 a policy in ``[-1, 1]`` drives
+            a motor of 5 N m.
+        limits: limits to which the inputs are clipped: one number h for -h to h, ``Limits(low=, high=)``, a mapping of
+            low and high, or rows ``[low, high]``, one for each input.
 
     Raises:
-        InputError: onnxruntime is not installed, this is no network with one input, or the limits cannot be used.
+        InputError: if onnxruntime is not installed, the file is not a network with one input, or the limits cannot be
+            used.
     """
 
     batched = True
@@ -57,7 +58,7 @@ class OnnxPolicy:
         self.limits = given_limits(limits)
         if len(self.network.widths) != 1:
             raise InputError(
-                f"a policy must have one input, the observations; the network has {', '.join(self.network.names)}."
+                f"a policy must have one input, the observations, but the network has {', '.join(self.network.names)}."
             )
 
     def design(self, task: Task, model: Model) -> BoundOnnxPolicy:
@@ -84,7 +85,7 @@ class BoundOnnxPolicy:
         """Return the inputs ``(..., m)`` at step t.
 
         Raises:
-            ShapeError: there are not as many observations as the network takes.
+            ShapeError: if the number of observations differs from the network's.
         """
         observe, limits = self.settings.observe, self.settings.limits
         observations: Any = x if observe is None else observe(t, x, self.task)
