@@ -151,7 +151,7 @@ def test_the_time_step_must_be_that_of_the_environment() -> None:
         ("Reacher-v99", "'Reacher-v99' cannot be made"),
         ("no environment", "cannot be made"),
         ("CartPole-v1", r"continuous actions, a Box, got Discrete\(2\)"),
-        ("Pendulum-v1", r"give get_state=\(environment -> x\)"),
+        ("Pendulum-v1", r"give the functions get_state\(environment\) -> x"),
     ],
 )
 def test_environments_that_cannot_be_used_are_refused(name: str, sentence: str) -> None:

@@ -14,7 +14,7 @@ def test_executing_says_what_to_do_instead() -> None:
     system = systems.Manual(**CART)
     assert isinstance(system, systems.System)
     assert system.manual
-    with pytest.raises(ExecutionError, match=r"take tasks with campaign\.ask\(\) and report .* campaign\.tell\(\)"):
+    with pytest.raises(ExecutionError, match=r"get a task with campaign\.ask\(\) and report .* campaign\.tell\(\)"):
         system.execute(lambda t, x: x, Task([0.0, 0.0], horizon=3, dt=0.1))
 
 

@@ -291,7 +291,7 @@ def test_the_process_itself_adopts_nobody(tmp_path: Path) -> None:
 def test_a_supervisor_that_is_killed_or_stopped_takes_its_command_with_it(
     signal_: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervised, "_PATIENCE", 0.2)
+    monkeypatch.setattr(supervised, "_GRACE_PERIOD", 0.2)
     code = SPAWN + f"import os, signal; os.kill(os.getppid(), signal.{signal_}); time.sleep(60)"
     with pytest.raises(ExecutionError, match=r"the process that watches the command was killed|did not end within 2 s"):
         python(tmp_path, code, str(tmp_path), timeout=2).execute(designed(), TASK)
@@ -307,7 +307,7 @@ def test_all_is_killed_when_we_are_interrupted(tmp_path: Path, monkeypatch: pyte
         pids.append(int(text))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(supervised, "_says_something", interrupted)
+    monkeypatch.setattr(supervised, "_readable", interrupted)
     with pytest.raises(KeyboardInterrupt):
         python(tmp_path, SPAWN + "time.sleep(60)", str(tmp_path)).execute(designed(), TASK)
     assert gone(pids[0])

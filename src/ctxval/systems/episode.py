@@ -1,4 +1,4 @@
-"""One closed loop on a system that keeps its own state and is stepped from outside."""
+"""One closed loop on a system that keeps its own state and is advanced step by step."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import InputError, ShapeError
 
 SAME_STATE = 1e-6
-"""By how much a system may miss the task's initial state, relative to the larger of 1 and that state."""
+"""Largest difference of a system's first state from the task's initial state, relative to the larger of 1 and it."""
 
 Advance = Callable[[Array], tuple[Array, str]]
-"""``u -> (x_next, reason)``: one control step; the reason is empty where the episode goes on."""
+"""One control step, ``u -> (x_next, reason)``; the reason why the episode ended is empty if it continues."""
 
 
 def run_episode(advance: Advance, controller: Controller, task: Task, inputs: int) -> Trajectory:
-    """Run a controller over the task's horizon, or until a step gives a reason why the episode has ended.
+    """Run a controller over the task's horizon, or until a step returns a reason why the episode has ended.
 
-    What comes after that step is NaN, and the trajectory's ``ended`` is the reason. An episode that ends with the last
-    step of the horizon is whole.
+    All values after that step are NaN, and the reason is the trajectory's ``ended``. An episode that ends with the last
+    step of the horizon is complete.
 
     Args:
-        advance: takes ``(m,)`` and returns the next state ``(n,)`` and a reason.
-        controller, task: of one task, not a batch.
-        inputs: m.
+        advance: function that applies an input ``(m,)`` for one step and returns the next state ``(n,)`` and a reason.
+        controller: the controller for this task.
+        task: one task, not a batch.
+        inputs: the number of inputs m.
 
     Raises:
-        ShapeError: the controller returns another number of inputs.
+        ShapeError: if the controller returns another number of inputs.
     """
     x = np.array(task.initial_state)
     states, applied = np.full((task.horizon + 1, len(x)), np.nan), np.full((task.horizon, inputs), np.nan)
@@ -55,10 +56,10 @@ def run_episode(advance: Advance, controller: Controller, task: Task, inputs: in
 
 
 def require_one(task: Task) -> None:
-    """Check that a task is one, not a batch.
+    """Check that a task is one task, not a batch.
 
     Raises:
-        ShapeError: it is a batch.
+        ShapeError: if the task is a batch.
     """
     if task.batch_shape:
         raise ShapeError(f"this system executes one task at a time, got a batch of shape {task.batch_shape}.")
@@ -68,18 +69,18 @@ def require_time_step(task: Task, dt: float, what: str) -> None:
     """Check that a task has the system's time step.
 
     Raises:
-        InputError: it has another; the message says what the system's is.
+        InputError: if the time step differs; the message gives the system's.
     """
     if not np.isclose(task.dt, dt, rtol=1e-9, atol=0):
         raise InputError(f"the task's dt must be {what}, {dt:g} s, got {task.dt:g} s.")
 
 
 def require_started(task: Task, state: Array) -> None:
-    """Check that a system stands in the task's initial state.
+    """Check that a system is in the task's initial state.
 
     Raises:
-        ShapeError: it has another number of states.
-        InputError: it stands elsewhere.
+        ShapeError: if the number of states differs.
+        InputError: if the system is in another state.
     """
     wanted = task.initial_state
     if state.shape != wanted.shape:

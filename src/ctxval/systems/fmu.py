@@ -1,4 +1,4 @@
-"""A functional mock-up unit (FMU), as Simulink, Modelica tools and others export them, as the true system."""
+"""A functional mock-up unit (FMU), which Simulink, Modelica tools and others export, as the true system."""
 
 from __future__ import annotations
 
@@ -34,21 +34,23 @@ _PROGRAM = Path(__file__).with_name("fmu_process.py")
 class FMU:
     """An FMU for co-simulation, FMI 2 or 3, as the true system.
 
-    Every execution has an instance of its own: parameters and the initial state are set as start values, inputs are
-    held over a step, and the instance is freed however the execution ends. An FMU holds machine code, which runs in a
-    process of its own, kept for the next execution: an FMU that crashes it is a failed execution.
+    Every execution has its own instance: parameters and the initial state are set as start values, inputs are held
+    over a step, and the instance is freed however the execution ends. An FMU contains machine code. It runs in a
+    separate process, which is kept for the next execution; if the FMU crashes this process, the execution has failed.
 
     Args:
         path: the ``.fmu`` file.
-        states: names of the variables that are the state, real numbers.
-        inputs: names of the input variables, real numbers.
-        start: for a state's name the variable whose start value sets it; the state's own variable by default.
+        states: names of the variables that make up the state; they are real numbers.
+        inputs: names of the input variables; they are real numbers.
+        start: the variable whose start value sets a state, by the name of the state; by default the state's own
+            variable.
         parameters: values of other variables, set before the initialisation.
-        step: the communication step size, seconds; a task's dt must be a whole multiple of it, and is it by default.
+        step: the communication step size in seconds, of which a task's dt must be a whole multiple; by default it is
+            the task's dt.
 
     Raises:
-        InputError: FMPy is not installed, or the file is no FMU that can be used.
-        UnknownNameError: the FMU has no variable of that name.
+        InputError: if FMPy is not installed, or the file is not an FMU that can be used.
+        UnknownNameError: if the FMU has no variable of a given name.
     """
 
     def __init__(
@@ -71,9 +73,9 @@ class FMU:
         self._open()
 
     def _open(self) -> None:
-        """Unpack the file and look up the variables, here and again in another process."""
+        """Unpack the file and look up the variables; a copy of this object in another process does so again."""
         self._description, self._unpacked = _unpacked(self.path)
-        # By the process that started them: a fork of this one must not talk to the same.
+        # The key is the process that started them, because a fork of it must not use the same ones.
         self._idle: dict[int, list[_Process]] = {}
         weakref.finalize(self, _clean, self._idle, self._unpacked, os.getpid())
         self._digest = hashlib.sha256(self.path.read_bytes()).hexdigest()[:16]
@@ -112,9 +114,9 @@ class FMU:
         """Run the closed loop from the task's initial state over its horizon.
 
         Raises:
-            InputError: the task's dt is no multiple of the step, or the initial state cannot be set.
-            ShapeError: states or inputs are not as many as the names.
-            ExecutionError: the FMU refuses to start, or crashes then.
+            InputError: if the task's dt is not a multiple of the step, or the initial state cannot be set.
+            ShapeError: if the number of states or inputs differs from the number of names.
+            ExecutionError: if the FMU refuses to start, or crashes when it starts.
         """
         require_one(task)
         substeps = self._substeps(task)
@@ -135,7 +137,7 @@ class FMU:
 
     @contextlib.contextmanager
     def _process(self) -> Iterator[_Process]:
-        """Lend a process; one in which anything went wrong is not used again."""
+        """Yield an idle or a new process; it is not used again after an error."""
         idle = self._idle.setdefault(os.getpid(), [])
         try:
             process = idle.pop()
@@ -171,14 +173,14 @@ class _Process:
     """The process that runs an FMU; see :mod:`ctxval.systems.fmu_process`.
 
     Attributes:
-        sound: whether it can be used again.
+        sound: whether the process can be used again.
     """
 
     def __init__(self, setup: Mapping[str, Any]) -> None:
         path = os.pathsep.join(entry for entry in sys.path if entry)
         self.sound, self.size = True, len(setup["states"])
-        # -P: the folder of the program has modules named as those of others. A session of its own: Ctrl-C is for the
-        # campaign, which ends after what is running.
+        # -P, because modules in the folder of the program have the same names as other modules. A session of its own,
+        # because Ctrl-C is for the campaign, which ends after the running executions.
         self._process = subprocess.Popen(
             [sys.executable, "-P", str(_PROGRAM), str(os.getpid())],
             stdin=subprocess.PIPE,
@@ -191,15 +193,15 @@ class _Process:
 
     def _send(self, message: Any) -> None:
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # it has crashed, which the answer will say
+        with contextlib.suppress(OSError):  # the process has crashed, which reading the answer reports
             self._process.stdin.write(json.dumps(message) + "\n")
             self._process.stdin.flush()
 
     def ask(self, act: str, *arguments: Any) -> Any:
-        """Have something done; return what came of it.
+        """Send one request; return the value of its answer.
 
         Raises:
-            InputError, ExecutionError: the FMU refuses it, or crashes.
+            InputError, ExecutionError: if the FMU refuses the request or crashes.
         """
         assert self._process.stdout is not None
         self._send([act, *arguments])
@@ -215,7 +217,7 @@ class _Process:
         return answer["value"]
 
     def advance(self, u: Array) -> tuple[Array, str]:
-        """Hold the inputs over one control step; return the state, and why it failed if it did."""
+        """Hold the inputs over one control step; return the state, and the reason if the step failed."""
         try:
             state, reason = self.ask("advance", u.tolist())
         except _CrashError as crash:
@@ -223,7 +225,7 @@ class _Process:
         return np.full(self.size, np.nan) if state is None else np.array(state), reason
 
     def end(self) -> None:
-        """Kill the process: it has nothing that must be kept."""
+        """Kill the process, which holds no data to keep."""
         self._process.kill()
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout):
@@ -233,7 +235,7 @@ class _Process:
 
 
 def _clean(idle: dict[int, list[_Process]], unpacked: TemporaryFolder, owner: int) -> None:
-    """End this process's own processes, and remove the files where it was this one that unpacked them."""
+    """End the idle processes of this process, and remove the unpacked files if this process unpacked them."""
     for process in idle.pop(os.getpid(), []):
         process.end()
     if os.getpid() == owner:
@@ -249,11 +251,11 @@ def _unpacked(path: Path) -> tuple[Any, TemporaryFolder]:
     try:
         require_regular_file(path)
         description = fmpy.read_model_description(str(path))
-    except Exception as error:  # of many kinds: no file, no zip, no XML, not after the schema
+    except Exception as error:  # of many kinds: no file, not a zip, not XML, not valid by the schema
         raise InputError(f"{path} cannot be read as an FMU: {error}") from error
     if description.coSimulation is None or not description.fmiVersion.startswith(("2", "3")):
         raise InputError(
-            f"{path} must be an FMU for co-simulation, FMI 2 or 3; it is of FMI {description.fmiVersion}"
+            f"{path} must be an FMU for co-simulation, FMI 2 or 3, got FMI {description.fmiVersion}"
             f"{'' if description.coSimulation else ' without co-simulation'}."
         )
     folder = TemporaryFolder()

@@ -1,7 +1,7 @@
-"""The process that an FMU runs in, which it may crash; :mod:`ctxval.systems.fmu` starts this file as a program.
+"""The process in which an FMU runs and which it may crash; :mod:`ctxval.systems.fmu` starts this file as a program.
 
-Each line that comes in is JSON, what to do and its arguments, and so is each that goes out, what came of it. Nothing of
-ctxval is imported: the process starts in the time that FMPy takes.
+Each line of input is a request in JSON, with an action and its arguments; each line of output is its result in JSON.
+Nothing of ctxval is imported, so that the process needs only the time of FMPy to start.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from collections.abc import Callable
 from typing import IO, Any
 
 _POLL = 0.5
-"""Seconds between two looks whether the campaign is still there."""
+"""Seconds between two checks whether the campaign's process still runs."""
 
 
 class Refused(Exception):  # noqa: N818
-    """What an FMU does not do, and whether the user's input is to blame."""
+    """The FMU refused a request; ``input_is_wrong`` tells whether the user's input is the cause."""
 
     def __init__(self, sentence: str, *, input_is_wrong: bool = False) -> None:
         super().__init__(sentence)
@@ -28,14 +28,14 @@ class Refused(Exception):  # noqa: N818
 
 
 class Unit:
-    """An unpacked FMU, of which one instance at a time is simulated; FMI 2 and 3 call things differently.
+    """An unpacked FMU with one instance at a time; it hides the different names of FMI 2 and 3.
 
     Args:
-        folder: where it is unpacked.
-        name: of its file.
-        states, inputs: value references.
+        folder: the folder of the unpacked files.
+        name: the name of the FMU's file.
+        states, inputs: value references of the states and inputs.
         start: names of the variables whose start values set the state.
-        parameters: values by name.
+        parameters: values of parameters by name.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class Unit:
         self.initialised = False
 
     def begin(self, x: list[float] | None, step: float, substeps: int) -> list[float]:
-        """Start a simulation in a state, or as the FMU would; return the state in which it stands."""
+        """Start a simulation in a state, or in the FMU's own initial state; return the state in which it starts."""
         from fmpy.simulation import instantiate_fmu
 
         self.steps, self.step, self.substeps = 0, step, substeps
@@ -70,7 +70,7 @@ class Unit:
         self._set, self._get = (
             (self.fmu.setFloat64, self.fmu.getFloat64) if self.is_fmi3 else (self.fmu.setReal, self.fmu.getReal)
         )
-        # Another number of states is for the campaign to say.
+        # The campaign's process reports a wrong number of states.
         if x is not None and len(x) == len(self.start):
             self._set_start(x)
         self._initialise()
@@ -101,12 +101,12 @@ class Unit:
         return [float(value) for value in self._get(self.states)]
 
     def advance(self, u: list[float]) -> tuple[list[float] | None, str]:
-        """Hold the inputs over one control step; return the state, or None and why it failed."""
+        """Hold the inputs over one control step; return the state, or None and the reason of the failure."""
         try:
             if u:
                 self._set(self.inputs, u)
             for _ in range(self.substeps):
-                # A product, not a sum: the time of a long run is exact.
+                # A product, not a sum, so that the time of a long simulation is exact.
                 ended = self.fmu.doStep(self.steps * self.step, self.step)
                 self.steps += 1
                 if ended is not None and ended[1]:
@@ -121,7 +121,7 @@ class Unit:
         if fmu is None:
             return
         if self.initialised:
-            with contextlib.suppress(Exception):  # it may have failed before
+            with contextlib.suppress(Exception):  # the FMU may have failed before
                 fmu.terminate()
         self.initialised = False
         with contextlib.suppress(Exception):
@@ -135,7 +135,7 @@ def _set_parameter(fmu: Any, variable: Any, value: Any) -> None:
 
 
 def serve(requests: IO[str], answers: IO[str]) -> None:
-    """Do what each line says, until there are no more."""
+    """Answer each request, until there are no more."""
     unit = Unit(**json.loads(requests.readline()))
     acts: dict[str, Callable[..., Any]] = {"begin": unit.begin, "advance": unit.advance, "free": unit.free}
     for line in requests:
@@ -149,21 +149,21 @@ def serve(requests: IO[str], answers: IO[str]) -> None:
 
 
 def _watch(parent: int) -> None:
-    """Leave with the campaign, also out of a step that does not end."""
+    """End this process when the campaign's process ends, even during a step that does not end."""
     while os.getppid() == parent:
         time.sleep(_POLL)
     os._exit(1)
 
 
 def main() -> None:
-    """Serve the process that started this one; what an FMU reads and prints must not get between."""
+    """Serve the process that started this one. What an FMU reads and prints is kept apart from requests and answers."""
     threading.Thread(target=_watch, args=(int(sys.argv[1]),), daemon=True).start()
     requests, answers = os.fdopen(os.dup(0), encoding="utf-8"), os.fdopen(os.dup(1), "w", encoding="utf-8")
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     os.dup2(2, 1)
     serve(requests, answers)
-    # An FMU that is unloaded badly could still crash, and this process has nothing left to do.
+    # An FMU could still crash when it is unloaded, so the process ends without unloading it.
     os._exit(0)
 
 

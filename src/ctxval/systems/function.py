@@ -1,4 +1,4 @@
-"""A function that runs a whole execution, as the true system."""
+"""A function that runs a complete execution, as the true system."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from ctxval.errors import ExecutionError, InputError
 class Function:
     """A plain function ``(controller, task) -> trajectory`` as the true system: a robot's own driver, a simulator.
 
-    A function of one step, ``(x, u) -> x_next``, is a :class:`Simulated` system instead.
+    For a function of one step, ``(x, u) -> x_next``, use a :class:`Simulated` system.
 
     Args:
-        execute: runs the closed loop. It returns a trajectory, or the states ``(H + 1, n)`` and the inputs
-            ``(H, m)``. What it raises is the reason of a failed execution.
-        batched: whether it takes a batch of tasks, and returns ``(..., H + 1, n)`` and ``(..., H, m)``.
+        execute: function that runs the closed loop. It returns a trajectory, or the states ``(H + 1, n)`` and the
+            inputs ``(H, m)``. If it raises an exception, the execution has failed for that reason.
+        batched: whether the function takes a batch of tasks, and returns ``(..., H + 1, n)`` and ``(..., H, m)``.
 
     Raises:
-        InputError: it is no function.
+        InputError: if ``execute`` is not a function.
     """
 
     def __init__(self, execute: Callable[[Controller, Task], Any], *, batched: bool = False) -> None:
@@ -39,7 +39,7 @@ class Function:
         """Run one task, or a batch.
 
         Raises:
-            ExecutionError: what the function returned is no trajectory of this task.
+            ExecutionError: if the function does not return a trajectory of this task.
         """
         returned = self.function(controller, task)
         if isinstance(returned, Trajectory):

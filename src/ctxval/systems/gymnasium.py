@@ -26,27 +26,29 @@ StateSetter = Callable[[Any, Array], None]
 class Gymnasium:
     """A gymnasium environment with continuous actions as the true system.
 
-    An execution resets the environment with its seed, sets the task's initial state and steps the closed loop. MuJoCo
-    environments work as they are: their state is ``(qpos, qvel)``. Others need ``get_state`` and ``set_state``.
+    An execution resets the environment with its seed, sets the task's initial state and runs the closed loop. MuJoCo
+    environments need no further arguments: their state is ``(qpos, qvel)``. Other environments need ``get_state`` and
+    ``set_state``.
 
-    Actions go to the environment as the controller gave them, in the type of its action space: it is the environment
-    that clips them, as MuJoCo does to the control range. The trajectory keeps what the controller asked for.
+    The actions of the controller go to the environment unchanged, in the type of its action space. The environment
+    clips them, as MuJoCo does to the control range; the trajectory keeps the unclipped inputs.
 
-    A terminated or truncated episode ends the trajectory: the rest is NaN and ``ended`` says why, so that a campaign
-    records a failed trial. A simulation that MuJoCo warns of (an unstable state) has ended too, although MuJoCo resets
-    it silently.
+    If the environment terminates or truncates the episode, the trajectory ends: its remaining values are NaN and
+    ``ended`` gives the reason, so that a campaign records a failed trial. A warning of MuJoCo, such as an unstable
+    state, ends the trajectory too, although MuJoCo silently resets the simulation and continues.
 
     Args:
         environment: an id such as ``"Reacher-v5"``, or a function that makes an environment.
-        get_state: ``environment -> x``, of the environment without its wrappers; ``(qpos, qvel)`` by default.
-        set_state: ``(environment, x)``, likewise; by default the first of x go to MuJoCo's ``set_state``.
-        dt: seconds in one step; by default what the environment says.
-        seed: of every reset, so that executions repeat; None for another one each time.
-        ignore_termination: go on although the environment says that the episode has ended.
-        options: passed on to ``gymnasium.make`` or to the function, such as ``max_episode_steps=-1``.
+        get_state: function ``environment -> x`` of the environment without wrappers; ``(qpos, qvel)`` by default.
+        set_state: function ``(environment, x)`` of the environment without wrappers; by default the first components
+            of x go to MuJoCo's ``set_state``.
+        dt: length of a step, seconds; by default that of the environment.
+        seed: seed of every reset, so that executions are repeatable; None takes another one each time.
+        ignore_termination: continue although the environment reports the end of the episode.
+        options: further arguments for ``gymnasium.make`` or for the function, such as ``max_episode_steps=-1``.
 
     Raises:
-        InputError: gymnasium is not installed, or the environment cannot be made or used.
+        InputError: if gymnasium is not installed, or the environment cannot be made or used.
     """
 
     def __init__(
@@ -62,19 +64,19 @@ class Gymnasium:
     ) -> None:
         self.environment = environment
         self.options = options
-        # Environments are made again later, when the current folder may be another.
+        # Environments may be made again after the current folder has changed.
         self._files = {name: os.path.abspath(value) for name, value in options.items() if _is_relative_file(value)}
         self.get_state, self.set_state = get_state, set_state
         self.seed = seed
         self.ignore_termination = ignore_termination
         first = self._made()
-        self._idle = [first]  # each execution takes one, so that threads do not share any
+        self._idle = [first]  # each execution takes its own, so that threads do not share one
         self.inputs = _action_size(first)
         self.dt = _time_step(first, dt)
         if (get_state is None or set_state is None) and not _is_mujoco(first.unwrapped):
             raise InputError(
-                f"{first.unwrapped} has no MuJoCo state: give get_state=(environment -> x) and "
-                "set_state=(environment, x)."
+                f"{first.unwrapped} has no MuJoCo state; give the functions get_state(environment) -> x and "
+                "set_state(environment, x)."
             )
 
     def describe(self) -> dict[str, Any]:
@@ -83,7 +85,7 @@ class Gymnasium:
         return {name: getattr(self, name) for name in fields}
 
     def state(self) -> Array:
-        """Return the state ``(n,)`` after a reset: how many states there are, and in which order of magnitude."""
+        """Return the state ``(n,)`` after a reset, to see the number of states and their magnitudes."""
         environment = self._idle.pop() if self._idle else self._made()
         environment.reset(seed=self.seed)
         state = self._read(environment.unwrapped)
@@ -94,8 +96,8 @@ class Gymnasium:
         """Run the closed loop from the task's initial state over its horizon.
 
         Raises:
-            InputError: the task's dt is not the environment's, or its initial state cannot be set.
-            ShapeError: states or inputs are not as many as the environment's.
+            InputError: if the task's dt is not the environment's, or its initial state cannot be set.
+            ShapeError: if the number of states or inputs differs from the environment's.
         """
         require_one(task)
         require_time_step(task, self.dt, "that of the environment")
@@ -104,8 +106,8 @@ class Gymnasium:
             self._start(environment, task)
             trajectory = run_episode(lambda u: self._advance(environment, u), controller, task, self.inputs)
         except BaseException:
-            with contextlib.suppress(Exception):  # what failed first is the reason
-                environment.close()  # nobody knows what state it is in
+            with contextlib.suppress(Exception):  # the first exception is the reason to report
+                environment.close()  # its state is unknown, so it is not used again
             raise
         self._idle.append(environment)
         return trajectory
@@ -123,7 +125,7 @@ class Gymnasium:
         if not isinstance(self.environment, str):
             return self.environment(**{**self.options, **self._files})
         try:
-            # The passive checker warns of actions beyond the action space, which the environment is asked to clip.
+            # The passive checker would warn of actions outside the action space, but the environment clips them.
             return gymnasium.make(self.environment, **{"disable_env_checker": True, **self.options, **self._files})
         except (gymnasium.error.Error, ImportError, TypeError, AttributeError) as error:
             raise InputError(f"the environment {self.environment!r} cannot be made: {error}") from error
@@ -141,7 +143,7 @@ class Gymnasium:
     def _read(self, bare: Any) -> Array:
         if self.get_state is None:
             return np.concatenate([bare.data.qpos, bare.data.qvel])
-        # A copy: an environment may hand out the array that it goes on writing into.
+        # A copy, because an environment may return an array that it changes later.
         return np.array(as_floats("the state of the environment", self.get_state(bare)))
 
     def _advance(self, environment: Any, u: Array) -> tuple[Array, str]:
@@ -156,7 +158,7 @@ class Gymnasium:
         return state, f"the environment {'terminated' if terminated else 'truncated'} the episode"
 
     def __getstate__(self) -> dict[str, Any]:
-        # Environments do not go to other processes; they are made there again.
+        # Environments cannot be pickled; another process makes its own.
         return {**vars(self), "_idle": []}
 
     def __repr__(self) -> str:
@@ -164,7 +166,7 @@ class Gymnasium:
 
 
 def _is_relative_file(value: object) -> bool:
-    """Return whether an option is a file as seen from the current folder; gymnasium has models of its own by name."""
+    """Return whether an option is the relative path of a file; other names stand for models of gymnasium itself."""
     return isinstance(value, str) and value.startswith(("./", "../")) and os.path.exists(value)
 
 
@@ -197,7 +199,7 @@ def _time_step(environment: Any, given: float | None) -> float:
 
 
 def _mujoco_warning(bare: Any) -> str:
-    """Return the first kind of warning since the reset; empty without one, and for what is not MuJoCo."""
+    """Return the first kind of warning since the reset; empty if there is none, or if this is not MuJoCo."""
     counts = getattr(getattr(getattr(bare, "data", None), "warning", None), "number", None)
     if counts is None or not np.any(counts):
         return ""

@@ -1,4 +1,4 @@
-"""Discrete steps of continuous dynamics."""
+"""Discrete-time steps of continuous-time dynamics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def rk4(derivative: Derivative, dt: float) -> Callable[[Array, Array], Array]:
     """Return the step ``(x, u) -> x_next`` of the classical Runge-Kutta method of order 4.
 
     Args:
-        derivative: ``(x, u) -> dx/dt``, shapes ``(..., n), (..., m) -> (..., n)``.
+        derivative: function ``(x, u) -> dx/dt``, shapes ``(..., n), (..., m) -> (..., n)``.
         dt: length of the step, seconds; the input is held over it.
     """
 

@@ -1,4 +1,4 @@
-"""A system that people execute."""
+"""A system whose tasks people execute by hand."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from ctxval.errors import ExecutionError, InputError
 
 @part()
 class Manual:
-    """A system that only people can execute: take tasks with ``campaign.ask()``, report with ``campaign.tell()``.
+    """A system whose tasks people execute: get a task with ``campaign.ask()``, report it with ``campaign.tell()``.
 
     Attributes:
-        states, inputs: names of the components and their units, for files.
-        dt: seconds in a step.
+        states, inputs: names of the components with their units, for files.
+        dt: length of a step, seconds.
 
     Raises:
-        InputError: there is no state, a name or a unit is no text, or dt is not positive.
+        InputError: if there is no state, a name or a unit is not a text, or dt is not positive.
     """
 
     manual = True
-    """Nothing can be executed from here."""
+    """Mark of a system that a program cannot execute."""
 
     def __init__(self, *, states: Mapping[str, str], inputs: Mapping[str, str], dt: float) -> None:
         self.states, self.inputs = dict(states), dict(inputs)
@@ -40,14 +40,14 @@ class Manual:
         self.dt = float(dt)
 
     def execute(self, controller: Controller, task: Task) -> NoReturn:
-        """Refuse.
+        """Refuse to execute a task, because only people can do so.
 
         Raises:
             ExecutionError: always.
         """
         raise ExecutionError(
-            "a manual system is executed by people: take tasks with campaign.ask() and report what happened with "
-            "campaign.tell(), instead of campaign.run()."
+            "a manual system is executed by people; get a task with campaign.ask() and report its result with "
+            "campaign.tell() instead of campaign.run()."
         )
 
     def __repr__(self) -> str:

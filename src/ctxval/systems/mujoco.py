@@ -20,29 +20,31 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 
 _SAME_POSITION = 1e-6
-"""Metres by which the given position of a site may miss the actual one in an initial state."""
+"""Largest difference in metres between the given and the actual position of a site in an initial state."""
 
 
 @part(files=("mjcf",))
 class MuJoCo:
-    """An MJCF model as the true system, with feedback, whole batches of closed loops at once.
+    """An MJCF model as the true system, with feedback, for whole batches of closed loops at once.
 
-    The state is ``(qpos, qvel)``, then the chosen coordinates of each chosen site. An execution starts from the
-    model's defaults (activations, mocap bodies, ...) at the task's qpos and qvel. Inputs are MuJoCo's ``ctrl``, held
-    over a step; MuJoCo clamps them to a ``ctrlrange``, while the trajectory keeps what the controller asked for.
+    The state is ``(qpos, qvel)``, followed by the selected coordinates of each selected site. An execution starts from
+    the model's defaults (activations, mocap bodies, ...) at the task's qpos and qvel. Inputs are MuJoCo's ``ctrl``,
+    held over a step. MuJoCo clamps them to a ``ctrlrange``; the trajectory keeps the unclamped inputs.
 
-    A simulation that MuJoCo warns of (unstable state or acceleration, full contact buffer) has failed, although MuJoCo
-    resets it silently and goes on: its states are NaN from there on, and the trajectory's ``ended`` names the warning.
+    A warning of MuJoCo (unstable state or acceleration, full contact buffer) means that the simulation has failed,
+    although MuJoCo silently resets it and continues: its states are NaN from that step on, and the trajectory's
+    ``ended`` names the warning.
 
     Args:
         mjcf: the model as XML text, or the path of its file.
-        substeps: MuJoCo steps in one control step; a task's dt is the model's timestep times this.
-        sites: names of sites whose positions belong to the state, such as an end effector.
-        axes: which world coordinates of the sites, letters of ``"xyz"``.
-        threads: what a batch is spread over (MuJoCo 4 or later); the results do not depend on it.
+        substeps: number of MuJoCo steps in one control step; a task's dt must be the model's timestep times this.
+        sites: names of sites whose positions are part of the state, such as an end effector.
+        axes: world coordinates of the sites that are part of the state, letters of ``"xyz"``.
+        threads: number of threads for a batch (MuJoCo 4 or later); the results do not depend on it.
 
     Raises:
-        InputError: MuJoCo is not installed, the model cannot be read or compiled, or a value cannot be used.
+        InputError: if MuJoCo is not installed, the model cannot be read or compiled, or a value cannot be used.
+        UnknownNameError: if the model has no site of a given name.
     """
 
     batched = True
@@ -65,13 +67,13 @@ class MuJoCo:
 
     @property
     def dt(self) -> float:
-        """Seconds in one control step."""
+        """Length of a control step, seconds."""
         return float(self._model.opt.timestep) * self.substeps
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this system in a store."""
         digest = hashlib.sha256(self._mjcf.encode()).hexdigest()[:16]
-        masses = self._model.body_mass.tolist()  # those of meshes are not in the text
+        masses = self._model.body_mass.tolist()  # because the masses of meshes are not in the text
         return {
             "mjcf": digest,
             "mass": masses,
@@ -81,10 +83,14 @@ class MuJoCo:
         }
 
     def state(self, qpos: ArrayLike, qvel: ArrayLike | None = None) -> Array:
-        """Return the whole state at rest, or at ``qvel (..., nv)``, in configurations ``qpos (..., nq)``.
+        """Return the complete states for configurations and velocities.
+
+        Args:
+            qpos: the configurations, shape ``(..., nq)``.
+            qvel: the velocities, shape ``(..., nv)``; zero by default.
 
         Raises:
-            InputError: a value is not a finite number, or has the wrong shape.
+            InputError: if a value is not a finite number, or has the wrong shape.
         """
         positions = require_shape("qpos", as_finite("qpos", qpos), (self._model.nq,))
         velocities = np.zeros(self._model.nv) if qvel is None else as_finite("qvel", qvel)
@@ -100,8 +106,9 @@ class MuJoCo:
         """Run the closed loop from the task's initial state over its horizon.
 
         Raises:
-            InputError: the task's dt is not that of a control step, or its initial state has a site elsewhere.
-            ShapeError: states or inputs are not as many as the model's.
+            InputError: if the task's dt is not that of a control step, or the positions of sites in its initial state
+                do not belong to its qpos.
+            ShapeError: if the number of states or inputs differs from the model's.
         """
         if not np.isclose(task.dt, self.dt, rtol=1e-9, atol=0):
             raise InputError(
@@ -150,7 +157,7 @@ class MuJoCo:
 
 
 class _Execution:
-    """The simulations of a batch of tasks, as a step function with a memory."""
+    """The simulations of a batch of tasks as a step function; it keeps their state between steps."""
 
     def __init__(self, system: MuJoCo, simulations: _Simulations) -> None:
         self.system, self.simulations = system, simulations
@@ -159,7 +166,7 @@ class _Execution:
         self.failure = ""
 
     def step(self, x: Array, u: Array) -> Array:
-        """Apply inputs ``(..., m)`` for one control step; return the states ``(..., n)``, NaN where one failed."""
+        """Apply inputs ``(..., m)`` for one control step; return states ``(..., n)``, NaN if a simulation failed."""
         ctrl = self.simulations.ctrl
         if u.shape[-1] != ctrl.shape[1]:
             raise ShapeError(f"the controller must return the model's {ctrl.shape[1]} inputs, got {u.shape[-1]}.")
@@ -182,7 +189,7 @@ class _Execution:
 
 
 class _Simulations(Protocol):
-    """Simulations of one model, one a row: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``."""
+    """Simulations of one model, one in each row: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``."""
 
     qpos: Array
     qvel: Array
@@ -191,7 +198,7 @@ class _Simulations(Protocol):
 
     @property
     def warnings(self) -> Rows:
-        """How often MuJoCo warned, by simulation and kind of warning."""
+        """The number of MuJoCo's warnings, by simulation and kind of warning."""
 
     def locate(self) -> None:
         """Compute the sites' positions."""
@@ -208,7 +215,7 @@ def _simulations(model: Any, count: int, threads: int) -> _Simulations:
 
 
 class _Batch:
-    """MuJoCo's own batch, since its version 4."""
+    """MuJoCo's own batch, from its version 4 on."""
 
     def __init__(self, model: Any, count: int, threads: int) -> None:
         from mujoco import mjtStage
@@ -239,7 +246,7 @@ class _Loop:
         import mujoco
 
         self.model, self.data = model, mujoco.MjData(model)
-        # Everything that the next step depends on, the constraint solver's warm start too.
+        # Everything that the next step depends on, including the warm start of the constraint solver.
         self.kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
         row = np.empty(mujoco.mj_stateSize(model, self.kind))
         mujoco.mj_getState(model, self.data, row, self.kind)
@@ -274,7 +281,7 @@ class _Loop:
                 self.site_positions[i] = data.site_xpos
             if data.warning.number.any():
                 self.warnings[i] = data.warning.number
-                mujoco.mj_resetData(model, data)  # the others have not been warned of
+                mujoco.mj_resetData(model, data)  # so that the warning does not count for the other simulations
 
 
 def _compiled(mjcf: str | Path) -> tuple[str, Any]:

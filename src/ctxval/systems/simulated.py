@@ -16,8 +16,11 @@ class Simulated:
     """A step function, or a model, as the true system.
 
     Args:
-        step: ``(x, u) -> x_next``, or an object with such a ``step`` that takes batches.
-        vectorized: whether a plain function takes batches ``(..., n)``, ``(..., m)`` too.
+        step: function ``(x, u) -> x_next``, or an object with such a method ``step`` that takes batches.
+        vectorized: whether a plain function takes whole batches ``(..., n)`` and ``(..., m)``.
+
+    Raises:
+        InputError: if ``step`` is neither a function nor a model.
     """
 
     batched = True

@@ -26,33 +26,36 @@ from ctxval.systems.episode import require_one
 from ctxval.systems.supervised import run_supervised
 
 _TIMES = 0.01
-"""By how much the times of a trajectory may miss the task's, in steps."""
+"""Largest difference between the times of a trajectory and those of its task, in steps."""
 
 _TAIL = 4096
-"""Bytes at the end of stderr in which its last line is looked for."""
+"""Number of bytes at the end of stderr that are searched for its last line."""
 
 
 @part(runs_code=True, folder="folder")
 class Subprocess:
-    """A command that executes one task as the true system.
+    """A command that executes one task, as the true system.
 
-    Every execution has a fresh folder, with ``task.json`` and the controller as ``controller.json`` and
-    ``controller.npz`` (see :mod:`ctxval.core.exchange`). The command is run with that folder as its last argument, and
-    writes ``trajectory.npz`` (times, states, inputs, perhaps ended) or ``trajectory.csv`` (columns ``t, x0, ..., u0,
-    ...``, no inputs in the last row) into it, as a regular file. It runs in the folder that was the current one when
-    this object was made. An exit status other than 0 is a failed execution, whose reason is the
-    last line of stderr. Whatever the command started is ended with it, and with this process, however that ends; on
-    Linux also what left its process group.
+    Every execution has a new folder with ``task.json`` and the controller as ``controller.json`` and
+    ``controller.npz`` (see :mod:`ctxval.core.exchange`). The command gets the path of that folder as its last argument.
+    It writes ``trajectory.npz`` (times, states, inputs, optionally ended) or ``trajectory.csv`` (columns
+    ``t, x0, ..., u0, ...``, no inputs in the last row) into that folder, as a regular file. The command runs in the
+    folder that was the current folder when this object was made.
+
+    If the exit status is not 0, the execution has failed, and the last line of stderr is the reason. All processes that
+    the command started end with it, and also if this process ends in any way; on Linux this includes processes that
+    left its process group.
 
     Args:
-        command: the program and its arguments; a string is split as a shell would. No shell runs it.
-        timeout: seconds after which the command and all that it started are killed.
-        states, inputs: names and units for the files.
-        keep: a folder in which the folders of all executions stay, for a look at what went wrong.
-        folder: where files that the command names are sought; the current folder if they are not there, or by default.
+        command: the program and its arguments; a string is split like a shell does. No shell runs the command.
+        timeout: seconds after which the command and all processes that it started are killed.
+        states, inputs: names of the states and inputs with their units, for the files.
+        keep: a folder in which the folders of all executions are kept, to examine failures.
+        folder: folder in which the files that the command names are searched first; by default, and if they are not
+            there, the current folder is used.
 
     Raises:
-        InputError: the program does not exist, or the timeout is not positive.
+        InputError: if the program does not exist, or the timeout is not positive.
     """
 
     def __init__(
@@ -74,7 +77,7 @@ class Subprocess:
         self.timeout = timeout
         self.states = None if states is None else dict(states)
         self.inputs = None if inputs is None else dict(inputs)
-        # Absolute: what runs in this process may change the current folder.
+        # Absolute, because other code in this process may change the current folder.
         self.keep = None if keep is None else Path(keep).absolute()
         self._home = Path.cwd()
 
@@ -86,8 +89,8 @@ class Subprocess:
         """Run the command on one task.
 
         Raises:
-            InputError: the controller cannot be written to a file.
-            ExecutionError: the command fails, takes too long, or leaves no trajectory of this task.
+            InputError: if the controller cannot be written to a file.
+            ExecutionError: if the command fails, takes too long, or writes no trajectory of this task.
         """
         require_one(task)
         with self._folder() as folder:
@@ -95,7 +98,7 @@ class Subprocess:
             for kind in ("json", "npz"):
                 path = folder / f"controller.{kind}"
                 write_controller(path, controller, dt=task.dt, states=self.states, inputs=self.inputs)
-            # On another machine it may not be there.
+            # On another machine the folder may not exist.
             _run([*self._located, str(folder)], self._home if self._home.is_dir() else None, folder, self.timeout)
             return _of_task(_trajectory(folder, task), task)
 
@@ -114,7 +117,7 @@ class Subprocess:
 
 
 def _located(command: Sequence[str], folder: Path) -> list[str]:
-    """Return a command with the whole paths of files in the folder; a program by its name alone stays as it is."""
+    """Return a command with absolute paths of its files in the folder; a program name without a path stays as it is."""
     return [
         str(folder / part) if (i or os.path.dirname(part)) and (folder / part).is_file() else part
         for i, part in enumerate(command)
@@ -122,7 +125,7 @@ def _located(command: Sequence[str], folder: Path) -> list[str]:
 
 
 def _run(command: Sequence[str], home: Path | None, folder: Path, timeout: float) -> None:
-    # Output goes to files: a pipe that a grandchild keeps open would make us wait for it.
+    # Output goes to files, because a grandchild that keeps a pipe open would make us wait for it.
     with (folder / "stdout.txt").open("wb") as stdout, (folder / "stderr.txt").open("w+b") as stderr:
         status = run_supervised(command, home, stdout, stderr, timeout)
         if status is None:
@@ -133,7 +136,7 @@ def _run(command: Sequence[str], home: Path | None, folder: Path, timeout: float
 
 
 def signal_name(number: int) -> str:
-    """Return a signal's name."""
+    """Return the name of a signal."""
     try:
         return signal.Signals(number).name
     except ValueError:
@@ -141,7 +144,7 @@ def signal_name(number: int) -> str:
 
 
 def _last_line(file: IO[bytes]) -> str:
-    """Return the last line of a file that is open: under its name there may be something else by now."""
+    """Return the last line of an open file; it is not opened again, because its name may now stand for another file."""
     file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
     lines = [line.strip() for line in file.read().decode("utf-8", "replace").splitlines() if line.strip()]
     return lines[-1][:300] if lines else ""
@@ -160,7 +163,11 @@ def _trajectory(folder: Path, task: Task) -> Trajectory:
 
 
 def _of_task(trajectory: Trajectory, task: Task) -> Trajectory:
-    """Return the trajectory if it is one of this task."""
+    """Return a trajectory after a check that it has the shape and the times of this task.
+
+    Raises:
+        ExecutionError: if the trajectory is complete and its shape or its times differ.
+    """
     if trajectory.ended != COMPLETE:
         return trajectory
     n = task.initial_state.size

@@ -1,6 +1,6 @@
-"""A command, and the end of all that it starts: after it, at a timeout, and with the process that started it.
+"""Commands whose child processes all end: with the command, at a timeout, and with the process that started it.
 
-A command that goes on after ``kill -9`` of its campaign would move a rig beside its own repetition.
+If a command went on after ``kill -9`` of its campaign, it would move a rig at the same time as its own repetition.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ from ctxval.errors import ExecutionError
 
 _PROGRAM = Path(__file__).absolute().with_name("supervisor.py")
 
-_PATIENCE = 10.0
-"""Seconds that a supervisor has to end its command, before it is killed itself."""
+_GRACE_PERIOD = 10.0
+"""Seconds that a supervisor has to end its command before it is killed itself."""
 
 _LONGEST = 3600.0
-"""Seconds that are waited at once: a call of the system takes no timeout of years."""
+"""Largest timeout of one system call in seconds; the operating system does not take a timeout of years."""
 
 
 def run_supervised(
     command: Sequence[str], folder: Path | None, stdout: IO[bytes], stderr: IO[bytes], timeout: float
 ) -> int | None:
-    """Run a command, and end all that it started, however this call ends.
+    """Run a command, and end all processes that it started, however this call ends.
 
     Args:
         command: the program and its arguments.
-        folder: it is run there; None for the current one.
-        stdout, stderr: open files.
-        timeout: seconds.
+        folder: the folder in which the command runs; None for the current folder.
+        stdout, stderr: open files for the output of the command.
+        timeout: seconds after which the command is killed.
 
     Returns:
-        Its status, negative for a signal; None if it did not end in time and was killed.
+        The exit status, negative for a signal; None if the command did not end in time and was killed.
 
     Raises:
-        ExecutionError: it cannot be started, or its supervisor was killed.
+        ExecutionError: if the command cannot be started, or its supervisor was killed.
     """
     if os.name != "posix":
         return _run_alone(command, folder, stdout, stderr, timeout)
     descriptors = stdout.fileno(), stderr.fileno()
-    # -I: the folder of the program has modules named as those of others. A session of its own: Ctrl-C is for the
-    # campaign, which ends after what is running.
+    # -I, because modules in the folder of the program have the same names as other modules. A session of its own,
+    # because Ctrl-C is for the campaign, which ends after the running executions.
     program = [sys.executable, "-I", "-S", str(_PROGRAM), str(os.getpid()), *map(str, descriptors), *command]
     supervisor = _started(program, cwd=folder, pass_fds=descriptors, start_new_session=True)
     assert supervisor.stdout is not None
@@ -58,7 +58,7 @@ def run_supervised(
         if len(line) == 2:
             raise ExecutionError(f"the command cannot be started: {os.strerror(int(line[1]))}")
         child = int(line[0]) if line else 0
-        if not _says_something(supervisor.stdout, timeout):
+        if not _readable(supervisor.stdout, timeout):
             return None
         status = supervisor.stdout.readline().strip()
         if not status.lstrip(b"-").isdigit():
@@ -70,7 +70,7 @@ def run_supervised(
 
 def _started(program: Sequence[str], **options: object) -> subprocess.Popen[bytes]:
     try:
-        # Unbuffered: a line that was read ahead could not be waited for.
+        # Unbuffered, because select does not see a line that was read ahead.
         return subprocess.Popen(  # type: ignore[call-overload, no-any-return]
             program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, bufsize=0, **options
         )
@@ -78,7 +78,7 @@ def _started(program: Sequence[str], **options: object) -> subprocess.Popen[byte
         raise ExecutionError(f"the command cannot be started: {error}") from error
 
 
-def _says_something(stdout: IO[bytes], timeout: float) -> bool:
+def _readable(stdout: IO[bytes], timeout: float) -> bool:
     deadline = time.monotonic() + timeout
     with selectors.DefaultSelector() as selector:
         selector.register(stdout, selectors.EVENT_READ)
@@ -89,7 +89,7 @@ def _says_something(stdout: IO[bytes], timeout: float) -> bool:
 
 
 def _end(supervisor: subprocess.Popen[bytes], child: int) -> None:
-    """Have the supervisor end what is left; kill what can be found of it where it does not."""
+    """Make the supervisor end the remaining processes; if it does not, kill it and the command's process group."""
     assert supervisor.stdin is not None
     assert supervisor.stdout is not None
     with contextlib.suppress(OSError):
@@ -97,8 +97,8 @@ def _end(supervisor: subprocess.Popen[bytes], child: int) -> None:
     with contextlib.suppress(OSError):
         supervisor.stdin.close()
     try:
-        supervisor.wait(_PATIENCE)
-    except subprocess.TimeoutExpired:  # somebody stopped it
+        supervisor.wait(_GRACE_PERIOD)
+    except subprocess.TimeoutExpired:  # e.g. somebody stopped the supervisor by SIGSTOP
         supervisor.kill()
         supervisor.wait()
     finally:
@@ -111,7 +111,7 @@ def _end(supervisor: subprocess.Popen[bytes], child: int) -> None:
 def _run_alone(
     command: Sequence[str], folder: Path | None, stdout: IO[bytes], stderr: IO[bytes], timeout: float
 ) -> int | None:
-    """Run a command where there are no process groups: what it starts may outlive it."""
+    """Run a command on a system without process groups; processes that it starts may outlive it."""
     try:
         process = subprocess.Popen(command, cwd=folder, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr)
     except OSError as error:

@@ -1,13 +1,14 @@
-# ruff: noqa: SIM105  -- contextlib takes as long to import as all the rest
-"""The process that runs one command and ends all that it started; :mod:`ctxval.systems.supervised` starts this file.
+# ruff: noqa: SIM105  -- importing contextlib takes as long as all other imports
+"""The process that runs one command and ends all processes of it; :mod:`ctxval.systems.supervised` starts this file.
 
 A command may start processes that leave its group (``setsid``) or lose their parent. On Linux this process is their
-reaper: whoever loses its parent becomes its child, so that none can hide from it. It has no other children, which the
-process of a campaign may have. Nothing of ctxval is imported, and little else: it is started for every execution.
+reaper: a process that loses its parent becomes a child of this one, so that none escapes. This process has no other
+children; the campaign's process may have some, so it cannot be the reaper. Nothing of ctxval is imported, and little
+else, because this file is started for every execution.
 
-Its arguments are the process that it works for, the descriptors of the command's stdout and stderr, and the command.
-It writes lines: the command's process, and when nothing of it runs any more its status, negative for a signal.
-Anything on stdin, or its end, means that the command must be ended.
+Its arguments are the id of the campaign's process, the descriptors of the command's stdout and stderr, and the command.
+It writes two lines: the id of the command's process, and, after all its processes have ended, the exit status, negative
+for a signal. Any input on stdin, or its end, means that the command must be ended.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ if TYPE_CHECKING:
 _LINUX = sys.platform.startswith("linux")
 _PR_SET_CHILD_SUBREAPER = 36
 
-_LOOK = 0.5
-"""Seconds between two looks whether the campaign is still there: a fork of it may hold our stdin open."""
+_POLL = 0.5
+"""Seconds between two checks whether the campaign still runs; a fork of it may hold our stdin open."""
 
 _WAIT = 0.005
-"""Seconds between two looks whether what was killed has gone."""
+"""Seconds between two checks whether the killed processes have ended."""
 
-_LOOKS = 200
-"""Looks that those are given who cannot be killed, as they belong to another user."""
+_ATTEMPTS = 200
+"""Number of attempts if only processes are left that cannot be killed because they belong to another user."""
 
 
 def main() -> None:
@@ -53,7 +54,7 @@ def main() -> None:
     _say(str(child))
     statuses: dict[int, int] = {}
     while not _reap(statuses) and child not in statuses and os.getppid() == int(parent):
-        if 0 in (ready := select.select([0, woken], [], [], _LOOK)[0]):
+        if 0 in (ready := select.select([0, woken], [], [], _POLL)[0]):
             break
         if ready:
             os.read(woken, 4096)
@@ -62,7 +63,7 @@ def main() -> None:
 
 
 def _spawn(command: list[str], stdout: int, stderr: int) -> int:
-    """Start the command in a group of its own; return its process."""
+    """Start the command in its own process group; return the id of its process."""
     files: list[tuple[Any, ...]] = [(os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0)]
     files += [(os.POSIX_SPAWN_DUP2, stdout, 1), (os.POSIX_SPAWN_DUP2, stderr, 2)]
     files += [(os.POSIX_SPAWN_CLOSE, stdout), (os.POSIX_SPAWN_CLOSE, stderr)]
@@ -80,7 +81,7 @@ def _say(line: str) -> None:
 
 
 def _reap(statuses: dict[int, int]) -> bool:
-    """Collect the children that have ended; return whether there are no others."""
+    """Collect the children that have ended; return whether no child is left."""
     try:
         while True:
             pid, status = os.waitpid(-1, os.WNOHANG)
@@ -92,12 +93,12 @@ def _reap(statuses: dict[int, int]) -> bool:
 
 
 def _end(child: int, statuses: dict[int, int]) -> None:
-    """Kill all descendants, again and again: those of whoever dies become our children."""
+    """Kill all descendants repeatedly, because the children of a killed process become children of this one."""
     spared: set[int] = set()
-    looks = _LOOKS
-    while not _reap(statuses) and looks:
+    attempts = _ATTEMPTS
+    while not _reap(statuses) and attempts:
         found = _descendants(os.getpid()) if _LINUX else {-child}
-        looks -= found <= spared
+        attempts -= found <= spared
         for pid in found:
             try:
                 os.kill(pid, signal.SIGKILL)
@@ -110,7 +111,7 @@ def _end(child: int, statuses: dict[int, int]) -> None:
         try:
             os.killpg(child, signal.SIGKILL)
         except OSError:
-            pass  # there is nothing left of it
+            pass  # no process of the group is left
 
 
 def _descendants(ancestor: int) -> set[int]:
@@ -119,10 +120,10 @@ def _descendants(ancestor: int) -> set[int]:
     for name in filter(str.isdigit, os.listdir("/proc")):
         try:
             with open(f"/proc/{name}/stat", "rb") as file:
-                # After the name, which may have blanks and brackets in it: state, parent.
+                # The state and the parent follow the name, which may contain blanks and brackets.
                 parent = int(file.read().rpartition(b")")[2].split()[1])
         except OSError:
-            continue  # it has gone
+            continue  # the process has ended
         children.setdefault(parent, []).append(int(name))
     found: set[int] = set()
     waiting = [ancestor]
