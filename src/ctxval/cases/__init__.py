@@ -1,4 +1,4 @@
-"""The paper's systems, each readable as a script on the public interface."""
+"""The paper's systems. Each module reads like a script that uses the public interface."""
 
 from __future__ import annotations
 

@@ -25,9 +25,9 @@ from ctxval.errors import UnknownNameError
 MODELS = ("fnn", "gp", "linear")
 """The paper's three: a feedforward network of 2 x 8 ReLU units, a Gaussian process, a linear model."""
 
-# Reacher's, as in Gymnasium: the links' lengths, thickness and density (0.1 m each, the fingertip 0.01 m beyond), the
-# joints' armature and damping, the elbow's range, the motors' gear and range, gravity, integrator and timestep.
-# Its walls and its target are left out, as nothing ever touches them; the site marks its fingertip.
+# The values are those of Gymnasium's Reacher: the links' lengths, thickness and density (0.1 m each, the fingertip
+# 0.01 m beyond), the joints' armature and damping, the elbow's range, the motors' gear and range, gravity, integrator
+# and timestep. Reacher's walls and target are left out, because nothing touches them; the site marks its fingertip.
 MJCF = """
 <mujoco model="arm">
   <compiler angle="radian"/>
@@ -54,7 +54,7 @@ MJCF = """
 """
 
 END_EFFECTOR = (4, 5)
-"""Where (y, z), the paper's names for the coordinates on the table, stand in the state."""
+"""Indices of y and z in the state; these are the paper's names of the coordinates on the table."""
 
 
 @dataclass(frozen=True)
@@ -62,26 +62,29 @@ class Settings:
     """Every free parameter of the case, with the reason for its value; the paper gives none of them.
 
     Attributes:
-        substeps: MuJoCo steps in one control step; dt is 0.1 s, a tenth of the joints' time constant, armature over
-            damping. Reacher's 20 ms would take five times as many steps, over which the network's errors add up.
-        horizon: steps; in 1.5 s iLQR ends within 3 cm of the targets (median 8 mm) on a model without error, but for
-            those straight ahead (z = 0 exactly), where the extended arm has no reason to bend to either side.
-        y, z: m; the table in front of the arm. All of it is within the arm's reach of 0.21 m, the far corners are
-            0.206 m away, and 4 cm and more from the shoulder, where the elbow's stops let no fingertip, so that
-            whoever misses a target is to blame. Behind its shoulder the arm has no way that is better than all others.
-        position_weight: of the end effector's deviation, 1/m^2; what the task is about.
-        rate_weight: s^2/rad^2; small, yet without it whirling through the target is as good as stopping there.
-        torque_weight: of the torque in units of the motors' 200 N m; such that an eighth of them is ever used, about
-            what was recorded.
-        final_position_weight, final_rate_weight: of the last state, ten times those of the others.
-        iterations: of iLQR; on smooth models more gain nothing worth having, on the network they chase its kinks.
+        substeps: MuJoCo steps in one control step; dt is 0.1 s, a tenth of the joints' time constant (armature over
+            damping). Reacher's 20 ms would take five times as many steps, over which the network's errors add up.
+        horizon: steps; in 1.5 s iLQR ends within 3 cm of the targets (median 8 mm) on a model without error. The
+            exception are targets straight ahead (z = 0 exactly), for which the extended arm has no reason to bend to
+            either side.
+        y, z: m; the table in front of the arm. All of it is within the arm's reach of 0.21 m: the far corners are
+            0.206 m away. All of it is also at least 4 cm from the shoulder; the elbow's stops keep the fingertip out
+            of that circle. So every target can be reached. Targets behind the shoulder would have no single best way.
+        position_weight: weight of the end effector's deviation, 1/m^2; the task is about this deviation.
+        rate_weight: s^2/rad^2; small. Without it, passing the target at full speed would be as good as stopping there.
+        torque_weight: weight of the torque in units of the motors' 200 N m; with it at most an eighth of them is used,
+            about as much as in the recordings.
+        final_position_weight, final_rate_weight: weights of the last state, ten times those of the other states.
+        iterations: largest number of iLQR iterations; on smooth models more iterations gain almost nothing, on the
+            network they follow its kinks.
         rollouts, steps: recorded for learning: 500 x 4 transitions from rest, 200 s in all.
-        torque: recorded torques are uniform within +-0.12 of the motors' range, which leads to the joint rates of the
-            closed loop, 5 rad/s.
-        elbow: rad; recordings start at any angle of the shoulder and at elbow angles within +-2.2, so that they
-            cover the bent arm, and fewer than one in a hundred meets the elbow's stops at 3 rad.
-        points: of the data that the Gaussian process is conditioned on; with more it is slower and errs by less still.
-        restarts, training: how often the network is trained, and iterations of one training at most; the best is kept.
+        torque: recorded torques are uniform within +-0.12 of the motors' range, which gives joint rates like those of
+            the closed loop, 5 rad/s.
+        elbow: rad; recordings start at any angle of the shoulder and at elbow angles within +-2.2. They cover the bent
+            arm, and fewer than one in a hundred reaches the elbow's stops at 3 rad.
+        points: number of data points of the Gaussian process; with more points it is slower and more accurate.
+        restarts, training: number of trainings of the network, of which the best is kept, and largest number of
+            iterations of one training.
     """
 
     substeps: int = 10
@@ -121,7 +124,7 @@ def learn(model: str, data: Transitions, settings: Settings, seed: int) -> model
     """Return one of the three models, learned from recorded transitions.
 
     Raises:
-        UnknownNameError: there is no such model.
+        UnknownNameError: if there is no such model.
     """
     if model == "fnn":
         return models.FeedforwardReLU.fit(
@@ -135,10 +138,10 @@ def learn(model: str, data: Transitions, settings: Settings, seed: int) -> model
 
 
 def experiment(seed: int = 0, model: str = "fnn", settings: Settings | None = None) -> Experiment:
-    """Return the case with one of the three models; the seed draws the data, the same for all of them.
+    """Return the case with one of the three models; the seed draws the data, which are the same for all models.
 
     Raises:
-        UnknownNameError: there is no such model.
+        UnknownNameError: if there is no such model.
     """
     settings = Settings() if settings is None else settings
     system = arm(settings)
@@ -154,7 +157,7 @@ def experiment(seed: int = 0, model: str = "fnn", settings: Settings | None = No
         task=reach,
         system=system,
         model=learn(model, record(system, settings, seed), settings, seed),
-        # The angles themselves cost nothing: the task says where the end effector is to be, not how.
+        # The angles themselves have no weight, because the task prescribes only the position of the end effector.
         synthesizer=controllers.ILQR(
             [0.0, 0.0, rates, rates, positions, positions],
             [settings.torque_weight, settings.torque_weight],
@@ -177,12 +180,12 @@ def experiment(seed: int = 0, model: str = "fnn", settings: Settings | None = No
 
 @dataclass(frozen=True, eq=False)
 class Aspects:
-    """How far from their targets the closed loops end, the two aspects of Remark 1.
+    """The final distances of the closed loops from their targets, the two aspects of Remark 1.
 
     Attributes:
-        targets: shape ``(N, 2)``, m.
-        model_error: Aspect-1, how far the model's end effector ends from its target, shape ``(N,)``, m.
-        system_error: the same of the arm under the same controllers, NaN where the execution failed.
+        targets: the targets, shape ``(N, 2)``, m.
+        model_error: Aspect-1, the final distance of the model's end effector from its target, shape ``(N,)``, m.
+        system_error: the same distance of the arm under the same controllers; NaN if the execution failed.
     """
 
     targets: Array
@@ -197,10 +200,10 @@ class Aspects:
 
 
 def aspects(seed: int = 0, model: str = "fnn", settings: Settings | None = None, *, per_axis: int = 21) -> Aspects:
-    """Return how well model and arm do the tasks on a grid of targets. Executes S for each.
+    """Return the final distances of model and arm from a grid of targets. S is executed for each target.
 
     Raises:
-        UnknownNameError: there is no such model.
+        UnknownNameError: if there is no such model.
     """
     validation = experiment(seed, model, settings).validation
     targets = validation.space.grid(per_axis)

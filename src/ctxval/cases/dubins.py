@@ -1,4 +1,4 @@
-"""The paper's Dubins car (Sec. VI-A): a linear model learned from it, LQR to follow sums of ten sine waves."""
+"""The paper's Dubins car (Sec. VI-A): a linear model learned from it, and LQR that follows sums of ten sine waves."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ WAVES = 10
 def root_mean_square(model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
     """Return ``||xi_S - xi_M||_2 / sqrt(H)``, the root mean square over time of the gap between the states.
 
-    It is ``sqrt(H)`` = 10 times the printed formula: the same task is the worst, and a search chooses the same tasks.
+    It is ``sqrt(H)`` = 10 times the printed formula, so the worst task and the choices of a search are the same.
     """
     whole = distances.WholeTrajectory(norm=2)(model_trajectory, system_trajectory, task)
     return np.asarray(whole / np.sqrt(task.horizon))
@@ -42,9 +42,9 @@ DISTANCES: dict[str, distances.Distance] = {
     "root-mean-square": root_mean_square,
     "mean-deviation": distances.MeanDeviation(norm=2, components=(0, 1)),
 }
-"""The formula as printed, ``||xi_S - xi_M||_2 / H``, and two readings of the "average deviation in metres" that the
-text makes of it. The first two count a radian of heading as a metre; the last is the mean over time of the distance
-between the positions alone."""
+"""The formula as printed, ``||xi_S - xi_M||_2 / H``, and two readings of the paper's text, which calls it the "average
+deviation in metres". The first two distances count a radian of heading as a metre; the last one is the mean over time
+of the distance between the positions alone."""
 
 
 @dataclass(frozen=True)
@@ -63,29 +63,32 @@ class Settings:
     """Every free parameter of the case, with the reason for its value; the defaults are the variant ``paper``.
 
     The paper gives the horizon, the start and the task space. It reports a largest average deviation of 3.5 m, found
-    in 100 executions, and that 500 random tasks stay below 2 to 3 m. So it is here, in the median over seeds, where
-    the average is the root mean square: 3.6 m, of which GP-UCB finds 3.2 m and random tasks 1.8 m. The printed formula
-    gives a tenth of that. The mean deviation of the position is at most 1.4 m; 3.5 m of it, three times the mean
-    height of the waves, would need a loop on S that is nearly unstable.
+    in 100 executions, and that 500 random tasks stay below 2 to 3 m. With the root mean square as the average, this
+    case agrees in the median over seeds: d* is 3.6 m, of which GP-UCB finds 3.2 m and random tasks 1.8 m. The printed
+    formula gives a tenth of these values. The mean deviation of the position is at most 1.4 m. A mean deviation of
+    3.5 m, three times the mean height of the waves, would need a closed loop on S that is nearly unstable.
 
     Attributes:
         horizon: steps, the paper's H.
-        dt: s; the ten waves then have 0.1 to 1 Hz. From 0.2 s on the loop on S begins to lose stability.
-        heading_weight: of the deviation, 1/rad^2, where a position weighs 1/m^2. Small, as a heading of 0 is not that
-            of the waves; with 1 the car hardly turns, and no task is much worse than most.
-        input_weight: s^2/m^2 and s^2/rad^2. From 0.05 down the loop on S loses stability in some tasks.
-        samples: recorded steps; enough that the models of all seeds are much alike, and their loops on S stable.
-        heading: rad; recorded ones are uniform in plus or minus a quarter turn. Over a full turn the effect of the
-            speed cancels, and the model believes that nothing moves y.
-        speed: m/s; recorded ones are uniform from 0 to this. The model takes their mean for the car's speed when it
-            steers z: the slower it believes the car to be, the harder it turns. This sets the root mean square d*:
-            2.9 m for 2, 3.6 m for 1.75, 5 m for 1.5, 8 m for 1.25.
-        turn_rate: rad/s; recorded ones are uniform in plus or minus this. The heading is linear in it, so any would do.
-        position: m; recorded ones are uniform in plus or minus this. Nothing depends on them but the model's errors.
-        limit: m/s and rad/s; no input is larger. Without it a loop that loses stability grows until rounding decides.
+        dt: s; with it the ten waves have 0.1 to 1 Hz. From 0.2 s on, the closed loop on S begins to lose stability.
+        heading_weight: weight of the heading's deviation, 1/rad^2, if a position weighs 1/m^2. It is small, because the
+            reference heading of 0 is not that of the waves; with 1 the car hardly turns, and no task is much worse
+            than most others.
+        input_weight: s^2/m^2 and s^2/rad^2. At 0.05 and below, the closed loop on S loses stability in some tasks.
+        samples: recorded steps; with so many the models of all seeds are similar, and their closed loops on S stable.
+        heading: rad; recorded headings are uniform within plus or minus a quarter turn. Over a full turn the effect of
+            the speed cancels, so that in the model no input moves y.
+        speed: m/s; recorded speeds are uniform from 0 to this. When the model steers z, it takes the mean of the
+            recorded speeds as the speed of the car: the lower this mean, the harder it turns. This sets the root mean
+            square d*: 2.9 m for 2, 3.6 m for 1.75, 5 m for 1.5, 8 m for 1.25.
+        turn_rate: rad/s; recorded turn rates are uniform within plus or minus this. The heading is linear in the turn
+            rate, so any value would do.
+        position: m; recorded positions are uniform within plus or minus this. Only the model's errors depend on them.
+        limit: m/s and rad/s; the largest input. Without it a loop that loses stability grows until rounding errors
+            dominate.
         first_seed: added to the seed of the data.
         distance: a name of ``DISTANCES``.
-        threshold: in m, for that distance: in the gap between what random tasks show and d*.
+        threshold: m; the threshold for that distance, between the largest distance of random tasks and d*.
     """
 
     horizon: int = 100
@@ -105,16 +108,16 @@ class Settings:
 
 VARIANTS: dict[str, Settings] = {
     "paper": Settings(),
-    # Fewer data make models of more kinds. Those of some seeds, the first here among them, have a wide local maximum
-    # at the end point 0, where half of all climbs end.
+    # With fewer data the models differ more. For some seeds, such as the first one here, the distance has a wide local
+    # maximum at the end point 0, at which half of all climbs end.
     "basin": Settings(samples=400, speed=2.0, first_seed=25, threshold=0.2),
-    # Cheap inputs: in a few corners of the task space the loop on S loses stability, and the car goes round as fast as
-    # it can. Data of small headings and a heavier weight of the heading keep those corners few.
+    # Inputs have a small weight: in a few corners of the task space the closed loop on S loses stability, and the car
+    # turns at its limits. Data of small headings and a larger weight of the heading keep these corners few.
     "heavy-tail": Settings(
         heading_weight=0.3, input_weight=0.01, samples=2000, heading=np.pi / 4, speed=2.0, limit=10.0, threshold=0.2
     ),
 }
-"""``paper`` resembles what the paper reports; the other two are hard for a search, and for a surrogate."""
+"""``paper`` resembles the results of the paper; the other two variants are hard for a search and for a surrogate."""
 
 
 def record(car: Dubins, settings: Settings, seed: int) -> Transitions:
@@ -129,7 +132,7 @@ def record(car: Dubins, settings: Settings, seed: int) -> Transitions:
 def reference(end: Array, amplitudes: Array, horizon: int) -> Array:
     """Return the states to follow, ``(..., H + 1, 3)``, for ends a_0 ``(...)`` and amplitudes a_j ``(..., 10)`` in m.
 
-    In the paper ``z(t) = sum_j a_j sin(2 pi j y(t) / a_0)`` with ``y(t) = t a_0 / H``: a_0 cancels, and may be 0.
+    In the paper ``z(t) = sum_j a_j sin(2 pi j y(t) / a_0)`` with ``y(t) = t a_0 / H``; a_0 cancels, so it may be 0.
     """
     share = np.arange(horizon + 1) / horizon
     waves = np.sin(2 * np.pi * np.arange(1, WAVES + 1)[:, None] * share)
@@ -143,13 +146,13 @@ def experiment(
     """Return the case; the seed draws the data that the linear model is learned from.
 
     Args:
-        seed: of the data, not negative.
+        seed: seed of the data, not negative.
         variant: a name of ``VARIANTS``.
-        distance: a name of ``DISTANCES``; the variant's own, which alone has a threshold, by default.
-        settings: in place of the variant's.
+        distance: a name of ``DISTANCES``; by default the distance of the variant. Other distances have no threshold.
+        settings: settings that replace those of the variant.
 
     Raises:
-        UnknownNameError: nothing has the name of the variant or of the distance.
+        UnknownNameError: if there is no such variant or distance.
     """
     if settings is None:
         if variant not in VARIANTS:
@@ -170,7 +173,7 @@ def experiment(
 
 
 def tracking(seed: int, settings: Settings, distance: distances.Distance) -> Validation:
-    """Return the car, a linear model learned from it, and the task to follow ten waves."""
+    """Return the validation of a linear model of the car on tasks that follow ten waves."""
     car = Dubins()
 
     def follow(p: Parameters) -> Task:

@@ -1,4 +1,4 @@
-"""The paper's linear systems (Sec. VI-C): a random system, a random model, a random feedback, n = 1 to 10 states."""
+"""The paper's linear systems (Sec. VI-C): a random system, a random model and a random feedback, n = 1 to 10 states."""
 
 from __future__ import annotations
 
@@ -23,24 +23,25 @@ from ctxval import (
 from ctxval.errors import InputError
 
 DIMENSIONS = range(1, 11)
-"""The numbers of states that the paper has."""
+"""The numbers of states in the paper."""
 
 
 @dataclass(frozen=True)
 class Settings:
     """Every free parameter of the case, with the reason for its value.
 
-    The paper gives none of them, only that A, B and K are random.
+    The paper gives none of them; it only says that A, B and K are random.
 
     Attributes:
-        dt: s; the discretisation is exact, so this is only how long an input is held: 50 ms are short against the
+        dt: s; the discretisation is exact, so dt only sets how long an input is held. 50 ms are short against the
             closed loops' time constants, of which the shortest is typically 0.4 s.
-        horizon: steps; 1 s is half of the longest time constant, so that the final state still depends on the
-            initial state, and already on the goal.
-        decay: 1/s; both closed loops decay at least so fast. Draws that do not are made to, by a shift ``A - s I``:
-            to reject them would take forever, as few random closed loops of 10 states are stable.
+        horizon: steps; 1 s is half of the longest time constant, so that the final state depends both on the initial
+            state and on the goal.
+        decay: 1/s; both closed loops decay at least this fast. Draws that decay more slowly are shifted, ``A - s I``.
+            Rejecting them would take too long, because few random closed loops of 10 states are stable.
         spread: 1/s; about the modulus of the largest eigenvalue of A and of B K, for any n.
-        tolerance: the threshold is this for each state; a quarter of the way from the centre of P to its edge.
+        tolerance: the threshold is this times the number of states; it is a quarter of the way from the centre of P to
+            its edge.
     """
 
     dt: float = 0.05
@@ -52,18 +53,18 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class LinearSystem:
-    """``x' = A x + B u``.
+    """The system ``x' = A x + B u``.
 
     Attributes:
-        A: shape ``(n, n)``, 1/s.
-        B: shape ``(n, m)``, 1/s.
+        A: matrix of the states, shape ``(n, n)``, 1/s.
+        B: matrix of the inputs, shape ``(n, m)``, 1/s.
     """
 
     A: Array
     B: Array
 
     def discretised(self, dt: float) -> models.Linear:
-        """Return the exact step of dt seconds under a held input: ``exp([[A, B], [0, 0]] dt)`` has it in its rows."""
+        """Return the exact step of dt seconds under a held input: the first n rows of ``exp([[A, B], [0, 0]] dt)``."""
         n, m = self.B.shape
         generator = np.block([[self.A, self.B], [np.zeros((m, n + m))]])
         rows = expm(generator * dt)[:n]
@@ -72,10 +73,10 @@ class LinearSystem:
 
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """``u = K (x - x_final)``.
+    """The feedback ``u = K (x - x_final)``.
 
     Attributes:
-        gain: K, shape ``(m, n)``.
+        gain: the gain K, shape ``(m, n)``.
     """
 
     gain: Array
@@ -88,7 +89,7 @@ class Feedback:
 def draw(rng: np.random.Generator, gain: Array, settings: Settings) -> LinearSystem:
     """Return a random system whose closed loop under a gain ``(m, n)`` decays.
 
-    The entries are normal, of a variance at which the largest eigenvalues do not grow with n (the circular law).
+    The entries are normal, with a variance for which the largest eigenvalues do not grow with n (the circular law).
     """
     m, n = gain.shape
     A = rng.normal(scale=settings.spread / np.sqrt(n), size=(n, n))
@@ -98,7 +99,7 @@ def draw(rng: np.random.Generator, gain: Array, settings: Settings) -> LinearSys
 
 
 def final_state_map(step: models.Linear, gain: Array, horizon: int) -> Array:
-    """Return the matrix ``(n, 2 n)`` that maps p = (x_init, x_final) to the closed loop's final state."""
+    """Return the matrix ``(n, 2 n)`` that maps p = (x_init, x_final) to the final state of the closed loop."""
     n = len(step.A)
     response = np.hstack([np.eye(n), np.zeros((n, n))])
     by_goal = np.hstack([np.zeros((n, n)), step.B @ gain])
@@ -122,12 +123,12 @@ def largest_norm(C: Array, space: TaskSpace) -> Truth:
 
 
 def experiment(seed: int = 0, dim: int = 4, settings: Settings | None = None) -> Experiment:
-    """Return the case with ``dim`` states n, so a task space of 2 n dimensions.
+    """Return the case with n = ``dim`` states, whose task space has 2 n dimensions.
 
     The seed draws K, then independently A and B of the system and A and B of the model.
 
     Raises:
-        InputError: dim is not an integer from 1 to 10.
+        InputError: if dim is not an integer from 1 to 10.
     """
     if not isinstance(dim, int | np.integer) or isinstance(dim, bool) or dim not in DIMENSIONS:
         raise InputError(f"dim, the number of states, must be an integer from 1 to 10, got {dim!r}.")

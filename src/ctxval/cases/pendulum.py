@@ -48,16 +48,17 @@ class Pendulum:
 class Settings:
     """Every free parameter of the case, with the reason for its value.
 
-    The paper gives none of them. These make d* about 0.3 rad with weak regions around +-pi/2, as it reports.
+    The paper gives none of them. With these values d* is about 0.3 rad, with weak regions around +-pi/2, as in the
+    paper.
 
     Attributes:
         dt: s; 20 ms resolve the pendulum's fastest mode, 3.8 rad/s, more than 80 times.
         horizon: steps; 3 s are enough for the model to reach every goal.
-        angle_weight, rate_weight: of the deviation, 1/rad^2 and s^2/rad^2; the angle is what the task is about.
-        torque_weight: 1/(N m)^2; small, so that the torque limits nothing.
-        final_factor: weight of the last state over that of the others.
+        angle_weight, rate_weight: weights of the deviation, 1/rad^2 and s^2/rad^2; the task is about the angle.
+        torque_weight: 1/(N m)^2; small, so that the torque restricts no motion.
+        final_factor: ratio of the weight of the last state to that of the other states.
         rollouts, steps: recorded for learning: 20 x 20 transitions.
-        torque: N m; recorded torques are uniform in +-5, about the 4.9 that hold the rod level.
+        torque: N m; recorded torques are uniform within +-5, about the 4.9 that hold the rod level.
     """
 
     dt: float = 0.02
