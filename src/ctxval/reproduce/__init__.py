@@ -26,14 +26,14 @@ STUDIES: tuple[Study, ...] = (
     ArmModels(),
     LinearComplexity(),
 )
-"""The paper's figures, in its order."""
+"""The studies behind the paper's figures, in the order of the paper."""
 
 
 def studies_named(name: str) -> list[Study]:
-    """Return one study by its name, or all.
+    """Return the study with this name, or all studies for ``all``.
 
     Raises:
-        UnknownNameError: there is no such study.
+        UnknownNameError: if there is no such study.
     """
     if name == "all":
         return list(STUDIES)
@@ -53,21 +53,21 @@ def reproduce(
     on_start: Callable[[int], None] = lambda missing: None,
     on_done: Callable[[Job], None] = lambda job: None,
 ) -> Path:
-    """Run what is not stored yet, draw the figures, and write the table of claims; return the table's path.
+    """Run the jobs that are not stored yet, draw the figures, and write the table of claims; return the table's path.
 
-    The table has every study whose runs are stored, not only the one that was asked for.
+    The table has every study whose runs are all stored, not only the requested one.
 
     Args:
         name: one study, or ``all``.
         out: folder of the figures (PNG) and their data (CSV); the table is written beside it, ``<out>.md``.
-        stored: folder of the runs' results, ``<out>/results`` if it is not given.
-        scale: full, or quick with fewer trials and coarser grids.
-        workers: processes.
-        on_start: called with the number of runs that are missing.
-        on_done: called after each.
+        stored: folder of the runs' results; ``<out>/results`` by default.
+        scale: the scale: full, or quick with fewer trials and coarser grids.
+        workers: number of processes.
+        on_start: function that is called with the number of missing runs.
+        on_done: function that is called after each run, with its job.
 
     Raises:
-        InputError: there is no such study, or no worker.
+        InputError: if there is no such study, or the number of workers is not positive.
     """
     if workers < 1:
         raise InputError(f"workers must be at least 1, got {workers}.")

@@ -56,21 +56,21 @@ def _truth(model: str, seed: int) -> Job:
 
 
 class ArmSamples:
-    """The paper's Fig. 6: executions to come within some per cent of d*, with the network as the model."""
+    """The paper's Fig. 6: executions until the estimate is within some per cent of d*, for the network as the model."""
 
     name = "arm-samples"
     title = "Arm: executions until within some per cent of d*"
     case = "arm"
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one campaign a technique and trial, and the truths."""
+        """Return one campaign for each technique and trial, and the truths."""
         seeds = range(scale.trials)
-        # SD looks at the same samples as SC: one run serves both.
+        # SD uses the same samples as SC, so one run serves both.
         searches = [_search("fnn", name, seed) for name in ("gp-ucb", "random") for seed in seeds]
         return searches + [_truth("fnn", seed) for seed in seeds]
 
     def executions(self, results: Results, scale: Scale, search: str) -> Array:
-        """Return executions, shape ``(percents, trials)``; infinity for never."""
+        """Return the numbers of executions, shape ``(percents, trials)``; infinity if the estimate never gets there."""
         ran = "gp-ucb" if search == "gp-ucb" else "random"
         rows = []
         for percent in _PERCENTS:
@@ -82,7 +82,7 @@ class ArmSamples:
         return np.array(rows)
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the medians; where the median never got there, an open triangle at the budget."""
+        """Return a figure of the medians; an open triangle at the budget means that the median never gets there."""
         figure = new_figure()
         axes = figure.add_subplot()
         rows = {search: self.executions(results, scale, search) for search in TECHNIQUES}
@@ -96,7 +96,7 @@ class ArmSamples:
         return figure
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return median, least and largest for each technique."""
+        """Return median, smallest and largest value for each technique."""
         names: list[str] = ["percent"]
         values: list[list[float]] = [list(_PERCENTS)]
         for search in TECHNIQUES:
@@ -106,7 +106,7 @@ class ArmSamples:
         return Columns(names, values)
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return what the paper says of the executions."""
+        """Return the paper's claim about the executions, with the measured numbers."""
         at_two = _PERCENTS.index(2.0)
         ucb = spread(self.executions(results, scale, "gp-ucb")[at_two])
         sc = spread(self.executions(results, scale, "random")[at_two])
@@ -123,14 +123,14 @@ class ArmSamples:
 
 
 class ArmModels:
-    """The paper's Fig. 7: what GP-UCB finds for each of the three models, with the truths."""
+    """The paper's Fig. 7: the largest distances that GP-UCB finds for each of the three models, with the truths."""
 
     name = "arm-models"
     title = "Arm: three learned models"
     case = "arm"
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one campaign a model and trial, the truths, and how well the tasks are done."""
+        """Return one campaign for each model and trial, the truths, and the final distances from the targets."""
         pairs = [(model, seed) for model in MODELS for seed in range(scale.trials)]
         campaigns = [_search(model, "gp-ucb", seed) for model, seed in pairs]
         return campaigns + [_truth(*pair) for pair in pairs] + [self._aspects(*pair) for pair in pairs]
@@ -139,7 +139,7 @@ class ArmModels:
         return Job("aspects", "arm", seed, _options(model), budget=21)
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the first trial: distance found against executions, and the truths."""
+        """Return a figure of the first trial: the distance found against executions, and the truths."""
         figure = new_figure()
         axes = figure.add_subplot()
         for model, (label, colour, line, marker) in MODELS.items():
@@ -157,7 +157,7 @@ class ArmModels:
         return figure
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return, for each model and trial, d* and how far model and system end from their targets."""
+        """Return, for each model and trial, d* and the final distances of model and system from their targets."""
         rows: list[tuple[str, float, float, float, float, float, float]] = []
         for model in MODELS:
             for seed in range(scale.trials):
@@ -179,7 +179,7 @@ class ArmModels:
         return Columns(names, [list(column) for column in zip(*rows, strict=True)])
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return what the paper says of the three models, under both measures."""
+        """Return the paper's claims about the three models, under both measures, with the measured numbers."""
         seeds = range(scale.trials)
         worst = {m: [results[_truth(m, s)]["distance"] for s in seeds] for m in MODELS}
         aspects: dict[str, list[Result]] = {m: [results[self._aspects(m, s)] for s in seeds] for m in MODELS}

@@ -20,7 +20,7 @@ _ACTIVE = 100
 
 
 class DubinsMedians:
-    """The paper's Fig. 5: the distance as printed, 1/H ||xi_S - xi_M||_2, over the executions."""
+    """The paper's Fig. 5: the largest distance found, 1/H ||xi_S - xi_M||_2 as printed, against executions."""
 
     name = "dubins"
     title = "Dubins car: largest distance found"
@@ -33,7 +33,7 @@ class DubinsMedians:
         return Job("search", "dubins", seed, search=search, budget=self._budget(search))
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one campaign a technique and trial, and the best-known values."""
+        """Return one campaign for each technique and trial, and the best-known values."""
         seeds = range(scale.trials)
         return [self._job(search, seed) for search in TECHNIQUES for seed in seeds] + [
             Job("truth", "dubins", seed) for seed in seeds
@@ -45,7 +45,7 @@ class DubinsMedians:
         return np.array([running_estimate(distances_of(results[job]), search) for job in jobs])
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the medians with their quartiles, and the median of the best-known values."""
+        """Return a figure of the medians with their quartiles, and the median of the best-known values."""
         figure = new_figure()
         axes = figure.add_subplot()
         for search, (label, colour, line, marker) in TECHNIQUES.items():
@@ -63,7 +63,7 @@ class DubinsMedians:
         return figure
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return the medians; empty behind the end of a budget."""
+        """Return the medians; the cells after the end of a budget are empty."""
         names: list[str] = ["executions"]
         values: list[list[float | str]] = [list(range(1, _RANDOM + 1))]
         for search in TECHNIQUES:
@@ -73,7 +73,7 @@ class DubinsMedians:
         return Columns(names, values)
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return what the paper says of the Dubins car."""
+        """Return the paper's claims about the Dubins car, with the measured numbers."""
         final = {search: self.estimates(results, scale, search)[:, -1] for search in TECHNIQUES}
         truths = np.array([results[Job("truth", "dubins", seed)]["distance"] for seed in range(scale.trials)])
         ucb, sc, sd = final.values()

@@ -1,7 +1,7 @@
-"""The paper's Example 1: the running example's M and S compared in four frameworks.
+"""The paper's Example 1, in which four frameworks compare M and S of the running example.
 
-In open loop by whole trajectories (OLDT) or final states (OLCD), in closed loop by whole trajectories (CCDT) or final
-states (CuSTOM).
+Two frameworks compare open loops, by whole trajectories (OLDT) or by final states (OLCD). The other two compare closed
+loops, by whole trajectories (CCDT) or by final states (CuSTOM).
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ FINAL = distances.FinalState(norm=1)
 """The distance of OLCD and CuSTOM."""
 
 BOUND = pendulum.Settings().torque
-"""Of the open-loop torques, N m: that of the training data, so that the model does not extrapolate in the input.
+"""Bound of the open-loop torques, N m. It is that of the training data, so that the model does not extrapolate.
 
-The paper leaves the torque unbounded, where no largest open-loop distance exists. The distance grows with the bound:
-if it exceeds the closed-loop one here, so it does with the far larger torques that the closed loops use.
+The paper leaves the torque unbounded, but then no largest open-loop distance exists. The distance grows with the bound:
+if it exceeds the closed-loop distance here, it also does so with the far larger torques of the closed loops.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Frameworks:
-    """The distance between M and S as each framework has it.
+    """The distance between M and S in each framework.
 
     Attributes:
-        goals: theta_final, shape ``(N,)``, rad.
+        goals: the goal angles theta_final, shape ``(N,)``, rad.
         ccdt: distance of the closed loops' trajectories for each goal, shape ``(N,)``.
         custom: distance of the closed loops' final states for each goal, shape ``(N,)``.
         oldt: the largest distance of open-loop trajectories, the same for every goal.
         olcd: the largest distance of open-loop final states, the same for every goal.
-        bound: of the open-loop torques, N m.
+        bound: the bound of the open-loop torques, N m.
         closed_loop_torque: the largest torque of any closed loop, on M or on S, N m.
     """
 
@@ -53,12 +53,12 @@ class Frameworks:
 
     @property
     def worst_ccdt_goal(self) -> float:
-        """The goal where CCDT is largest, rad."""
+        """The goal with the largest CCDT distance, rad."""
         return float(self.goals[np.argmax(self.ccdt)])
 
     @property
     def worst_custom_goal(self) -> float:
-        """The goal where CuSTOM is largest, rad."""
+        """The goal with the largest CuSTOM distance, rad."""
         return float(self.goals[np.argmax(self.custom)])
 
 
@@ -66,13 +66,13 @@ def frameworks(seed: int = 0, *, per_axis: int = 2001, restarts: int = 64, bound
     """Return the four distances of the running example.
 
     Args:
-        seed: draws the data that the model is learned from, and where the open-loop searches start.
-        per_axis: goals on the grid.
-        restarts: of each open-loop search.
-        bound: of the open-loop torques, N m.
+        seed: seed of the data that the model is learned from, and of the starts of the open-loop searches.
+        per_axis: number of goals on the grid.
+        restarts: number of restarts of each open-loop search.
+        bound: bound of the open-loop torques, N m.
 
     Raises:
-        InputError: an argument cannot be used.
+        InputError: if an argument cannot be used.
     """
     validation = pendulum.experiment(seed).validation
     goals = validation.space.grid(per_axis)
@@ -106,7 +106,7 @@ def open_loop(
     seed: int,
 ) -> OpenLoopWorst:
     """Return the worst open loop from the running example's initial state."""
-    assert isinstance(validation.system, systems.Simulated)  # the running example's is
+    assert isinstance(validation.system, systems.Simulated)  # as in the running example
     task = validation.task(validation.space.parameters([0.0]))
     step = validation.system.model
     return worst_open_loop(step, validation.model, task, bound, distance, restarts=restarts, seed=seed)

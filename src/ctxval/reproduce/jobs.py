@@ -29,20 +29,20 @@ DISCARDED = 5
 """The paper's k in sampling and discarding."""
 
 _DIGITS = 10
-"""Significant digits that are stored: more than any figure shows, and half the size."""
+"""Number of significant digits in stored results: more than any figure shows, at half the size."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run, fully said by its fields.
+    """One run, completely defined by its fields.
 
     Attributes:
         kind: a key of :data:`KINDS`.
-        case: which system.
-        seed: of the data, the model and the search.
-        options: of the case, as pairs.
-        search: which search, for the kind ``search``.
-        budget: executions, or grid points on each axis.
+        case: the name of the case.
+        seed: seed of the data, the model and the search.
+        options: options of the case, as pairs of name and value.
+        search: the name of the search, for the kind ``search``.
+        budget: the number of executions, or of grid points on each axis.
     """
 
     kind: str
@@ -75,11 +75,11 @@ class Job:
 
 
 def _search(job: Job) -> Result:
-    """Return the points and distances of one campaign, in order; of independent draws only the records."""
+    """Return the points and distances of one campaign in order, or only the records for independent draws."""
     experiment = job.experiment()
     search = searches.by_name(job.search)
     if searches.BaseSearch.of(search).iid:
-        # The points depend on no distance, so all of them are executed in one batch.
+        # The points do not depend on the distances, so all of them are executed in one batch.
         search.reset(experiment.validation.space.dimension, job.seed)
         unit = search.ask(job.budget)
         points = experiment.validation.space.from_unit(unit)
@@ -91,9 +91,9 @@ def _search(job: Job) -> Result:
 
 
 def records(distances: Array) -> list[list[float]]:
-    """Return ``[index, distance]`` of each one that was among the six largest when it came.
+    """Return ``[index, distance]`` of each distance that is among the six largest up to its index.
 
-    These are all that the estimates of SC and of SD with k = 5 ever look at.
+    The estimates of SC and of SD with k = 5 depend on no other distances.
     """
     largest: list[float] = []
     found = []
@@ -105,7 +105,7 @@ def records(distances: Array) -> list[list[float]]:
 
 
 def distances_of(result: Result) -> Array:
-    """Return the distances of a search in order; NaN for those that were no records."""
+    """Return the distances of a search in order; NaN for distances that are not records."""
     if "distances" in result:
         return np.array(result["distances"], dtype=np.float64)
     distances = np.full(result["executions"], np.nan)
@@ -115,10 +115,10 @@ def distances_of(result: Result) -> Array:
 
 
 def _truth(job: Job) -> Result:
-    """Return the largest distance, as well as the case can find it."""
+    """Return the largest distance that the case's own method finds."""
     experiment = job.experiment()
     if experiment.truth is None:
-        raise InputError(f"the case {job.case!r} knows no truth.")
+        raise InputError(f"the case {job.case!r} has no method that finds its true maximum.")
     truth = experiment.truth()
     return {"distance": truth.distance, "point": truth.parameters.points.tolist(), "method": truth.method}
 
@@ -147,7 +147,7 @@ def _frameworks(job: Job) -> Result:
 
 
 def _aspects(job: Job) -> Result:
-    """Return how far model and system end from their targets, on a grid of targets (Remark 1)."""
+    """Return the final distances of model and system from a grid of targets (Remark 1)."""
     from ctxval.cases.arm import aspects
 
     found = aspects(job.seed, **dict(job.options), per_axis=job.budget)
@@ -161,14 +161,14 @@ KINDS: dict[str, Callable[[Job], Result]] = {
     "frameworks": _frameworks,
     "aspects": _aspects,
 }
-"""What can be run."""
+"""The kinds of jobs, each with the function that runs it."""
 
 
 def run_job(job: Job) -> Result:
     """Run one job on one thread.
 
     Raises:
-        InputError: there is no such kind.
+        InputError: if there is no such kind of job.
     """
     if job.kind not in KINDS:
         raise InputError(f"there is no kind of job {job.kind!r}.")
@@ -195,17 +195,17 @@ class Results:
         return self._of_kind(job.kind)[job.key,]
 
     def fill(self, jobs: Iterable[Job], workers: int, on_done: Callable[[Job], None]) -> None:
-        """Run what is not stored yet, in parallel; each result is stored as soon as it is there.
+        """Run the jobs that are not stored yet, in parallel; each result is stored as soon as it is complete.
 
         Args:
-            jobs: which; those already stored cost nothing.
-            workers: how many processes.
-            on_done: called with each job that has been run.
+            jobs: the jobs; stored ones are skipped.
+            workers: number of processes.
+            on_done: function that is called with each job after its run.
         """
         missing = [job for job in dict.fromkeys(jobs) if job not in self]
         if not missing:
             return
-        # Fresh interpreters: a forked one would inherit locks of threads that it does not have.
+        # New interpreters, because a forked one would inherit locks of threads that it does not have.
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
             waiting = {pool.submit(run_job, job): job for job in missing}
             try:

@@ -32,7 +32,7 @@ _STATES = tuple(range(1, 11))
 
 
 class LinearComplexity:
-    """The paper's Fig. 8: the effect of dimensionality."""
+    """The paper's Fig. 8: the effect of the dimension of the task space."""
 
     name = "linear"
     title = "Linear systems: executions until within 5 %"
@@ -46,14 +46,14 @@ class LinearComplexity:
         return Job("search", "linear", seed, (("dim", states),), search, budget)
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one campaign a technique, dimension and trial, and the exact truths."""
+        """Return one campaign for each technique, dimension and trial, and the exact truths."""
         pairs = [(states, seed) for states in _STATES for seed in range(scale.trials)]
-        # SD looks at the same samples as SC: one run serves both.
+        # SD uses the same samples as SC, so one run serves both.
         searches = [self._job(name, *pair, scale) for name in ("gp-ucb", "random") for pair in pairs]
         return searches + [Job("truth", "linear", seed, (("dim", states),)) for states, seed in pairs]
 
     def executions(self, results: Results, scale: Scale, search: str) -> Array:
-        """Return executions until within 5 %, shape ``(dimensions, trials)``; infinity for never."""
+        """Return the executions until within 5 % of d*, shape ``(dimensions, trials)``; infinity for never."""
         ran = "gp-ucb" if search == "gp-ucb" else "random"
         rows = []
         for states in _STATES:
@@ -66,7 +66,7 @@ class LinearComplexity:
         return np.array(rows)
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the medians; where the median never got there, an arrow at the budget."""
+        """Return a figure of the medians; an open triangle at the budget means that the median never gets there."""
         figure = new_figure()
         axes = figure.add_subplot()
         rows = {search: self.executions(results, scale, search) for search in TECHNIQUES}
@@ -80,7 +80,7 @@ class LinearComplexity:
         return figure
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return median, least and largest for each technique and dimension."""
+        """Return median, smallest and largest value for each technique and dimension."""
         names: list[str] = ["dimension"]
         values: list[list[float]] = [[2.0 * states for states in _STATES]]
         for search in TECHNIQUES:
@@ -90,7 +90,7 @@ class LinearComplexity:
         return Columns(names, values)
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return what the paper says of the dimension."""
+        """Return the paper's claim about the dimension, with the measured numbers."""
         said = {}
         for search in TECHNIQUES:
             medians = [spread(row)[0] for row in self.executions(results, scale, search)]

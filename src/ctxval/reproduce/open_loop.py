@@ -1,9 +1,9 @@
-"""Open-loop validation (the paper's eq. 1): the inputs under which M and S come apart the most.
+"""Open-loop validation (the paper's eq. 1): the inputs under which M and S differ the most.
 
-The controller knows no task here, so the distance is maximised over all input sequences within a bound. The search
-goes by the gradient to sequences at the bound: there is the maximum if M and S are linear, as the distance is convex
-then, and there it mostly is if both are affine in the input, by Pontryagin's principle. Many restarts and a trial of
-every single switch guard against poor local maxima. What is found is a lower bound of the true maximum.
+There is no feedback here, so the distance is maximised over all input sequences within a bound. The search follows the
+gradient to sequences at the bound. The maximum is there if M and S are linear, because the distance is then convex; it
+is mostly there if both are affine in the input, by Pontryagin's principle. Many restarts and a test of every single
+switch guard against poor local maxima. The result is a lower bound of the true maximum.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from ctxval.distances import FinalState, WholeTrajectory
 from ctxval.errors import InputError, ModelError, ShapeError
 
 _ROLLOUTS = 4096
-"""Rollouts in one batch: enough to be fast, few enough for memory."""
+"""Number of rollouts in one batch, large enough to be fast and small enough for memory."""
 
 _PARTIAL = 0.5 ** np.arange(1, 7)
-"""How far the whole sequence is moved, where moving parts of it all the way is too far."""
+"""Fractions of the way by which the whole sequence is moved, in case whole moves of single entries are too far."""
 
 _NEGLIGIBLE = 1e-10
-"""The least relative improvement that counts as one."""
+"""Smallest relative increase that counts as an improvement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +38,9 @@ class OpenLoopWorst:
 
     Attributes:
         distance: the largest distance, a lower bound of the paper's eq. 1.
-        inputs: a sequence that attains it, shape ``(H, m)``.
-        model_trajectory, system_trajectory: what M and S do under it.
-        restarts: the distance that each restart ended with, largest first, shape ``(R,)``.
+        inputs: a sequence of inputs with this distance, shape ``(H, m)``.
+        model_trajectory, system_trajectory: the trajectories of M and S under these inputs.
+        restarts: the final distance of each restart, largest first, shape ``(R,)``.
     """
 
     distance: float
@@ -64,21 +64,21 @@ def worst_open_loop(
     """Maximise the distance between M and S over the inputs ``|u| <= bound``, from the task's initial state.
 
     With ``WholeTrajectory(norm=inf)`` it is the paper's OLDT, with ``FinalState(norm=1)`` its OLCD. A restart depends
-    on the seed and its own number alone, so that more restarts never find less, but for rounding.
+    only on the seed and on its own number, so that more restarts never find less, except for rounding.
 
     Args:
-        system: the step of a simulated S; ``systems.Simulated`` has it as its ``model``.
+        system: the step of a simulated S, which is the ``model`` of ``systems.Simulated``.
         model: the model M.
         task: one task; its goal is ignored.
-        bound: of each input's magnitude, shape ``(m,)``, or a number for one input.
-        distance: what to maximise.
-        restarts: how many sequences are improved, R.
-        seed: of the first sequences.
-        iterations: the most improvements of one sequence in each of the search's three passes.
+        bound: bound of each input's magnitude, shape ``(m,)``, or a number for one input.
+        distance: the distance to maximise.
+        restarts: number R of sequences that are improved.
+        seed: seed of the first sequences.
+        iterations: largest number of improvements of one sequence in each of the three passes of the search.
 
     Raises:
-        InputError: an argument cannot be used.
-        ModelError: M or S is not finite under inputs within the bound.
+        InputError: if an argument cannot be used.
+        ModelError: if M or S is not finite under inputs within the bound.
     """
     _require_counts(restarts, seed, iterations)
     pair = _Pair(as_model(system), as_model(model), _single(task), _as_bound(bound))
@@ -130,7 +130,7 @@ class _Pair:
         return trajectory
 
     def gap(self, U: Array) -> Array:
-        """Return the states of S less those of M, shape ``(..., H + 1, n)``."""
+        """Return the states of S minus those of M, shape ``(..., H + 1, n)``."""
         return self.run(self.system, U).states - self.run(self.model, U).states
 
     def gradient(self, U: Array, weights: Array) -> Array:
@@ -138,7 +138,7 @@ class _Pair:
         return self._pulled_back(self.system, U, weights) - self._pulled_back(self.model, U, weights)
 
     def _pulled_back(self, model: Model, U: Array, weights: Array) -> Array:
-        """Carry the weights of the states back to the inputs by the adjoint ``l_t = w_t + A_t' l_(t+1)``."""
+        """Propagate the weights of the states back to the inputs by the adjoint ``l_t = w_t + A_t' l_(t+1)``."""
         A, B = linearize(model, self.run(model, U).states[..., :-1, :], U)
         A = np.broadcast_to(A, (*U.shape[:-1], *A.shape[-2:]))
         B = np.broadcast_to(B, (*U.shape[:-1], *B.shape[-2:]))
@@ -150,7 +150,7 @@ class _Pair:
         return gradient
 
 
-# What is maximised
+# Objectives
 
 
 class _Objective(Protocol):
@@ -159,7 +159,7 @@ class _Objective(Protocol):
     def value(self, gap: Array, rows: Rows) -> Array: ...
 
     def weights(self, gap: Array, rows: Rows) -> Array:
-        """Return a subgradient, of the gap's shape."""
+        """Return a subgradient in the shape of the gap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +177,7 @@ class _Fixed:
 
 @dataclass(frozen=True, eq=False)
 class _Norm:
-    """The norm of the gap's entries, each times its factor: zero for those that do not count."""
+    """The norm of the gap's entries, each times its factor; the factor is zero for entries that do not count."""
 
     order: float
     factors: Array
@@ -204,10 +204,11 @@ class _Norm:
         return (gap * self.factors).reshape(*gap.shape[:-2], -1)
 
     def directions(self, count: int) -> Array:
-        """Return linear functions below the norm that the restarts pursue first, shape ``(R, H + 1, n)``.
+        """Return the linear functions below the norm that the restarts maximise first, shape ``(R, H + 1, n)``.
 
-        The norm is the largest of them. Those of the infinity norm are one state at one time, with a sign; those of
-        the others have a sign for each state. The first few have every state, every sign and the final time.
+        The norm is the maximum of such functions. For the infinity norm each of them is one state at one time, with a
+        sign; for the other norms it has a sign for each state. The first few cover every state, every sign and the
+        final time.
         """
         times, components = np.flatnonzero(self.factors.any(axis=1)), np.flatnonzero(self.factors.any(axis=0))
         directions = np.zeros((count, *self.factors.shape))
@@ -223,7 +224,7 @@ class _Norm:
 
 
 def _van_der_corput(index: int) -> float:
-    """Return 0, 1/2, 1/4, 3/4, 1/8, ...: each new one falls into the largest gap."""
+    """Return an entry of the sequence 0, 1/2, 1/4, 3/4, 1/8, ..., in which each entry falls into the largest gap."""
     return sum((index >> j & 1) * 0.5 ** (j + 1) for j in range(index.bit_length()))
 
 
@@ -240,14 +241,14 @@ def _dual(vectors: Array, order: float) -> Array:
     return np.divide(vectors, norms, out=np.zeros_like(vectors), where=norms > 0)
 
 
-# How it is maximised
+# Maximisation
 
 _Proposal = Callable[[_Pair, Array, _Objective, Rows], tuple[Array, Array]]
-"""Where each entry of the inputs could go, and how much the objective would gain by that entry alone."""
+"""A proposal returns a target for each entry of the inputs, and the gain of the objective by that entry alone."""
 
 
 def _first_inputs(pair: _Pair, restarts: int, seed: int) -> Array:
-    """Return random sequences at the bound, from few to many switches, shape ``(R, H, m)``."""
+    """Return random sequences at the bound, with few to many switches, shape ``(R, H, m)``."""
     sequences = []
     for r in range(restarts):
         rng = np.random.default_rng(np.random.SeedSequence([seed, r]))
@@ -258,7 +259,7 @@ def _first_inputs(pair: _Pair, restarts: int, seed: int) -> Array:
 
 
 def _ascend(pair: _Pair, U: Array, objective: _Objective, proposal: _Proposal, iterations: int) -> Array:
-    """Improve each restart's inputs ``(R, H, m)`` until nothing proposed improves them."""
+    """Improve each restart's inputs ``(R, H, m)`` until no proposal improves them."""
     U = U.copy()
     rows = np.arange(len(U))
     values = objective.value(pair.gap(U), rows)
@@ -275,9 +276,9 @@ def _ascend(pair: _Pair, U: Array, objective: _Objective, proposal: _Proposal, i
 
 
 def _moves(U: Array, targets: Array, gains: Array) -> Array:
-    """Return ways from the inputs towards the targets, shape ``(K, N, H, m)``.
+    """Return moves of the inputs towards the targets, shape ``(K, N, H, m)``.
 
-    The 1, 2, 4, ... entries that gain the most go all the way; or all go a part of the way.
+    Either the 1, 2, 4, ... entries with the largest gains move all the way, or all entries move a part of the way.
     """
     size = U[0].size
     order = np.argsort(-gains.reshape(len(U), -1), axis=1, kind="stable")
@@ -288,7 +289,7 @@ def _moves(U: Array, targets: Array, gains: Array) -> Array:
 
 
 def _by_gradient(pair: _Pair, U: Array, objective: _Objective, rows: Rows) -> tuple[Array, Array]:
-    """Propose the bound on the side where the gradient points, as the Frank-Wolfe method does."""
+    """Propose the bound in the direction of the gradient, as the Frank-Wolfe method does."""
     gradient = pair.gradient(U, objective.weights(pair.gap(U), rows))
     targets = np.where(gradient == 0, U, np.copysign(pair.bound, gradient))
     return targets, gradient * (targets - U)

@@ -1,4 +1,4 @@
-"""The four figures of the running example: frameworks, trajectories, techniques, converged GP."""
+"""The four figures of the running example: frameworks, trajectories, techniques, and the converged GP."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SHOWN = 0
-"""The seed that figures of a single trial show: the first."""
+"""The seed of figures that show a single trial."""
 
 _BUDGET = 100
 _CONVERGED = 25
 
 
 class Frameworks:
-    """The paper's Fig. 1: the distance as each framework has it, over the goal angle."""
+    """The paper's Fig. 1: the distance in each framework over the goal angle."""
 
     name = "frameworks"
     title = "Pendulum: four frameworks"
     case = "pendulum"
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one run a trial."""
+        """Return one run for each trial."""
         return [Job("frameworks", "pendulum", seed, budget=scale.of(1001)) for seed in range(scale.trials)]
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the four profiles of the first trial."""
+        """Return a figure of the four profiles of the first trial."""
         found = results[self.jobs(scale)[SHOWN]]
         goals = np.array(found["goals"])
         figure = new_figure()
@@ -79,7 +79,7 @@ class Frameworks:
         )
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return what the paper says of the profiles."""
+        """Return the paper's claims about the profiles, with the measured numbers."""
         trials = [results[job] for job in self.jobs(scale)]
         return [_worst_goal(trials), _two_regions(trials), _ccdt_maximum(trials), _open_loop_is_higher(trials)]
 
@@ -140,14 +140,14 @@ def _open_loop_is_higher(trials: list[Result]) -> Claim:
 
 
 class Trajectories:
-    """The paper's Fig. 2: error between the closed loops at the goal where CCDT is largest."""
+    """The paper's Fig. 2: the closed loops of M and S at the goal with the largest CCDT distance."""
 
     name = "trajectories"
     title = "Pendulum: closed-loop trajectories"
     case = "pendulum"
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return the run that knows where CCDT is largest."""
+        """Return the run from which the goal with the largest CCDT distance is read."""
         return Frameworks().jobs(scale)[SHOWN : SHOWN + 1]
 
     def _loops(self, results: Results, scale: Scale) -> tuple[float, Trajectory, Trajectory]:
@@ -157,7 +157,7 @@ class Trajectories:
         return goal, *closed_loops(validation, validation.task(validation.space.parameters([goal])))
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the trajectories of M and S."""
+        """Return a figure of the trajectories of M and S."""
         goal, model, system = self._loops(results, scale)
         figure = plot.trajectories(model, system, states=("angle [rad]", "rate [rad/s]"), inputs=("torque [N m]",))
         figure.suptitle(f"goal {goal:.2f} rad, where CCDT is largest", fontsize=10)
@@ -170,7 +170,7 @@ class Trajectories:
         return Columns(names, [model.times.tolist(), *model.states.T.tolist(), *system.states.T.tolist()])
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return what the paper says of the trajectories."""
+        """Return the paper's claim about the trajectories, with the measured numbers."""
         goal, model, system = self._loops(results, scale)
         gap = np.abs(system.states - model.states)
         return [
@@ -183,14 +183,14 @@ class Trajectories:
 
 
 class Techniques:
-    """The paper's Fig. 3: error of the estimated d* against samples, for the three techniques."""
+    """The paper's Fig. 3: the error of the estimated d* against samples, for the three techniques."""
 
     name = "techniques"
     title = "Pendulum: three techniques"
     case = "pendulum"
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one campaign a technique and trial, and the truths."""
+        """Return one campaign for each technique and trial, and the truths."""
         seeds = range(scale.trials)
         searches = [
             Job("search", "pendulum", seed, search=name, budget=_BUDGET) for name in TECHNIQUES for seed in seeds
@@ -207,7 +207,7 @@ class Techniques:
         return np.array(rows)
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the median errors with their quartiles."""
+        """Return a figure of the median errors with their quartiles."""
         figure = new_figure()
         axes = figure.add_subplot()
         counts = np.arange(1, _BUDGET + 1)
@@ -238,7 +238,7 @@ class Techniques:
         return Columns(names, values)
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return what the paper says of the three techniques."""
+        """Return the paper's claims about the three techniques, with the measured numbers."""
         within = [
             executions_within(
                 distances_of(results[Job("search", "pendulum", seed, search="gp-ucb", budget=_BUDGET)]),
@@ -296,7 +296,7 @@ class ConvergedGP:
         return points[:, 0], values, fit_surrogate(space.to_unit(points), values)
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the GP with its band, the truth, the samples and the maximum."""
+        """Return a figure of the GP with its band, the truth, the samples and the maximum."""
         x, y, _ = self._fit(results)
         columns = self.data(results, scale)
         goals, truth, mean, deviation = (np.array(column) for column in columns.values)
@@ -330,7 +330,7 @@ class ConvergedGP:
         return Columns(names, [curve["points"], curve["distances"], mean.tolist(), deviation.tolist()])
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return what the paper says of the converged GP."""
+        """Return the paper's claim about the converged GP, with the measured numbers."""
         goals, truth, mean, deviation = (np.array(column) for column in self.data(results, scale).values)
         inside = np.abs(truth - mean) <= 1.96 * deviation + 1e-9
         near = np.abs(goals - goals[truth.argmax()]) < 0.3

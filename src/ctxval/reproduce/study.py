@@ -1,4 +1,4 @@
-"""What every figure of the paper is made from: the jobs it needs, its picture, its data, and the claims about it."""
+"""The contract of a study of one figure, with its jobs, picture, data and claims, and helpers for all studies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BLUE, ORANGE, GREEN, PINK, BLACK, GREY = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#000000", "#999999"
-"""Okabe and Ito's colours; line styles and markers differ too, for grey print."""
+"""Colours of Okabe and Ito; line styles and markers differ too, so that the figures are readable in grey."""
 
 TECHNIQUES = {
     "gp-ucb": ("CuSTOM (GP-UCB)", BLUE, "-", "o"),
@@ -30,12 +30,12 @@ TECHNIQUES = {
 
 @dataclass(frozen=True)
 class Scale:
-    """How much is run.
+    """The scale of a reproduction.
 
     Attributes:
-        name: full or quick.
-        trials: trials behind each median.
-        share: of the grids and the budgets.
+        name: the name, full or quick.
+        trials: number of trials of each median.
+        share: fraction of the full grids and budgets.
     """
 
     name: str
@@ -52,13 +52,13 @@ FULL, QUICK = Scale("full", 10, 1.0), Scale("quick", 3, 0.3)
 
 @dataclass(frozen=True)
 class Claim:
-    """One thing that the paper says, and what was measured.
+    """One claim of the paper, with the measured numbers.
 
     Attributes:
-        paper: the claim.
-        measured: the figures.
-        agrees: yes, partly or no.
-        remark: why it differs, as far as is known.
+        paper: the claim of the paper.
+        measured: the measured numbers.
+        agrees: whether they agree with the claim: yes, partly or no.
+        remark: the reason for a difference, if known.
     """
 
     paper: str
@@ -75,7 +75,7 @@ class Columns:
     values: Sequence[Sequence[float | str]] = field(default_factory=list)
 
     def write(self, path: Path) -> None:
-        """Write them as CSV."""
+        """Write the columns as CSV."""
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(self.names)
@@ -90,29 +90,29 @@ class Study(Protocol):
     case: str
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return what must be run."""
+        """Return the jobs whose results the study needs."""
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the picture."""
+        """Return the figure."""
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return what the picture shows, as numbers."""
+        """Return the numbers that the figure shows."""
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return what the paper says of it, and what was measured."""
+        """Return the paper's claims about the figure, with the measured numbers."""
 
 
 def new_figure(width: float = 6.4, height: float = 4.2) -> Figure:
     """Return an empty figure."""
-    from matplotlib.figure import Figure  # loaded only where something is drawn
+    from matplotlib.figure import Figure  # imported here, because only figures need it
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def running_estimate(distances: Sequence[float] | Array, search: str) -> Array:
-    """Return the estimate of d* after 1, 2, ... executions: the largest distance, after discarding for SD.
+    """Return the estimates of d* after 1, 2, ... executions: the largest distance, or the largest one that SD keeps.
 
-    NaN while there is none. Failed executions count and add nothing.
+    The estimate is NaN until there is one. Failed executions count as executions and do not change the estimate.
     """
     discard = DISCARDED if search == "sampling-discarding" else 0
     largest: list[float] = []
@@ -126,23 +126,23 @@ def running_estimate(distances: Sequence[float] | Array, search: str) -> Array:
 
 
 def executions_within(distances: Sequence[float] | Array, search: str, truth: float, percent: float) -> float:
-    """Return after how many executions the estimate is within so many per cent of d*; infinity if never."""
+    """Return the number of executions until the estimate is within ``percent`` per cent of d*; infinity if never."""
     reached = running_estimate(distances, search) >= truth * (1 - percent / 100)
     return float(np.argmax(reached) + 1) if reached.any() else np.inf
 
 
 def spread(values: Sequence[float] | Array) -> tuple[float, float, float]:
-    """Return median, least and largest."""
+    """Return median, smallest and largest value."""
     array = np.asarray(values, dtype=np.float64)
-    # Infinity stands for "never": a median between a number and never is never.
+    # Infinity stands for "never"; the median of a number and "never" is "never".
     ordered = np.sort(array)
     return float(ordered[len(ordered) // 2] if np.isinf(array).any() else np.median(array)), ordered[0], ordered[-1]
 
 
 def draw_executions(axes: Axes, x: Array, medians: dict[str, Array], budgets: dict[str, int], dodge: float) -> None:
-    """Draw the median executions of each technique; open triangles at the budget stand for never.
+    """Draw the median executions of each technique; an open triangle at the budget stands for never.
 
-    ``dodge`` moves the triangles of one technique beside those of another.
+    ``dodge`` is the horizontal distance between the triangles of two techniques.
     """
     for i, (search, (label, colour, line, marker)) in enumerate(TECHNIQUES.items()):
         never = np.isinf(medians[search])

@@ -1,4 +1,4 @@
-"""The table of the paper's claims beside what was measured."""
+"""The table of the paper's claims with the measured numbers."""
 
 from __future__ import annotations
 
