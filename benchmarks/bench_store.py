@@ -66,7 +66,7 @@ def fill(path: Path, search: str, count: int = TRIALS) -> None:
     store, space = first.store, first.validation.space
     points = np.random.default_rng(0).random((count, 2))
     values = height(points)
-    with store._transaction():
+    with store._database.transaction():
         for number in range(1, count):
             point = points[number]
             names = space.describe_point(space.from_unit(point))

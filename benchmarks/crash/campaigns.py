@@ -24,6 +24,7 @@ from ctxval.core.controller import Controller  # noqa: E402
 from ctxval.core.task import Task  # noqa: E402
 from ctxval.core.trial import Trial  # noqa: E402
 from ctxval.errors import CtxvalError, DistanceError, ExecutionError, StoreAccessError  # noqa: E402
+from ctxval.storage.database import Database  # noqa: E402
 
 STORE = "runs/a.sqlite"
 BUDGET = 6
@@ -62,20 +63,31 @@ class Picky:
         return abs(system.states[..., -1, 0] - model.states[..., -1, 0])
 
 
+class MarkedDatabase(Database):
+    """A database that says after each transaction what it holds then."""
+
+    def __init__(self, path: str | Path | None, say: Callable[[object], None]) -> None:
+        self._say = say
+        super().__init__(path)
+
+    @contextlib.contextmanager
+    def transaction(self) -> Iterator[None]:
+        with super().transaction():
+            yield
+        self._say(content(self._connection))
+
+
 class Marked(Store):
-    """A store that says after each transaction what it holds then."""
+    """A store that acknowledges each transaction in a file of marks."""
 
     def __init__(self, path: Path, marks: Path, synchronous: str | None) -> None:
         self.marks = os.open(marks, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         super().__init__(path)
         if synchronous is not None:
-            self._connection.execute(f"PRAGMA synchronous = {synchronous}")
+            self._database.execute(f"PRAGMA synchronous = {synchronous}")
 
-    @contextlib.contextmanager
-    def _transaction(self) -> Iterator[None]:
-        with super()._transaction():
-            yield
-        self.say(content(self._connection))
+    def _opened(self, path: str | Path | None) -> Database:
+        return MarkedDatabase(path, self.say)
 
     def say(self, what: object) -> None:
         """Acknowledge something."""

@@ -47,7 +47,10 @@ class Store:
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
-        self._database = Database(path)
+        self._database = self._opened(path)
+
+    def _opened(self, path: str | Path | None) -> Database:
+        return Database(path)
 
     @property
     def path(self) -> Path | None:
