@@ -7,7 +7,7 @@ import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from ctxval._util.texts import reason_of
 from ctxval.errors import CtxvalError, InputError, UnknownNameError
@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # importlib.metadata is slow to import, and is needed only fo
     from importlib.metadata import EntryPoint
 
 Part = TypeVar("Part", bound=Callable[..., Any])
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def declaration_of(found: Any) -> Declaration | None:
         return None
 
 
-class Registry(Mapping[str, Any]):
+class Registry(Mapping[str, Any], Generic[Made]):
     """The parts of one kind by name: a mapping of names to classes, or to functions that make an object.
 
     A built-in part is never replaced by one of an installed package. Installed packages are looked at only if a name
@@ -173,7 +174,7 @@ class Registry(Mapping[str, Any]):
         lines = (inspect.getdoc(self.find(name)) or "").splitlines()
         return lines[0].removesuffix(".") if lines else ""
 
-    def make(self, name: str, /, **arguments: Any) -> Any:
+    def make(self, name: str, /, **arguments: Any) -> Made:
         """Return a new part from its name and its arguments.
 
         Raises:
@@ -182,7 +183,7 @@ class Registry(Mapping[str, Any]):
         """
         return self.require_made(name, construct(f"the {self.kind} {name}", self.find(name), arguments))
 
-    def require_made(self, name: str, made: Any) -> Any:
+    def require_made(self, name: str, made: Any) -> Made:
         """Return a part that was made if it has the method of its kind.
 
         Raises:
@@ -191,7 +192,8 @@ class Registry(Mapping[str, Any]):
         if self.method is not None and not callable(getattr(made, self.method, None)):
             got = type(made).__qualname__
             raise InputError(f"the {self.kind} {name} must have the method {self.method}; its class, {got}, has none.")
-        return made
+        found: Made = made
+        return found
 
     def __getitem__(self, name: str) -> Any:
         try:

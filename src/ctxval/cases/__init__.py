@@ -19,7 +19,9 @@ NAMES: dict[str, str] = {
 
 __all__ = ["NAMES", "REGISTRY", "by_name", "options_of", "text_of"]
 
-REGISTRY = Registry("case", __name__, modules={name: f"{__name__}.{name}:experiment" for name in NAMES})
+REGISTRY: Registry[Experiment] = Registry(
+    "case", __name__, modules={name: f"{__name__}.{name}:experiment" for name in NAMES}
+)
 """The cases that are found by name: those of this package, and those that installed packages add."""
 
 

@@ -18,7 +18,7 @@ from ctxval.errors import CertificateError, InputError, UnknownNameError
 Kind = TypeVar("Kind", bound=type[CertificateKind])
 
 
-class KindRegistry(Registry):
+class KindRegistry(Registry[CertificateKind]):
     """Kinds of certificates by name: built-in ones, those of installed packages, and those registered by a decorator.
 
     A kind that was registered runs its user's code, so it never counts as data.

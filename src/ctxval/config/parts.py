@@ -26,7 +26,7 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
 
-REGISTRIES: dict[str, Registry] = {
+REGISTRIES: dict[str, Registry[Any]] = {
     registry.kind: registry
     for registry in (systems.REGISTRY, models.REGISTRY, controllers.REGISTRY, distances.REGISTRY)
 }
@@ -65,7 +65,7 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) 
     return registry.require_made(name, _built(kind, what, build, arguments, folder))
 
 
-def _referenced(registry: Registry, what: str, found: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
+def _referenced(registry: Registry[Any], what: str, found: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
     """Return the part that a reference names: an object, or what a class or a function makes; checked before a call."""
     kind = registry.kind
     if isinstance(found, type):

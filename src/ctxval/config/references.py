@@ -144,7 +144,7 @@ def _place(file: str | None, folders: Any) -> str | None:
 # What a reference must name
 
 
-def require_part(registry: Registry, what: str, found: Any) -> Any:
+def require_part(registry: Registry[Any], what: str, found: Any) -> Any:
     """Return an object or a class if it has the method of its kind, a model or a distance also if it is a function.
 
     Args:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from ctxval._util.registry import Registry
 from ctxval.controllers.ilqr import ILQR, ILQRSolution
 from ctxval.controllers.lqr import LQR, StationaryLQR
@@ -32,20 +30,7 @@ __all__ = [
     "write_controller",
 ]
 
-REGISTRY = Registry("synthesizer", __name__, method="design")
+REGISTRY: Registry[Synthesizer] = Registry("synthesizer", __name__, method="design")
 """The synthesizers that are found by name: those of this package, and those that installed packages add."""
 
-
-def by_name(name: str, /, **arguments: Any) -> Synthesizer:
-    """Return a new synthesizer from its name and its arguments.
-
-    Args:
-        name: of :data:`REGISTRY`, such as ``"LQR"``.
-        arguments: those of its class.
-
-    Raises:
-        UnknownNameError: there is no such synthesizer, or it takes no such argument; the message has the nearest name.
-        InputError: the synthesizer refuses these arguments.
-    """
-    made: Synthesizer = REGISTRY.make(name, **arguments)
-    return made
+by_name = REGISTRY.make

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from ctxval._util.registry import Registry
 from ctxval.core.distance import ComposedDistance, Distance
 from ctxval.distances.final_state import FinalState
@@ -22,20 +20,7 @@ __all__ = [
     "by_name",
 ]
 
-REGISTRY = Registry("distance", __name__, method="__call__")
+REGISTRY: Registry[Distance] = Registry("distance", __name__, method="__call__")
 """The distances that are found by name: those of this package, and those that installed packages add."""
 
-
-def by_name(name: str, /, **arguments: Any) -> Distance:
-    """Return a new distance from its name and its arguments.
-
-    Args:
-        name: of :data:`REGISTRY`, such as ``"FinalState"``.
-        arguments: those of its class.
-
-    Raises:
-        UnknownNameError: there is no such distance, or it takes no such argument; the message has the nearest name.
-        InputError: the distance refuses these arguments.
-    """
-    made: Distance = REGISTRY.make(name, **arguments)
-    return made
+by_name = REGISTRY.make

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from ctxval._util.registry import Registry
 from ctxval.core.model import Function, Model, linearize
 from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
@@ -30,20 +28,7 @@ __all__ = [
     "state_space",
 ]
 
-REGISTRY = Registry("model", __name__, method="step")
+REGISTRY: Registry[Model] = Registry("model", __name__, method="step")
 """The models that are found by name: those of this package, and those that installed packages add."""
 
-
-def by_name(name: str, /, **arguments: Any) -> Model:
-    """Return a new model from its name and its arguments.
-
-    Args:
-        name: of :data:`REGISTRY`, such as ``"Linear"``.
-        arguments: those of its class.
-
-    Raises:
-        UnknownNameError: there is no such model, or it takes no such argument; the message has the nearest name.
-        InputError: the model refuses these arguments.
-    """
-    made: Model = REGISTRY.make(name, **arguments)
-    return made
+by_name = REGISTRY.make

@@ -45,7 +45,7 @@ Scalar = BayesianOptimisation
 Climbs = TrustRegion
 """The older name of :class:`TrustRegion`."""
 
-REGISTRY = Registry("search", __name__, method="ask")
+REGISTRY: Registry[Search] = Registry("search", __name__, method="ask")
 """The searches that are found by name: those of this package, and those that installed packages add."""
 
 NAMES: dict[str, type[Any]] = {name: REGISTRY.find(name) for name in sorted((*REGISTRY.built_in, *REGISTRY.aliases))}

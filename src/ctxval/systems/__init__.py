@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from ctxval._util.registry import Registry
 from ctxval.core.system import System
 from ctxval.systems.fmu import FMU
@@ -29,20 +27,7 @@ __all__ = [
     "rk4",
 ]
 
-REGISTRY = Registry("system", __name__, method="execute")
+REGISTRY: Registry[System] = Registry("system", __name__, method="execute")
 """The systems that are found by name: those of this package, and those that installed packages add."""
 
-
-def by_name(name: str, /, **arguments: Any) -> System:
-    """Return a new system from its name and its arguments.
-
-    Args:
-        name: of :data:`REGISTRY`, such as ``"Simulated"``.
-        arguments: those of its class.
-
-    Raises:
-        UnknownNameError: there is no such system, or it takes no such argument; the message has the nearest name.
-        InputError: the system refuses these arguments.
-    """
-    made: System = REGISTRY.make(name, **arguments)
-    return made
+by_name = REGISTRY.make
