@@ -7,13 +7,16 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test check reliability crash-states attack bench bench-peers study reproduce search calibrate parts pictures clean
+.PHONY: demo test quick check reliability crash-states attack bench bench-peers study reproduce search calibrate parts pictures clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
 
 test: check
 	$(BIN)/python -m pytest
+
+quick: .venv/.test  ## everything that takes less than half a second, on all cores, for daily work
+	$(BIN)/python -m pytest -q -m "not slow" --numprocesses auto
 
 check: .venv/.test
 	$(BIN)/ruff check .

@@ -23,6 +23,7 @@ def block(document: str, language: str, holding: str) -> str:
     return next(code for code in blocks if holding in code)
 
 
+@pytest.mark.slow
 def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}

@@ -134,6 +134,7 @@ def test_a_recipe_is_short(part: str) -> None:
     assert Path(recipe.test).parts[1] == Path(recipe.module).parts[2]  # tests mirror the source
 
 
+@pytest.mark.slow
 def test_what_the_recipes_give_passes_make_check(tree: Path) -> None:
     for recipe in RECIPES.values():  # it is formatted and in order as it is written in the guide
         assert (tree / recipe.module).read_text() == recipe.source
@@ -143,12 +144,14 @@ def test_what_the_recipes_give_passes_make_check(tree: Path) -> None:
         assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_what_the_recipes_give_passes_its_tests_and_those_of_all_parts(tree: Path) -> None:
     own = [recipe.test for recipe in RECIPES.values()]
     done = run(tree, "pytest", "-q", "-p", "no:cacheprovider", *own, *TESTS)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", RECIPES)
 def test_a_part_is_found_in_an_experiment_file_and_in_the_page(part: str, tree: Path, tmp_path: Path) -> None:
     toml = RECIPES[part].toml

@@ -268,6 +268,7 @@ def test_every_public_class_has_an_example() -> None:
     assert sorted(CLASSES) == sorted(EXAMPLES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
 def test_public_objects_show_themselves_in_a_few_lines(name: str) -> None:
     found = EXAMPLES[name]()
@@ -471,6 +472,7 @@ def test_collections_are_shown_by_their_first_items() -> None:
     assert shown(np.array([True, False])) == "[True, False]"
 
 
+@pytest.mark.slow
 def test_what_identifies_an_object_in_a_store_does_not_depend_on_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> None:
     names = [name for name in EXAMPLES if name not in ("Campaign", "Store", "OpenTrial")]
     objects = {name: EXAMPLES[name]() for name in names}

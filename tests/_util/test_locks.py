@@ -18,6 +18,7 @@ def taken_elsewhere(path: Path) -> bool:
     return subprocess.run([sys.executable, "-c", TRY, str(path)], capture_output=True).returncode == 0
 
 
+@pytest.mark.slow
 def test_a_lock_is_held_until_it_is_released(tmp_path: Path) -> None:
     path = tmp_path / "lock"
     held = FileLock(path)
@@ -69,6 +70,7 @@ def test_a_database_is_locked_by_any_of_its_names_and_stays_usable(tmp_path: Pat
     connection.close()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not LOCKS_FILE_ITSELF, reason="locks of SQLite are not inherited anyway")
 def test_a_forked_process_neither_holds_nor_releases_the_lock(tmp_path: Path) -> None:
     path = tmp_path / "lock"

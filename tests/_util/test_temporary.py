@@ -91,6 +91,7 @@ def test_folders_in_use_stay_whoever_has_them() -> None:
     mine.remove()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
 def test_a_fork_leaves_its_parents_folder_alone() -> None:
     done = subprocess.run([sys.executable, "-c", FORK], capture_output=True, text=True)

@@ -32,6 +32,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return attack.prepare(tmp_path_factory.mktemp("attack") / "base")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", attack.FAMILIES)
 def test_hostile_input_ends_in_a_sentence(family: str, base: Path) -> None:
     for number in range(EACH[family]):
@@ -77,6 +78,7 @@ def test_the_cage_notices(code: str, wrong: str, monkeypatch: pytest.MonkeyPatch
     assert wrong in ran(monkeypatch, tmp_path, lambda: exec(code, {"os": os, "sys": sys}))
 
 
+@pytest.mark.slow
 def test_what_never_ends_is_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(cage, "CPU", 1)
 
@@ -91,6 +93,7 @@ def test_what_ends_well_is_let_be(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     assert ran(monkeypatch, tmp_path, lambda: print(json.dumps({"a": "ä"}))) == ()
 
 
+@pytest.mark.slow
 def test_the_attack_goes_on_where_it_was(base: Path) -> None:
     none: dict[str, Any] = {}
     first, _ = attack.attack(60, 1, base, workers=1, done=none, apart=10**6, only=["told"])
@@ -103,6 +106,7 @@ def test_the_page_is_what_the_stored_counts_give() -> None:
     assert reliability.page() == reliability.PAGE.read_text()
 
 
+@pytest.mark.slow
 def test_an_interpreter_of_its_own_says_the_same(base: Path, tmp_path: Path) -> None:
     (tmp_path / "f").mkdir()
     shutil.copy(base / "a.sqlite", tmp_path / "f" / "a.sqlite")

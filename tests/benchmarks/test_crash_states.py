@@ -80,6 +80,7 @@ def test_a_renamed_file_has_one_of_its_names() -> None:
 # Campaigns
 
 
+@pytest.mark.slow
 @needs_strace
 @pytest.mark.parametrize(("name", "mode"), [("hand", "ordered"), ("full", "strict")])
 def test_no_acknowledged_execution_is_lost_or_doubled(name: str, mode: Mode, tmp_path: Path) -> None:

@@ -57,6 +57,7 @@ def best_of_random(case: str, budget: int) -> Array:
     return validation.distances(points).reshape(100, budget).max(axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "budget"), [("hidden-load", 14), ("corner-stop", 8)])
 def test_the_search_falls_back_says_why_and_beats_random(case: str, budget: int) -> None:
     campaign = Campaign(misleading.CASES[case](0).validation, search=Thrifty(), seed=0).run(budget)

@@ -65,6 +65,7 @@ def test_functions_agree_with_the_cases(case: str, name: str, options: dict[str,
     assert expected.max() <= found.maximum
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_said_of_the_functions_is_so(case: str) -> None:
     validation = experiment(case, 0).validation

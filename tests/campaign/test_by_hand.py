@@ -151,6 +151,7 @@ def test_a_folder_that_cannot_be_written_leaves_the_trial_open_and_says_how_to_g
     assert asked(invoke, "a.sqlite", "--trial", "1")["trial"] == 1
 
 
+@pytest.mark.slow
 def test_asking_by_command_chooses_what_a_campaign_chooses(invoke: Any) -> None:
     sys.path.insert(0, os.getcwd())
     import my_rig  # type: ignore[import-not-found]
@@ -307,6 +308,7 @@ def test_the_task_of_a_failed_trial_can_be_executed_again(invoke: Any) -> None:
     assert "there is no trial 7; there are 2, numbered from 0" in refused.stderr
 
 
+@pytest.mark.slow
 def test_why_a_failed_task_is_executed_again_is_kept_and_certified(invoke: Any) -> None:
     new(invoke)
     invoke("tell", "a.sqlite", "0", "--failed", "the fuse blew")
@@ -527,6 +529,7 @@ def ends(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
     return ended
 
 
+@pytest.mark.slow
 def test_several_terminals_ask_and_tell_at_once(invoke: Any) -> None:
     ask = ["ask", "my_rig:experiment", "--store", "a.sqlite", "--search", "random", "--json"]
     first = ends([start(*ask) for _ in range(4)])
@@ -558,6 +561,7 @@ def test_an_asking_campaign_learns_what_others_stored(validation: Any, tmp_path:
         first.ask()
 
 
+@pytest.mark.slow
 def test_a_point_that_was_asked_for_twice_does_not_hinder_a_resumption(validation: Any, tmp_path: Path) -> None:
     campaign = Campaign(validation, store=tmp_path / "a.sqlite", seed=3)
     for _ in range(2):

@@ -72,6 +72,7 @@ def test_running_in_pieces_equals_running_at_once(validation: Validation, tmp_pa
     assert facts(pieces.trials) == facts(whole.trials)
 
 
+@pytest.mark.slow
 def test_the_budget_is_a_total(validation: Validation) -> None:
     campaign = Campaign(validation).run(5)
     assert len(campaign.run(5).trials) == 5
@@ -181,6 +182,7 @@ def test_a_trial_can_be_told_later_by_its_number(validation: Validation, tmp_pat
     assert second.tell(0, trajectory).distance == validation.measure(opened.plan, trajectory)
 
 
+@pytest.mark.slow
 def test_running_leaves_trials_that_were_asked_by_hand_open(validation: Validation) -> None:
     campaign = Campaign(validation)
     opened = campaign.ask()
@@ -245,6 +247,7 @@ def test_a_model_that_fails_stops_the_campaign_and_the_next_run_goes_on_behind_i
     assert len(campaign.trials) == 4
 
 
+@pytest.mark.slow
 def test_a_distance_of_nan_stops_the_campaign_but_keeps_the_execution(validation: Validation) -> None:
     campaign = Campaign(make_validation(distance=lambda a, b, task: np.nan))
     with pytest.raises(DistanceError, match="one finite number"):
@@ -253,6 +256,7 @@ def test_a_distance_of_nan_stops_the_campaign_but_keeps_the_execution(validation
     assert campaign.trajectories(campaign.trials[0])[1] is not None
 
 
+@pytest.mark.slow
 def test_verdicts_are_executed_facts_or_undecided(validation: Validation) -> None:
     campaign = gp_ucb(validation).run(8)
     assert campaign.worst is not None
@@ -422,6 +426,7 @@ def test_a_campaign_stops_before_the_execution_that_is_not_needed(validation: Va
     assert facts(campaign.trials) == facts(gp_ucb(validation, seed=1).run(7).trials)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 def test_a_campaign_executes_what_nothing_came_near_to_before_it_validates(tmp_path: Path) -> None:
     def campaign(name: str) -> Campaign:
@@ -451,6 +456,7 @@ def test_a_campaign_ends_at_its_counterexample(validation: Validation) -> None:
     assert falsified.verdict(1e-6).answer == "falsified"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 def test_workers_decide_together(validation: Validation) -> None:
     decided = Campaign(validation, search=OneCorner(), seed=1).run_until_decided(1e3, 20, workers=2)

@@ -23,6 +23,7 @@ def no_data(validation: Validation) -> Validation:
     return validation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("with_data", "budget"), [(True, 3), (False, 5)])
 def test_the_worst_task_is_found_in_a_handful_of_executions(with_data: bool, budget: int) -> None:
     case = cases.by_name("pendulum", 0)
@@ -43,6 +44,7 @@ def test_linear_systems_take_two_executions_more_than_they_have_states(seed: int
     assert campaign.worst.distance == pytest.approx(case.truth().distance, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_data", [True, False])
 def test_running_in_pieces_equals_running_at_once(tmp_path: Path, with_data: bool) -> None:
     def validation() -> Validation:
@@ -55,6 +57,7 @@ def test_running_in_pieces_equals_running_at_once(tmp_path: Path, with_data: boo
     assert any(t.note is not None and t.note["engine"] == "climb" for t in whole.trials)
 
 
+@pytest.mark.slow
 def test_an_interrupted_execution_and_failures_change_nothing_that_is_chosen(tmp_path: Path) -> None:
     class Rig(FaultyRig):
         interrupt = False
@@ -103,6 +106,7 @@ def test_a_note_of_a_task_that_could_not_be_planned_is_kept(tmp_path: Path) -> N
     assert reopened.run(2).executions == 2
 
 
+@pytest.mark.slow
 def test_a_hidden_state_that_misleads_the_prediction_does_not_keep_the_worst_task_hidden() -> None:
     class Sticky:
         """Executions whose friction grows with the time: no function of state and input."""

@@ -151,6 +151,7 @@ def check_damaged(path: Path, expected: Everything) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_flipped_bytes_are_noticed_or_harmless(whole: Path, tmp_path: Path) -> None:
     expected, data = everything(Store(whole)), whole.read_bytes()
     rng = np.random.default_rng(0)
@@ -226,6 +227,7 @@ def run_limited(store: Path, budget: int, size: int) -> subprocess.CompletedProc
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
 
 
+@pytest.mark.slow
 def test_a_full_disk_loses_no_execution(tmp_path: Path) -> None:
     store = tmp_path / "a.sqlite"
     campaign = long_campaign(store).run(3)
@@ -448,6 +450,7 @@ def test_lines_are_counted_with_the_blank_ones(tmp_path: Path) -> None:
 # Programs that talk
 
 
+@pytest.mark.slow
 def test_what_a_system_prints_does_not_spoil_the_json(tmp_path: Path) -> None:
     (tmp_path / "talking.py").write_text(
         "import os\nfrom conftest import make_validation\n\n"

@@ -24,6 +24,7 @@ def test_a_point_that_waits_for_its_value_is_in_the_history_once() -> None:
     assert history_of(trials)[0].note == {"first": True}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("data", [True, False])
 def test_auto_goes_on_although_distances_were_told_without_trajectories(tmp_path: Path, data: bool) -> None:
     validation = make_validation()

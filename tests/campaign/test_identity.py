@@ -263,6 +263,7 @@ def with_older_names(path: Path) -> str:
     return str(text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "old"),
     [
@@ -288,6 +289,7 @@ def test_a_store_with_the_older_name_of_a_search_goes_on(
 # Without a search
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "search",
     [
@@ -425,6 +427,7 @@ def test_counters_of_a_system_do_not_go_into_the_store_with_another_distance(tmp
     assert campaign(tmp_path / "a.sqlite", make_validation(system=rig, distance=Scaled(scale=2.0))).executions == 2
 
 
+@pytest.mark.slow
 def test_a_task_that_was_told_in_another_distance_counts_again_once_it_is_executed(store: Path) -> None:
     told = campaign(store)
     told.tell(told.ask({"goal": 1.0}), distance=0.25)

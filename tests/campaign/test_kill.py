@@ -46,6 +46,7 @@ def resumed(store: Path) -> tuple[list[tuple[object, ...]], list[tuple[object, .
     return before, content(store)
 
 
+@pytest.mark.slow
 def test_a_killed_campaign_resumes_bit_for_bit(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     kills = request.config.getoption("--kills")
     whole = tmp_path / "whole.sqlite"

@@ -30,6 +30,7 @@ def run(store: Path, search: str, budget: int, processor: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("search", ["gp-ucb", "auto"])
 def test_a_campaign_goes_on_upon_another_processor(search: str, tmp_path: Path) -> None:
     moved, unmoved = tmp_path / "moved.sqlite", tmp_path / "unmoved.sqlite"

@@ -113,6 +113,7 @@ def test_a_recursion_limit_that_a_system_sets_is_its_own() -> None:
     assert sys.getrecursionlimit() == before
 
 
+@pytest.mark.slow
 def test_run_ends_with_a_report_if_the_system_leaves_hard(tmp_path: Path) -> None:
     (tmp_path / "rig.py").write_text(
         textwrap.dedent("""

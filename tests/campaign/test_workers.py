@@ -192,6 +192,7 @@ def test_an_execution_that_kills_every_worker_fails_in_the_end(tmp_path: Path) -
     assert campaign.executions == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hard", [False, True])
 def test_an_execution_that_hangs_is_ended(tmp_path: Path, hard: bool) -> None:
     campaign = run_of(Deadly(tmp_path, hang=1, hard=hard), 4, workers=2, timeout=0.5)
@@ -200,6 +201,7 @@ def test_an_execution_that_hangs_is_ended(tmp_path: Path, hard: bool) -> None:
     assert len(campaign.completed) == 3
 
 
+@pytest.mark.slow
 def test_a_timeout_alone_is_one_worker(tmp_path: Path) -> None:
     campaign = run_of(Deadly(tmp_path, hang=1), 3, timeout=0.5)
     assert [trial.state for trial in campaign.trials] == ["failed", "completed", "completed"]
@@ -289,6 +291,7 @@ class Picklable:
         raise AssertionError
 
 
+@pytest.mark.slow
 def test_a_thread_that_hangs_is_given_up() -> None:
     release = threading.Event()
 
@@ -303,6 +306,7 @@ def test_a_thread_that_hangs_is_given_up() -> None:
     assert [trial.failure for trial in campaign.trials] == ["the execution did not end within 0.2 s"] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs dask.distributed")
 @pytest.mark.filterwarnings("ignore")
 def test_a_campaign_on_dask_survives_the_death_of_a_worker(tmp_path: Path) -> None:
@@ -326,6 +330,7 @@ def test_a_campaign_on_dask_survives_the_death_of_a_worker(tmp_path: Path) -> No
     assert [trial.distance for trial in trials] == [trial.distance for trial in alone.trials]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs dask.distributed")
 def test_a_campaign_whose_dask_scheduler_is_killed_goes_on_with_another(tmp_path: Path) -> None:
     status, stderr, before = rig_cluster.killed_and_resumed(tmp_path, after=4, wait=0.1)
@@ -397,6 +402,7 @@ def ended(store: Path) -> int:
     return sum(trial.state == "completed" for trial in Store(store).trials()) if store.exists() else 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 3])
 def test_the_first_interrupt_ends_after_the_running_executions(tmp_path: Path, workers: int) -> None:
     store, marks = tmp_path / "a.sqlite", tmp_path / "marks"
@@ -415,6 +421,7 @@ def test_the_first_interrupt_ends_after_the_running_executions(tmp_path: Path, w
     assert facts(logged(str(store), str(marks), 0).run(len(states) + 2)) == facts(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 3])
 def test_the_second_interrupt_ends_at_once_and_the_store_can_be_resumed(tmp_path: Path, workers: int) -> None:
     store, marks = tmp_path / "a.sqlite", tmp_path / "marks"
@@ -432,6 +439,7 @@ def test_the_second_interrupt_ends_at_once_and_the_store_can_be_resumed(tmp_path
     assert facts(resumed) == facts(logged(None, str(marks), 0).run(12))
 
 
+@pytest.mark.slow
 def test_workers_do_not_outlive_a_killed_campaign(tmp_path: Path) -> None:
     store, marks = tmp_path / "a.sqlite", tmp_path / "marks"
     process = start(store, marks, 3)

@@ -96,6 +96,7 @@ def test_every_target_is_within_reach_and_clear_of_the_stops() -> None:
 # The data and the models
 
 
+@pytest.mark.slow
 def test_the_recordings_hardly_meet_the_stops() -> None:
     settings = arm.Settings()
     for seed in range(5):
@@ -160,6 +161,7 @@ def test_a_campaign_runs_on_it(experiment: Experiment) -> None:
 # The two aspects
 
 
+@pytest.mark.slow
 def test_aspects_are_the_distances_to_the_targets(aspects: dict[str, arm.Aspects]) -> None:
     whole = arm.experiment(1, "gp", SMALL).validation
     to_goal = Validation(
@@ -188,6 +190,7 @@ def test_the_gaussian_process_does_the_tasks_and_the_linear_model_does_not(aspec
         assert np.median(error) > 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_gaussian_process_mimics_the_arm_best_and_the_linear_model_worst(seed: int) -> None:
     settings = replace(arm.Settings(), restarts=1, training=300)

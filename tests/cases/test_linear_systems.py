@@ -144,6 +144,7 @@ def test_an_unknown_option_is_refused_with_the_nearest() -> None:
         cases.by_name("linear", dims=3)
 
 
+@pytest.mark.slow
 def test_a_campaign_finds_the_worst_task_and_falsifies() -> None:
     case = linear.experiment(0, 2)
     campaign = Campaign(case.validation).run(20)

@@ -22,6 +22,7 @@ def test_distances_are_in_diagonals() -> None:
     assert farthest_task(np.full((1, 3), 0.5)) == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000), st.integers(1, 3), st.floats(0.15, 0.6))
 def test_executing_the_points_covers_and_none_of_them_is_needless(seed: int, d: int, resolution: float) -> None:
     X = np.random.default_rng(seed).random((3, d))

@@ -32,6 +32,7 @@ def surprises(hyper: Hyperparameters, assumed: Hyperparameters) -> list[float]:
     return [diagnose([condition(assumed, X, y)], X).surprise for X, y in drawn]
 
 
+@pytest.mark.slow
 def test_surprises_of_the_process_itself_are_uniform_whatever_chose_the_tasks() -> None:
     assert kstest(surprises(KNOWN, KNOWN), "uniform").pvalue > 1e-3
 
@@ -45,6 +46,7 @@ def test_of_independent_values_the_surprise_is_the_t_tests_of_each_against_those
     assert diagnosis.trial == 2 + int(np.argmin(tails))
 
 
+@pytest.mark.slow
 def test_surprises_of_another_process_are_not() -> None:
     rough = Hyperparameters(1.5, np.array([np.log(0.02)]), float(np.log(EXACT)))
     assert kstest(surprises(rough, KNOWN), "uniform").pvalue < 1e-6
@@ -133,6 +135,7 @@ def test_left_out_alone_the_surprise_is_the_t_test_of_each_against_all_others() 
     assert diagnosis.trial == int(np.argmin(tails))
 
 
+@pytest.mark.slow
 def test_left_out_surprises_of_the_process_itself_are_as_rare_as_stated() -> None:
     found = []
     for seed in range(400):

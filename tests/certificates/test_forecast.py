@@ -29,6 +29,7 @@ def test_what_is_decided_already_takes_no_more_executions(sample: Sample, found:
     assert (falsified.executions, falsified.validated, falsified.falsified) == (0, 0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_a_threshold_closer_to_the_largest_distance_takes_more_executions_to_keep(
     sample: Sample, found: Maxima
 ) -> None:
@@ -41,6 +42,7 @@ def test_a_threshold_closer_to_the_largest_distance_takes_more_executions_to_kee
     assert near.falsified > far.falsified
 
 
+@pytest.mark.slow
 def test_what_the_bound_leaves_undecided_takes_at_least_one_execution(sample: Sample, found: Maxima) -> None:
     for share in (0.3, 0.6, 0.9, 0.99):
         tau = sample.best + share * (found.upper(CONFIDENCE) - sample.best)

@@ -123,6 +123,7 @@ def from_prior(seed: int) -> tuple[Sample, float]:
     return Sample(grid[rows], path[rows], ["acquisition"] * 7, ["completed"] * 7), float(path.max())
 
 
+@pytest.mark.slow
 def test_on_the_prior_the_stated_confidence_is_the_measured_coverage() -> None:
     runs, held = 60, {0.5: 0, 0.9: 0}
     for seed in range(runs):
@@ -207,6 +208,7 @@ def test_one_task_with_two_distances_is_not_deterministic() -> None:
 # The error of the bound
 
 
+@pytest.mark.slow
 def test_the_error_is_what_seeds_differ_by() -> None:
     trials = sample(7)
     found = [draw_maxima(trials, draws=48, paths=4, seed=seed) for seed in range(24)]
@@ -217,6 +219,7 @@ def test_the_error_is_what_seeds_differ_by() -> None:
         assert (np.abs(bounds - bounds.mean()) < 2 * errors).mean() >= 0.8
 
 
+@pytest.mark.slow
 def test_more_draws_have_a_smaller_error() -> None:
     few, many = (draw_maxima(sample(7), draws=draws, paths=4) for draws in (16, 256))
     assert 0 < many.error(0.9) < 0.7 * few.error(0.9)

@@ -72,6 +72,7 @@ def test_the_recipe_is_short() -> None:
     assert len(RECIPE.strip().splitlines()) < 40
 
 
+@pytest.mark.slow
 def test_the_new_kind_is_found_by_name_and_judges(recipe: ModuleType) -> None:
     campaign = Campaign(make_validation(), seed=1).run(8)
     kind = KINDS.find("lipschitz").of({"slope": 2.0})
@@ -86,6 +87,7 @@ def test_the_new_kind_is_found_by_name_and_judges(recipe: ModuleType) -> None:
     assert campaign.verdict(1e-6, certificate=CertificateOptions(kind)).answer == "falsified"
 
 
+@pytest.mark.slow
 def test_the_command_line_and_files_know_the_new_kind(
     recipe: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

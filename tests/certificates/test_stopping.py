@@ -33,6 +33,7 @@ def test_a_corner_that_a_trial_is_only_near_to_is_executed_before_anything_is_va
     assert judge([*known, trial(9, 1.0, 0.01)], 0.9).answer == "validated"
 
 
+@pytest.mark.slow
 def test_corners_of_two_parameters_come_first() -> None:
     points = [[0.5, 0.5], [0.05, 0.05], [0.95, 0.0], [0.0, 0.95], [0.5, 0.0], [0.0, 0.5]]
     known = [replace(trial(k, 0.0, 0.1 * k), unit_point=np.array(point)) for k, point in enumerate(points)]
@@ -45,6 +46,7 @@ def test_corners_of_two_parameters_come_first() -> None:
     assert sorted(asked) == [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]
 
 
+@pytest.mark.slow
 def test_a_bound_is_put_to_the_test_twice_before_it_decides() -> None:
     known = [trial(k, x, 0.5 + 0.3 * np.sin(9 * x)) for k, x in enumerate([0.0, 0.2, 0.42, 0.6, 0.8, 1.0])]
     for _ in range(2):

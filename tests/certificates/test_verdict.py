@@ -188,6 +188,7 @@ def test_a_confidence_beyond_the_draws_is_undecided_and_one_that_is_none_is_refu
             StoppingRule(tau, posterior(confidence)).decide(trials(), 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stochastic", [False, True])
 def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> None:
     known = trials(6)

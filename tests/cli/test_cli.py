@@ -73,6 +73,7 @@ def quick(*arguments: str) -> list[str]:
     return [*arguments] if named else [*arguments, "--search", "gp-ucb"]
 
 
+@pytest.mark.slow
 def test_the_default_search_learns_from_trajectories(invoke) -> None:  # type: ignore[no-untyped-def]
     result = CliRunner().invoke(app, ["run", "rig:experiment", "--budget", "3", "--json"])
     report = json.loads(result.stdout)
@@ -99,6 +100,7 @@ def test_json_is_one_object_with_everything_asked_for(invoke) -> None:  # type: 
     assert all(Path(picture).stat().st_size > 1000 for picture in report["pictures"])
 
 
+@pytest.mark.slow
 def test_running_again_resumes(invoke) -> None:  # type: ignore[no-untyped-def]
     first = json.loads(invoke("run", "rig:experiment", "--budget", "5", "--json").stdout)
     again = json.loads(invoke("run", "rig:experiment", "--budget", "5", "--json").stdout)
@@ -214,6 +216,7 @@ def test_a_confidence_that_no_bound_can_have_does_not_lose_the_report(invoke) ->
     assert "needs more than" in report["reason"]
 
 
+@pytest.mark.slow
 def test_a_campaign_stops_as_soon_as_its_verdict_is_reached(invoke) -> None:  # type: ignore[no-untyped-def]
     given = ("run", "rig:experiment", "--budget", "30", "--until-decided", "--json")
     validated = json.loads(invoke(*given, "--threshold", "9").stdout)
@@ -267,6 +270,7 @@ def of_kind(campaigns: dict[str, Path], case: str, kind: str) -> list[str]:
     return ["certify", str(campaigns[f"{case} drawn" if drawn else case]), "--kind", kind, *KINDS[kind]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["pendulum", "linear"])
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_every_kind_certifies_stored_campaigns(invoke, campaigns: dict[str, Path], case: str, kind: str) -> None:  # type: ignore[no-untyped-def]
@@ -308,6 +312,7 @@ def test_what_was_executed_falsifies_without_any_certificate(invoke, campaigns: 
     assert "no certificate" in spoken.stdout
 
 
+@pytest.mark.slow
 def test_what_is_undecided_says_how_many_more_executions_would_decide(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
     plain = json.loads(invoke("certify", str(campaigns["linear"]), "--resolution", "1", "--json").stdout)
     tau = 0.5 * (plain["details"]["best"] + plain["upper_bound"])
@@ -376,7 +381,7 @@ def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: 
         (["--kind", "scenario", "--theorem", "1,2,3,4,5"], "theorem is for certificates of the kind convergence"),
         (
             ["--volume", "0.1", "--threshold", "9"],
-            "volume is for certificates of the kind audit or scenario or sampling-discarding",
+            "volume is for certificates of the kind audit or sampling-discarding or scenario",
         ),
         (["--kind", "audit", "--volume", "0.1"], "may exceed a threshold; say --threshold too"),
         (["--kind", "convergence", "--constant", "1", "--theorem", "1,2,3,4,5"], "only one can be given"),
@@ -408,6 +413,7 @@ def test_an_audit_that_is_extended_counts_what_was_decided_on_last(invoke, campa
     assert "5 draws do not count, as their number was changed after they were known" in said
 
 
+@pytest.mark.slow
 def test_draws_that_ended_with_the_verdict_have_no_number_chosen_beforehand(invoke) -> None:  # type: ignore[no-untyped-def]
     arguments = ("run", "rig:experiment", "--search", "random", "--store", "a.sqlite")
     invoke(*arguments, "--threshold", "90", "--resolution", "1", "--until-decided", "--budget", "12")
@@ -417,6 +423,7 @@ def test_draws_that_ended_with_the_verdict_have_no_number_chosen_beforehand(invo
         assert sentence in result.stderr
 
 
+@pytest.mark.slow
 def test_a_scenario_bound_of_a_budget_that_was_raised_is_refused(invoke) -> None:  # type: ignore[no-untyped-def]
     for budget in ("6", "9"):
         invoke("run", "rig:experiment", "--search", "random", "--store", "a.sqlite", "--budget", budget)
@@ -425,6 +432,7 @@ def test_a_scenario_bound_of_a_budget_that_was_raised_is_refused(invoke) -> None
     assert json.loads(invoke("certify", "a.sqlite", "--kind", "audit", "--json").stdout)["trials"] == 3
 
 
+@pytest.mark.slow
 def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -> None:  # type: ignore[no-untyped-def]
     arguments = ("run", "rig:experiment", "--budget", "12", "--threshold", "90", "--resolution", "0.6")
     arguments += ("--until-decided",)
@@ -441,6 +449,7 @@ def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -
     assert report["rests_on"].startswith("It rests on")
 
 
+@pytest.mark.slow
 def test_a_certificate_tells_its_resolution_in_the_units_of_the_stored_task_space(invoke) -> None:  # type: ignore[no-untyped-def]
     space = TaskSpace(goal=(-3.0, 3.0, "rad"), load=([0.0, 0.0], [1.0, 2.0], "kg"))
     validation = make_validation()
@@ -490,6 +499,7 @@ def test_a_run_on_a_stochastic_system_says_so(invoke) -> None:  # type: ignore[n
     assert "independent normal noise" in json.loads(result.stdout)["certificate"]["assumptions"][2]
 
 
+@pytest.mark.slow
 def test_a_store_that_no_command_made_cannot_be_audited_but_certified(invoke) -> None:  # type: ignore[no-untyped-def]
     Campaign(make_validation(), store="own.sqlite").run(6)
     result = invoke("certify", "own.sqlite", "--audit", "3")
@@ -506,6 +516,7 @@ def test_status_and_cases_speak_to_people_and_to_programs(invoke) -> None:  # ty
     assert "pendulum" in json.loads(invoke("cases", "--json").stdout)
 
 
+@pytest.mark.slow
 def test_a_store_is_certified_against_the_threshold_of_its_file(invoke) -> None:  # type: ignore[no-untyped-def]
     Path("e.toml").write_text('experiment = "pendulum"\nbudget = 5\nthreshold = 0.01\nstore = "e.sqlite"')
     assert invoke("run", "e.toml").exit_code == 1
@@ -516,6 +527,7 @@ def test_a_store_is_certified_against_the_threshold_of_its_file(invoke) -> None:
     assert json.loads(invoke("certify", "e.sqlite", "--threshold", "90", "--json").stdout)["threshold"] == 90
 
 
+@pytest.mark.slow
 def test_why_executions_failed_is_said(invoke) -> None:  # type: ignore[no-untyped-def]
     assert invoke("run", "rig:sometimes", "--budget", "4", "--store", "a.sqlite").exit_code == 0
     for command in (["status", "a.sqlite"], ["run", "rig:sometimes", "--budget", "4", "--store", "a.sqlite"]):
@@ -541,6 +553,7 @@ def test_what_is_no_store_is_not_exported(invoke) -> None:  # type: ignore[no-un
     assert not Path("e.export").exists()
 
 
+@pytest.mark.slow
 def test_a_reader_that_goes_away_is_no_error(tmp_path: Path) -> None:
     command = f"{sys.executable} -c 'from ctxval.cli import main; main()' cases --help | head -c 1"
     script = f"set -o pipefail; for i in 1 2 3 4 5; do {command}; done"

@@ -57,6 +57,7 @@ def sentence(result: Result) -> str:
     return result.stderr.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_the_file_of_init_reaches_a_verdict_as_it_is(invoke: Any) -> None:
     result = invoke("run", "experiment.toml", "--until-decided", "--json")
     assert result.exit_code == 0, result.stderr
@@ -169,6 +170,7 @@ def test_what_the_certificate_of_the_file_would_ignore_is_refused(invoke: Any) -
     assert not Path("runs").exists()
 
 
+@pytest.mark.slow
 def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: Any) -> None:
     scenario = ('kind = "posterior"', 'kind = "scenario"\nvolume = 0.5')
     target = changed(scenario, ('name = "auto"', 'name = "random"'))

@@ -173,6 +173,7 @@ def test_nothing_that_a_foreign_store_names_is_imported_or_run(attack: str, fold
     assert [trial.state for trial in Store("a.sqlite").trials()] == ["open"]
 
 
+@pytest.mark.slow
 def test_the_store_of_the_attack_runs_nothing_through_the_real_command_line(folder: Path) -> None:
     store_with(HOSTILE)
     started = [
@@ -201,6 +202,7 @@ assert not [event for event, _ in seen if event in ("subprocess.Popen", "os.syst
 """
 
 
+@pytest.mark.slow
 def test_looking_at_a_store_imports_and_runs_nothing(folder: Path) -> None:
     plant(folder)
     store_with({**HOSTILE, "model": "evil:model", "system": EVIL_CALL})
@@ -273,6 +275,7 @@ def test_a_signature_of_another_store_serves_only_the_settings_that_it_is_of(fol
     assert not Path("imported.txt").exists()
 
 
+@pytest.mark.slow
 def test_a_module_beside_a_copied_store_is_not_found(folder: Path) -> None:
     rig_store(folder)
     elsewhere = folder / "downloads"
@@ -355,6 +358,7 @@ INSTALLED: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("attack", INSTALLED)
 def test_a_foreign_store_imports_no_part_of_an_installed_package(attack: str, site: Path) -> None:
     store_with(INSTALLED[attack])

@@ -82,6 +82,7 @@ def test_it_says_that_it_is_a_best_known_value_and_how_it_was_found() -> None:
     assert 1000 < evaluations < 2 * (61 * 60 + 61 * (16 + 30 * 7))
 
 
+@pytest.mark.slow
 def test_repeats_that_never_agree_end_at_the_limit_and_leave_a_doubt() -> None:
     def noise(x: np.ndarray) -> np.ndarray:
         return np.mod(1e6 * np.sin(1e4 * x).sum(axis=-1), 1.0)
@@ -109,6 +110,7 @@ def test_the_seed_decides_and_the_space_is_searched_in_batches() -> None:
     assert calls.count(1) == 3 * 2 * 3
 
 
+@pytest.mark.slow
 def test_climbs_find_a_narrow_peak_that_evolution_passes_by() -> None:
     def surface(x: np.ndarray) -> np.ndarray:
         """A wide hill of 1 in the middle, and in a corner a slope of small basin that leads to 1.5."""

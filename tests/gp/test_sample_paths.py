@@ -133,6 +133,7 @@ def test_noisy_paths_stay_off_the_data_by_what_the_noise_allows() -> None:
     assert np.abs(mean - y).max() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("d", "missed"), [(6, 0.003), (11, 0.003)])
 def test_maxima_in_many_dimensions_are_found_but_for_a_little(d: int, missed: float) -> None:
     rng = np.random.default_rng(d)

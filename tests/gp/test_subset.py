@@ -46,6 +46,7 @@ def test_copies_of_one_point_are_no_reason_to_stop() -> None:
     assert len(np.unique(kept_rows(points, values, 900))) == 900
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gp-ucb", "scalar"])
 @pytest.mark.parametrize("dimension", [1, 2, 20])
 def test_a_search_goes_on_over_a_long_history_as_one_never_stopped(name: str, dimension: int) -> None:
@@ -64,6 +65,7 @@ def test_a_search_goes_on_over_a_long_history_as_one_never_stopped(name: str, di
     np.testing.assert_array_equal(asked(), asked())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gp-ucb", "scalar"])
 def test_a_long_history_leads_to_the_maximum_too(name: str) -> None:
     rng = np.random.default_rng(1)

@@ -45,6 +45,7 @@ def test_results_are_stored_once_and_reused(tmp_path: Path) -> None:
     assert results[PROFILE]["distances"] == pytest.approx(case.validation.distances(case.validation.space.grid(21)))
 
 
+@pytest.mark.slow
 def test_a_result_of_a_case_that_has_changed_is_run_again(tmp_path: Path) -> None:
     done: list[Job] = []
     Results(tmp_path).fill([PROFILE], 1, done.append)

@@ -42,6 +42,7 @@ def test_columns_are_written_as_csv(tmp_path: Path) -> None:
         assert list(csv.reader(file)) == [["a", "b"], ["1.0", "x"], ["2.0", "y"]]
 
 
+@pytest.mark.slow
 def test_a_study_runs_is_drawn_and_enters_the_table_and_a_second_call_reuses_it(tmp_path: Path) -> None:
     started: list[int] = []
     done: list[object] = []
@@ -61,6 +62,7 @@ def test_a_study_runs_is_drawn_and_enters_the_table_and_a_second_call_reuses_it(
     assert "Dubins" not in text
 
 
+@pytest.mark.slow
 def test_the_runs_may_be_stored_elsewhere(tmp_path: Path) -> None:
     reproduce("converged-gp", tmp_path / "paper", stored=tmp_path / "runs", scale=QUICK, workers=1)
     assert sorted(path.name for path in (tmp_path / "paper").iterdir()) == ["converged-gp.csv", "converged-gp.png"]

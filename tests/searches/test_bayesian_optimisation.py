@@ -61,6 +61,7 @@ def test_it_finds_the_highest_corner_of_a_folded_plane(seed: int) -> None:
     assert values.max() > run(Random(), fold, 400, 8, seed).max()
 
 
+@pytest.mark.slow
 def test_it_leaves_a_wide_basin_for_a_higher_one_that_is_hidden() -> None:
     found = [run(BayesianOptimisation(), trap, 40, 3, seed).max() for seed in range(4)]
     assert min(found) > 0.7
@@ -157,6 +158,7 @@ def test_what_failed_is_not_asked_again_and_does_not_stop_the_search() -> None:
 # A function of seed and history
 
 
+@pytest.mark.slow
 def test_it_keeps_the_contract_of_a_search() -> None:
     check_search(BayesianOptimisation())
     check_search(BayesianOptimisation(initial=1), dimension=5, budget=30)

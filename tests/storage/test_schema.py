@@ -209,6 +209,7 @@ def test_an_unreadable_file_is_one_sentence(store: Path, monkeypatch: pytest.Mon
         Store.existing(store)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["-journal", "-wal", "-shm"])
 @pytest.mark.parametrize("kind", ["pipe", "link", "folder"])
 def test_what_lies_beside_must_be_a_file(store: Path, tmp_path: Path, ending: str, kind: str) -> None:
@@ -241,6 +242,7 @@ def journal(of: Path, *, pages: int = 1, names: Path | None = None) -> bytes:
     return header.ljust(512, b"\0") + records + trailer
 
 
+@pytest.mark.slow
 def test_a_journal_that_names_another_file_deletes_nothing(store: Path, tmp_path: Path) -> None:
     victim = tmp_path / "thesis.tex"
     victim.write_text("chapter 1\n")
@@ -250,6 +252,7 @@ def test_a_journal_that_names_another_file_deletes_nothing(store: Path, tmp_path
     assert victim.exists()
 
 
+@pytest.mark.slow
 def test_the_journal_of_another_database_is_one_sentence_and_export_reads_the_store(store: Path) -> None:
     beside = store.with_name("a.sqlite-journal")
     beside.write_bytes(journal(store, pages=3))
@@ -261,6 +264,7 @@ def test_the_journal_of_another_database_is_one_sentence_and_export_reads_the_st
     assert "store" in said(store)
 
 
+@pytest.mark.slow
 def test_the_journal_of_a_process_that_died_is_played_back_on_export(store: Path, tmp_path: Path) -> None:
     connection = sqlite3.connect(store, isolation_level=None)
     connection.execute("PRAGMA cache_size = 1")
@@ -281,6 +285,7 @@ def test_the_journal_of_a_process_that_died_is_played_back_on_export(store: Path
     assert len(Store.existing(died).trials()) == 5
 
 
+@pytest.mark.slow
 def test_a_store_in_wal_mode_becomes_one_file_again(store: Path, tmp_path: Path) -> None:
     connection = sqlite3.connect(store, isolation_level=None)
     connection.execute("PRAGMA journal_mode = WAL")

@@ -240,6 +240,7 @@ def test_a_crash_is_a_failed_trial_of_a_campaign(deadly: Path, options: dict[str
     assert 0 < len(campaign.failed) < 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["raise RuntimeError('broken')", "import os; os._exit(7)"])
 def test_an_exception_in_a_step_of_pythonfmu_is_survived(tmp_path: Path, how: str) -> None:
     pytest.importorskip("pythonfmu")
@@ -267,6 +268,7 @@ def test_an_fmu_that_crashes_at_the_start_is_refused(tmp_path: Path) -> None:
         FMU(built(tmp_path, "pythonfmu", source), **NAMES)
 
 
+@pytest.mark.slow
 def test_a_step_that_does_not_end_goes_with_its_execution(tmp_path: Path) -> None:
     pytest.importorskip("pythonfmu")
     mark = f"pathlib.Path({str(tmp_path / 'pid')!r}).write_text(str(os.getpid()))"
@@ -284,6 +286,7 @@ def test_a_step_that_does_not_end_goes_with_its_execution(tmp_path: Path) -> Non
     assert not alive(int((tmp_path / "pid").read_text()))
 
 
+@pytest.mark.slow
 def test_a_step_that_does_not_end_goes_with_a_campaign_that_is_killed(tmp_path: Path) -> None:
     pytest.importorskip("pythonfmu")
     mark = tmp_path / "pid"
@@ -314,6 +317,7 @@ def test_what_an_fmu_prints_and_reads_does_not_disturb(tmp_path: Path) -> None:
     assert system.execute(feedback, TASK).ended == "complete"
 
 
+@pytest.mark.slow
 def test_many_executions_and_garbage_collections_leave_the_process_alive(path: Path) -> None:
     # In a process of its own, which may crash.
     code = f"""
@@ -544,6 +548,7 @@ name = "gp-ucb"
 """
 
 
+@pytest.mark.slow
 def test_an_experiment_file_validates_a_learned_model_on_an_fmu(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

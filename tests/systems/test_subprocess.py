@@ -189,6 +189,7 @@ child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(6
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_command_ends_with_a_campaign_that_is_killed(workers: int, tmp_path: Path) -> None:
     campaign = rig_command.start(tmp_path, seconds=60, workers=workers)
@@ -206,6 +207,7 @@ def test_a_command_ends_with_a_campaign_that_is_killed(workers: int, tmp_path: P
     assert [trial.distance for trial in resumed.run(6).trials] == [trial.distance for trial in whole.trials]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
 @pytest.mark.parametrize(
     ("end", "sentence"), [("time.sleep(60)", "did not end within 1 s and was killed"), ("sys.exit(3)", "status 3")]
@@ -242,6 +244,7 @@ def escaped(folder: Path, count: int = 1) -> list[int]:
     return [int(path.stem) for path in found]
 
 
+@pytest.mark.slow
 @LINUX
 @pytest.mark.parametrize("end", ["", "sys.exit(3)", "time.sleep(60)", "os.kill(os.getpid(), 9)"])
 def test_what_left_the_group_ends_with_the_command(end: str, tmp_path: Path) -> None:
@@ -251,6 +254,7 @@ def test_what_left_the_group_ends_with_the_command(end: str, tmp_path: Path) -> 
     assert gone(pid)
 
 
+@pytest.mark.slow
 @LINUX
 def test_many_that_have_left_the_group_end_too(tmp_path: Path) -> None:
     code = "import os, sys\nfor _ in range(3):\n    os.fork()\n" + ESCAPE + "time.sleep(60)"
@@ -286,6 +290,7 @@ def test_the_process_itself_adopts_nobody(tmp_path: Path) -> None:
     assert adopts.value == 0
 
 
+@pytest.mark.slow
 @LINUX
 @pytest.mark.parametrize("signal_", ["SIGKILL", "SIGSTOP"])
 def test_a_supervisor_that_is_killed_or_stopped_takes_its_command_with_it(
@@ -420,6 +425,7 @@ def test_a_campaign_on_a_command_records_its_failures(tmp_path: Path) -> None:
     assert all(str(trial.failure).endswith("over the edge") for trial in campaign.failed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [None, 2])
 def test_a_killed_command_costs_its_own_trial_and_nothing_else(tmp_path: Path, workers: int | None) -> None:
     whole = rig_command.campaign(tmp_path, seconds=0).run(6)
@@ -436,6 +442,7 @@ def test_a_killed_command_costs_its_own_trial_and_nothing_else(tmp_path: Path, w
     assert len(list((tmp_path / "marks").iterdir())) == 6
 
 
+@pytest.mark.slow
 def test_a_killed_command_is_run_again_where_the_user_says_so(tmp_path: Path) -> None:
     whole = rig_command.campaign(tmp_path, seconds=0).run(6)
     shutil.rmtree(tmp_path / "marks")
