@@ -10,7 +10,15 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from ctxval.certificates import KINDS, Sample, certify_audit, certify_convergence, certify_posterior, draw_maxima
+from ctxval.certificates import (
+    KINDS,
+    Sample,
+    certify_anytime,
+    certify_audit,
+    certify_convergence,
+    certify_posterior,
+    draw_maxima,
+)
 from ctxval.config.settings import Settings
 from ctxval.core.trial import Origin, State
 from ctxval.testing import check_search
@@ -70,6 +78,7 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
     sample = Sample(points, np.sin(5 * points[:, 0]) + 2, origins, ["completed"] * 8)
     certificates = [
         certify_audit(sample),
+        certify_anytime(sample, 3.0),
         certify_convergence(sample, 1.0),
         certify_posterior(sample, 0.5, found=draw_maxima(sample, draws=4, paths=2)),
     ]

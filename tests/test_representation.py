@@ -201,6 +201,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "distances.MeanDeviation": distances.MeanDeviation,
     "distances.WholeTrajectory": distances.WholeTrajectory,
     "certificates.Assessment": lambda: certificates.assess(campaign().trials, BY_POSTERIOR),
+    "certificates.AnytimeAudit": certificates.AnytimeAudit,
     "certificates.Audit": certificates.Audit,
     "certificates.Certificate": lambda: CERTIFICATE,
     "certificates.CertificateOptions": certificates.CertificateOptions.posterior,

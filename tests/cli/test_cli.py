@@ -381,7 +381,7 @@ def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: 
         (["--kind", "scenario", "--theorem", "1,2,3,4,5"], "theorem is for certificates of the kind convergence"),
         (
             ["--volume", "0.1", "--threshold", "9"],
-            "volume is for certificates of the kind audit or sampling-discarding or scenario",
+            "volume is for certificates of the kind anytime or audit or sampling-discarding or scenario",
         ),
         (["--kind", "audit", "--volume", "0.1"], "may exceed a threshold; say --threshold too"),
         (["--kind", "convergence", "--constant", "1", "--theorem", "1,2,3,4,5"], "only one can be given"),

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from ctxval.certificates.anytime import AnytimeAudit, certify_anytime
 from ctxval.certificates.assessment import Assessment, assess
 from ctxval.certificates.audit import Audit, certify_audit
 from ctxval.certificates.base import Certificate, CertificateKind
@@ -41,6 +42,7 @@ __all__ = [
     "PLANNED",
     "RESOLUTION",
     "USES",
+    "AnytimeAudit",
     "Assessment",
     "Audit",
     "Certificate",
@@ -64,6 +66,7 @@ __all__ = [
     "assess",
     "bare_corners",
     "certify",
+    "certify_anytime",
     "certify_audit",
     "certify_convergence",
     "certify_posterior",

@@ -73,12 +73,18 @@ def assess(
             raise CertificateError(verdict.reason)
         return Assessment(options.kind.name, verdict.certificate, verdict)
     try:
-        certificate = _certificate(trials, options, known)
+        certificate = _certificate(trials, options, known, threshold)
     except CertificateError as error:
         return Assessment(options.kind.name, None, counterexample(trials, threshold), str(error))
     return Assessment(options.kind.name, certificate, judge_by(certificate, trials, threshold))
 
 
-def _certificate(trials: Sequence[Trial], options: CertificateOptions, known: Provenance) -> Certificate:
-    sample = Sample.of(trials, known.search)
-    return options.kind.certify(sample, options.confidence).with_remarks(known.remarks)
+def _certificate(
+    trials: Sequence[Trial], options: CertificateOptions, known: Provenance, threshold: float | None = None
+) -> Certificate:
+    sample, kind = Sample.of(trials, known.search), options.kind
+    if threshold is not None and kind.needs_threshold:
+        found, _ = kind.certify_against(sample, threshold, options.confidence)
+    else:
+        found = kind.certify(sample, options.confidence)
+    return found.with_remarks(known.remarks)

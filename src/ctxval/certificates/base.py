@@ -122,6 +122,9 @@ class CertificateKind(ABC):
     bounds_maximum: ClassVar[bool] = True
     """Whether it bounds d* itself. Otherwise it leaves out a volume of the task space, which a user must accept."""
 
+    needs_threshold: ClassVar[bool] = False
+    """Whether its statement is about a threshold, so that there is none without one."""
+
     @classmethod
     def options(cls) -> tuple[str, ...]:
         """Return the names of what may be stated for it: its fields, and ``volume`` if it leaves one out."""

@@ -1,0 +1,156 @@
+r"""An anytime audit: independent draws bound the volume above a threshold, valid at any stopping time.
+
+Let p be the share of tasks above the threshold, and let the hypothesis be p >= eps. After n independent draws with k
+violations, and for q <= eps,
+
+    L_n(q) = (q / eps)^k ((1 - q) / (1 - eps))^(n - k)
+
+is a supermartingale under the hypothesis: one draw multiplies its expectation by the factor
+p q / eps + (1 - p)(1 - q) / (1 - eps), which decreases with p and is 1 at p = eps. The mixture of q = 0 and of a
+uniform q in [0, eps],
+
+    E_n(eps) = w 1{k = 0} (1 - eps)^(-n) + (1 - w) B(k+1, n-k+1) I_eps(k+1, n-k+1) / (eps^(k+1) (1 - eps)^(n-k)),
+
+is a supermartingale too. Ville's inequality gives Pr(sup_n E_n(p) >= 1 / beta) <= beta, whenever the audit stops and
+whatever was looked at. Test martingales: Shafer et al. 2011; mixtures for bounded means: Waudby-Smith and Ramdas 2024.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.special import betainc, betaln
+
+from ctxval._util.arrays import Array, Mask
+from ctxval._util.registry import part
+from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
+from ctxval.certificates.bounds import at_most, require_probability
+from ctxval.certificates.forecast import Forecast
+from ctxval.certificates.sample import Sample
+from ctxval.certificates.scenario import UNSEEN, rests_on_draws
+from ctxval.core.space import TaskSpace
+from ctxval.errors import CertificateError
+
+_NO_VIOLATION = 0.75
+"""Weight w of q = 0. Without a violation, at most a share log(1/w) / log(1/beta) more draws are needed."""
+
+_LEAST_VOLUME = 1e-12
+"""Volumes below it are not told apart."""
+
+
+@part("anytime")
+@dataclass(frozen=True, repr=False)
+class AnytimeAudit(CertificateKind):
+    """Bound on the volume above a threshold, from independent draws that may be continued after looking at them."""
+
+    name: ClassVar[str] = "anytime"
+    bounds_maximum: ClassVar[bool] = False
+    needs_threshold: ClassVar[bool] = True
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Refuse: the bound is on the volume above a threshold, and none is given.
+
+        Raises:
+            CertificateError: always.
+        """
+        raise CertificateError("an anytime audit bounds the volume above a threshold, so it needs one (--threshold).")
+
+    def certify_against(
+        self, sample: Sample, threshold: float, confidence: float = 0.95
+    ) -> tuple[Certificate, Forecast | None]:
+        """Return :func:`certify_anytime` of the trials; nothing is forecast."""
+        return certify_anytime(sample, threshold, confidence), None
+
+    @classmethod
+    def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
+        """Return what it needs of the draws."""
+        return rests_on_draws(certificate)
+
+
+def certify_anytime(sample: Sample, threshold: float, confidence: float = 0.95) -> Certificate:
+    """Bound the volume of the tasks above a threshold, by the independent draws among the trials.
+
+    A draw without a distance counts as a violation, so that failures cannot help.
+
+    Args:
+        sample: trials of any origin; only independent draws count, in their order.
+        threshold: tau, in the distance's units, fixed before the draws were known.
+        confidence: 1 - beta.
+
+    Raises:
+        CertificateError: there is no independent draw, or the confidence is not a probability.
+    """
+    beta = 1 - require_probability("confidence", confidence)
+    drawn = sample.only("iid")
+    if not len(drawn):
+        raise CertificateError("an anytime audit needs independent draws of tasks, and there is none; use --audit N.")
+    violating = ~(drawn.distances <= threshold)  # also where no distance is known
+    volume = anytime_volume(violating, beta)
+    return Certificate(
+        kind="anytime",
+        statement=(
+            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % of the task space has a distance "
+            f"above {threshold:.6g} or fails, however often this was looked at and continued."
+        ),
+        upper_bound=float(threshold),
+        confidence=confidence,
+        volume=volume,
+        trials=len(drawn),
+        assumptions=(
+            "the audited tasks are independent and uniform over the task space",
+            f"the threshold {threshold:.6g} was fixed before any of them was known",
+            UNSEEN,
+            "each task has one distance: the system is deterministic",
+            "nothing is assumed of how the distance depends on the task",
+            "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
+            *sample.remarks,
+            ONE_CAMPAIGN,
+        ),
+        details={
+            "violations": int(violating.sum()),
+            "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
+            "failed": drawn.failed,
+            "failures": sample.failures,
+        },
+    )
+
+
+def anytime_volume(violating: Mask, beta: float) -> float:
+    """Return the least volume that draws reject at one of the times that there were, 1 if they reject none.
+
+    Args:
+        violating: which of n independent draws violate the threshold, in their order, shape ``(n,)``.
+        beta: the probability with which the true volume may be rejected, at any time.
+    """
+    counts = np.cumsum(violating)
+    # Between violations more draws only lower the volume, so that the last moment before each of them is enough.
+    ends = np.flatnonzero(np.append(violating[1:], True))
+    return min((_rejected_from(end + 1, int(counts[end]), beta) for end in ends.tolist()), default=1.0)
+
+
+def _rejected_from(n: int, violations: int, beta: float) -> float:
+    """Return the volume from which on n draws with so many violations reject; 1 if they reject none."""
+    target = -np.log(beta)
+
+    def excess(volume: float) -> float:
+        return float(log_e_value(n, violations, np.array(volume)) - target)
+
+    low, high = max(violations / n, _LEAST_VOLUME), 1 - 1e-9
+    if violations == n or excess(high) < 0:
+        return 1.0
+    found: float = brentq(excess, low, high, xtol=1e-12)
+    return min(1.0, found * (1 + 1e-9))
+
+
+def log_e_value(n: int, violations: int, volume: Array) -> Array:
+    """Return ``log E_n`` against the hypothesis that at least this volume violates, shape of ``volume``."""
+    k, held = violations, n - violations
+    with np.errstate(divide="ignore"):
+        uniform = np.log1p(-_NO_VIOLATION) + betaln(k + 1, held + 1) + np.log(betainc(k + 1, held + 1, volume))
+        uniform = uniform - (k + 1) * np.log(volume) - held * np.log1p(-volume)
+    if k:
+        return np.asarray(uniform)
+    return np.asarray(np.logaddexp(np.log(_NO_VIOLATION) - n * np.log1p(-volume), uniform))
