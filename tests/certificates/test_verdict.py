@@ -167,7 +167,7 @@ def test_a_bound_that_is_withdrawn_is_not_forecast() -> None:
         (trials(3), "at least 4 trials"),
         ([*trials(), trial(8, 0.4, None)], "1 of 9 executions failed"),
         ([*trials(), trial(8, 0.4, None, state="open")], "are open"),
-        ([trial(k, k / 9, 0.3) for k in range(9)], "they say nothing of d"),
+        ([trial(k, k / 9, 0.3) for k in range(9)], "they do not bound d"),
     ],
 )
 def test_where_nothing_can_be_certified_the_verdict_is_open_and_says_why(known: list[Trial], sentence: str) -> None:

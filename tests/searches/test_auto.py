@@ -31,5 +31,5 @@ def test_a_choice_designs_no_more_controllers_than_are_afforded(designs: int | N
 
 @pytest.mark.parametrize("designs", [0, -3])
 def test_without_a_design_there_is_no_choice(designs: int) -> None:
-    with pytest.raises(InputError, match="at least one design"):
+    with pytest.raises(InputError, match="designs must be at least 1"):
         Auto(designs=designs)

@@ -1,4 +1,4 @@
-"""Certificates: statements on d*, each with its assumptions, and the verdicts that rest on them."""
+"""Certificates: statements about d* with their assumptions, and the verdicts that rest on them."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -94,7 +94,7 @@ KINDS.collect()
 
 
 def __getattr__(name: str) -> Any:
-    """Return ``USES``, which kinds have a use for each option: all kinds are imported for it."""
+    """Return ``USES``: for each option, the kinds that use it. It is computed on request, as it imports all kinds."""
     if name != "USES":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     options = [option for name in KINDS.imported for option in KINDS.find(name).options()]

@@ -1,4 +1,4 @@
-"""What trials prove: a certificate, and against a threshold a verdict. It is what ``ctxval certify`` reports."""
+"""The result of ``ctxval certify``: a certificate of the trials and, if there is a threshold, a verdict."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Assessment:
 
     Attributes:
         kind: the name of the certificate's kind.
-        certificate: None if its theory refuses the trials.
-        verdict: None without a threshold.
-        refusal: why there is no certificate.
+        certificate: the certificate; None if its theory refuses the trials.
+        verdict: the verdict; None if no threshold was given.
+        refusal: why there is no certificate; None if there is one.
     """
 
     kind: str
@@ -33,7 +33,7 @@ class Assessment:
     refusal: str | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
+        """Return the certificate, the verdict and the forecast as one flat table, ready for JSON."""
         said = {} if self.verdict is None else self.verdict.to_json()
         expected = None if self.verdict is None or self.verdict.expected is None else asdict(self.verdict.expected)
         refused = {"kind": self.kind, "refused": self.refusal}
@@ -50,19 +50,20 @@ def assess(
     threshold: float | None = None,
     provenance: Provenance | None = None,
 ) -> Assessment:
-    """Return what trials prove.
+    """Return a certificate of the trials and, if there is a threshold, a verdict.
 
-    An executed counterexample stands without any certificate; a certificate is attempted all the same.
+    A trial whose distance exceeds the threshold falsifies it without a certificate. The certificate is computed all
+    the same, if its theory allows the trials.
 
     Args:
-        trials: all of them.
-        options: by which certificate.
-        threshold: tau, in the distance's units; without it there is no verdict.
-        provenance: what else is known of the campaign.
+        trials: all trials of the campaign.
+        options: the kind of certificate, its confidence and the acceptable volume.
+        threshold: tau, in the distance's units; if it is None, there is no verdict.
+        provenance: the task space, the search and remarks on the campaign, as far as they are known.
 
     Raises:
-        CertificateError: the certificate's theory refuses the trials, and none of them exceeds the threshold.
-        InputError: the threshold is not a positive number.
+        CertificateError: if the certificate's theory refuses the trials and none of them exceeds the threshold.
+        InputError: if the threshold is not a positive number.
     """
     known = provenance or Provenance()
     if threshold is None:

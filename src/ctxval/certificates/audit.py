@@ -1,6 +1,6 @@
-"""An audit: independent draws bound how many tasks are worse than the worst one known.
+"""An audit: independent draws bound the share of tasks whose distance is larger than the largest one known.
 
-Nothing is assumed of how the distance depends on the task, nor of how the worst task was found.
+It assumes nothing about how the distance depends on the task, or about how the worst known task was found.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ctxval.errors import CertificateError
 @part("audit")
 @dataclass(frozen=True, repr=False)
 class Audit(CertificateKind):
-    """Bound on all tasks but a volume, from the independent draws among the trials."""
+    """Bound on all tasks except a share of the task space, from the independent draws among the trials."""
 
     name: ClassVar[str] = "audit"
     bounds_maximum: ClassVar[bool] = False
@@ -33,30 +33,31 @@ class Audit(CertificateKind):
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
-        """Return what it needs of the draws."""
+        """Return what it assumes about the draws."""
         return rests_on_draws(certificate)
 
     @classmethod
     def shortfall(cls, certificate: Certificate) -> str:
-        """Return how many draws do not count, if there are such."""
+        """Return how many draws do not count; empty if all count."""
         missing = certificate.details.get("not_counted")
         return f"; {missing} draws do not count, as their number was changed after they were known" if missing else ""
 
 
 def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
-    """Bound the volume of the tasks that are worse than the worst one known, by the independent draws among the trials.
+    """Return a bound on the volume of the tasks whose distance exceeds the largest one known, from independent draws.
 
-    The volume above the largest of N independent draws is bounded whatever the distance is like, and that above the
-    largest of all trials, however chosen, is not larger. If the number of draws was raised after some were known, only
-    those that were decided on last count, as their number was chosen before they were executed.
+    Let h be the largest of N independent distances. The volume of tasks above h is bounded for any distance function.
+    The largest distance of all trials is at least h, so the volume above it is not larger, however those trials were
+    chosen. If the number of draws was raised after some were known, only the draws of the last decision count, since
+    only their number was chosen before they were executed.
 
     Args:
-        sample: trials of any origin, some of them independent draws.
-        confidence: 1 - beta.
+        sample: trials of any origin; some of them must be independent draws.
+        confidence: 1 - beta, the probability with which the statement holds.
 
     Raises:
-        CertificateError: there is no independent draw, their number depended on their distances, or an execution of
-            one failed.
+        CertificateError: if there is no independent draw, if the number of draws depended on their distances, or if
+            the execution of a draw failed.
     """
     beta = 1 - require_probability("confidence", confidence)
     everything = sample.only("iid")
@@ -91,30 +92,30 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
 
 
 def _countable(everything: Sample) -> Sample:
-    """Return the draws whose number was chosen before they were executed, all of them with a distance.
+    """Return the draws whose number was chosen before they were executed.
 
     Raises:
-        CertificateError: there is none, or one has no distance.
+        CertificateError: if there are no such draws, or one of them has no distance.
     """
     if not len(everything):
-        raise CertificateError("an audit needs independent draws of tasks, and there is none; run certify --audit N.")
+        raise CertificateError("an audit needs independent draws of tasks, but there is none; run certify --audit N.")
     drawn = _last_decided_on(everything)
     if not len(drawn):
         raise CertificateError(
             f"the {len(everything)} independent draws ended with the verdict (--until-decided), so their number "
             f"depended on their distances and none counts; certify --audit N draws until there are N in all, and "
-            f"counts those beyond the {len(everything)}."
+            f"counts only those after the first {len(everything)}."
         )
     if drawn.failed:
         raise CertificateError(
-            f"{violations(drawn)}; a new store of a task space without such tasks can be audited, and says nothing of "
-            f"them.{advice_to_remeasure(drawn)}"
+            f"{violations(drawn)}; to audit the other tasks, start a new store whose task space excludes these tasks."
+            f"{advice_to_remeasure(drawn)}"
         )
     return drawn
 
 
 def _last_decided_on(drawn: Sample) -> Sample:
-    """Return the draws whose number was decided on last, without those that the verdict was to end."""
+    """Return the draws of the last decision on their number, without draws that stop when the verdict is reached."""
     plans = [planned for planned in drawn.planned if planned != 0]
     return drawn.rows([row for row, planned in enumerate(drawn.planned) if plans and planned == plans[-1]])
 
@@ -130,7 +131,7 @@ def _not_counted(everything: Sample, drawn: Sample) -> tuple[str, ...]:
 
 
 def _against_the_search(sample: Sample, drawn: Sample) -> dict[str, float | int | None]:
-    """Return the largest distances that were drawn and that were found otherwise, and how many draws exceed these."""
+    """Return the largest distance of the draws and of all other trials, and how many draws exceed the latter."""
     chosen = sample.distances[[origin != "iid" for origin in sample.origins]]
     if not np.isfinite(chosen).any():
         return {"largest_drawn": drawn.best, "largest_chosen": None, "exceeding": None}

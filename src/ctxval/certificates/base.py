@@ -1,4 +1,4 @@
-"""What every certificate says, and what every kind of certificate must be able to do."""
+"""The certificate, and the base class of all kinds of certificates."""
 
 from __future__ import annotations
 
@@ -17,29 +17,33 @@ from ctxval.version import VERSION
 if TYPE_CHECKING:
     from ctxval.certificates.forecast import Forecast
 
-ONE_CAMPAIGN = "this campaign was fixed beforehand: the best of several is wrong more often than stated"
-"""What every certificate assumes."""
+ONE_CAMPAIGN = (
+    "this campaign was fixed beforehand and not chosen among several: the best of several is wrong more often than "
+    "stated"
+)
+"""The assumption that all certificates share."""
 
 _INDENT = "\n  "
-"""Before further lines of a text, so that none looks like a line of the certificate."""
+"""Line break within a text: its further lines are indented, so that none looks like a line of the certificate."""
 
 
 @dataclass(frozen=True, repr=False)
 class Certificate:
-    """A statement on d*, with everything it rests on; as text, what the command line prints of it.
+    """A statement about d* with its assumptions; ``str`` returns the text that the command line prints.
 
     Attributes:
         kind: the name of its :class:`CertificateKind`.
-        statement: what it says, in one sentence.
-        upper_bound: h, in the distance's units.
+        statement: the statement, in one sentence.
+        upper_bound: the bound h on the distance, in the distance's units.
         confidence: the probability of the statement, over what ``assumptions`` say is random.
         volume: the share of the task space that the statement leaves out; 0 if it covers all of it.
-        trials: n.
-        assumptions: what must hold, in plain words.
-        details: the numbers behind it.
-        doubt: why it is withdrawn, if the trials speak against what it assumes; a user must not believe it then.
-        error: standard error of ``upper_bound`` if it is computed from random draws, in the distance's units.
-        version: of ctxval.
+        trials: the number n of trials that it is computed from.
+        assumptions: conditions under which the statement holds, one sentence each.
+        details: the numbers from which the statement is computed.
+        doubt: why the certificate is withdrawn, if the trials contradict an assumption; None if they do not. The
+            statement of a withdrawn certificate must not be used.
+        error: standard error of ``upper_bound`` in the distance's units, if it is computed from random draws; else 0.
+        version: the version of ctxval that computed it.
     """
 
     kind: str
@@ -55,20 +59,24 @@ class Certificate:
     version: str = VERSION
 
     def covers(self, threshold: float, volume: float = 0.0) -> bool:
-        """Return whether it bounds the distance by the threshold for sure, but for a volume that is acceptable."""
+        """Return whether it bounds the distance by the threshold, except on at most this share of the task space.
+
+        A withdrawn certificate covers nothing. A bound that is computed from random draws must stay below the
+        threshold by two of its standard errors.
+        """
         return self.doubt is None and self.volume <= volume and self.upper_bound + ERRORS * self.error <= threshold
 
     def with_remarks(self, remarks: Sequence[str]) -> Certificate:
-        """Return the certificate with more sentences among its assumptions: what the user states and must know."""
+        """Return the certificate with more assumptions, such as changes of the system that the user has accepted."""
         return replace(self, assumptions=(*self.assumptions, *remarks))
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
+        """Return all attributes, ready for JSON."""
         return asdict(self)
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """The numbers that are shown to people; failures are among the assumptions."""
+        """The numbers that are printed; failures are left out, because the assumptions list them."""
         shown = {name: value for name, value in self.details.items() if name != "failures"}
         return {**shown, "trials": self.trials, "version": self.version}
 
@@ -108,82 +116,86 @@ class Certificate:
 
 @dataclass(frozen=True)
 class CertificateKind(ABC):
-    """A kind of certificate. Its fields are its options: what it must be told besides the trials and the confidence.
+    """A kind of certificate. Its fields are its options: its inputs besides the trials and the confidence.
 
-    A kind is a frozen dataclass with a name and a method that makes a certificate of trials. The other methods say what
-    a verdict by it rests on, and refuse what cannot succeed before it is paid for; their defaults suit a bound on d*
-    that is computed from the distances alone. A kind that needs numbers which the trials do not carry takes them as a
-    field; draws of d* under a learned model of the dynamics are such numbers.
+    A kind is a frozen dataclass with a name and a method that computes a certificate from trials. The other methods
+    state what a verdict by it rests on, and refuse a useless audit before its draws are executed.
+    Their defaults suit a bound on d* that is computed from the distances alone. If a kind needs numbers that the
+    trials do not contain, such as draws of d* under a learned model of the dynamics, it has a field for them.
     """
 
     name: ClassVar[str]
-    """What it is called in files, on the command line and on its certificates."""
+    """The name of the kind in files, on the command line and on its certificates."""
 
     bounds_maximum: ClassVar[bool] = True
-    """Whether it bounds d* itself. Otherwise it leaves out a volume of the task space, which a user must accept."""
+    """Whether it bounds d* itself. If not, it leaves out a share of the task space, which the user must accept."""
 
     needs_threshold: ClassVar[bool] = False
     """Whether its statement is about a threshold, so that there is none without one."""
 
     @classmethod
     def options(cls) -> tuple[str, ...]:
-        """Return the names of what may be stated for it: its fields, and ``volume`` if it leaves one out."""
+        """Return the names of its options: its fields, and ``volume`` if it leaves out a share of the task space."""
         own = tuple(one.name for one in fields(cls))
         return own if cls.bounds_maximum else (*own, "volume")
 
     @classmethod
     def of(cls, stated: Mapping[str, Any]) -> Self:
-        """Return it with those of the options that are its own; what is None or missing has its default."""
+        """Return an instance from those of the options that are its own; an option that is None keeps its default."""
         return cls(**{one.name: stated[one.name] for one in fields(cls) if stated.get(one.name) is not None})
 
     @abstractmethod
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the certificate of trials.
 
+        Args:
+            sample: the trials.
+            confidence: the probability with which the statement must hold.
+
         Raises:
-            CertificateError: its theory does not allow these trials, or an option that it needs is missing.
+            CertificateError: if its theory does not allow these trials, or an option that it needs is missing.
         """
 
     def certify_against(
         self, sample: Sample, threshold: float, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
-        """Return the certificate as exact as a threshold asks for, and what is expected of further executions.
+        """Return a certificate that is precise enough for a threshold, and a forecast of further executions.
 
-        The forecast is None if the threshold is kept, or nothing can be foreseen.
+        The forecast is None if the certificate keeps the threshold, or if nothing can be predicted.
 
         Raises:
-            CertificateError: as :meth:`certify` does.
+            CertificateError: under the conditions of :meth:`certify`.
         """
         return self.certify(sample, confidence), None
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:  # noqa: B027 (most kinds can use draws)
-        """Make sure, before independent draws are executed, that this certificate could use them.
+        """Check that this certificate can use independent draws, before they are executed.
 
         Args:
-            origins: of the trials that there are already.
+            origins: the origins of the trials so far.
 
         Raises:
-            CertificateError: it could not, however they come out.
+            CertificateError: if the certificate would be refused whatever the distances of the draws are.
         """
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
-        """Return what a validation by its certificate rests on: ends of a sentence that begins with "It rests on".
+        """Return what a validation by a certificate rests on: each entry completes a sentence "It rests on ...".
 
         Args:
-            certificate: one of this kind.
-            space: the tasks, to tell lengths in their units.
+            certificate: a certificate of this kind.
+            space: the task space, to state lengths in its units; None if it is not known.
         """
         return ["what its certificate assumes"]
 
     @classmethod
     def qualification(cls, certificate: Certificate, space: TaskSpace | None = None) -> str:
-        """Return what a validation says of options that are not the usual ones: the end of a sentence, or nothing."""
+        """Return the end of a sentence that names options other than the defaults; empty if all are defaults."""
         return ""
 
     @classmethod
     def shortfall(cls, certificate: Certificate) -> str:
-        """Return why the volume left out is larger than it might be: the end of a sentence, or nothing."""
+        """Return the end of a sentence on why the volume left out is not smaller; empty if there is no reason."""
         return ""
 
     def __repr__(self) -> str:

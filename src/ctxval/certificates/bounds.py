@@ -1,4 +1,4 @@
-"""Numbers of certificates: probabilities are checked, and bounds are rounded up wherever they are printed."""
+"""Numbers of certificates: checks of probabilities, and bounds as text, which are always rounded up."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from ctxval.errors import CertificateError
 
 ERRORS = 2.0
-"""Standard errors of a computed bound by which it must keep a threshold."""
+"""Number of its standard errors by which a bound from random draws must stay below a threshold."""
 
 
 def with_error(upper: float, error: float) -> str:
@@ -28,7 +28,7 @@ def _place(value: float) -> int:
 
 
 def at_most(value: float, digits: int = 4) -> str:
-    """Return a bound as text, rounded up: what is printed must not be smaller than what holds."""
+    """Return a bound as text, rounded up: the printed number must be a valid bound as well."""
     short = f"{value:.{digits}g}"
     if float(short) >= value or not np.isfinite(value):
         return short
@@ -36,10 +36,10 @@ def at_most(value: float, digits: int = 4) -> str:
 
 
 def require_probability(name: str, value: float) -> float:
-    """Return a probability strictly between 0 and 1.
+    """Return a probability, which must be strictly between 0 and 1.
 
     Raises:
-        CertificateError: it is not.
+        CertificateError: if the value is not strictly between 0 and 1.
     """
     if not 0 < value < 1:
         raise CertificateError(f"{name} must be strictly between 0 and 1, got {value!r}.")
@@ -47,7 +47,7 @@ def require_probability(name: str, value: float) -> float:
 
 
 def as_text(value: object) -> str:
-    """Return a number, a list or a table of numbers as text, floats with four digits."""
+    """Return a number, a list of numbers or a table of numbers as text; floats have four significant digits."""
     match value:
         case None:
             return "-"

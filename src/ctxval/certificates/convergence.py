@@ -1,10 +1,10 @@
-r"""The paper's Proposition 1 and Corollary 1: how far GP-UCB may still be from d* after n executions.
+r"""The paper's Proposition 1 and Corollary 1: a bound on the gap between the best distance of GP-UCB and d*.
 
 With the information gain gamma_n of the kernel, and |P| the dimension of the task space,
 
-    Pr(d* > best_n + r_n for some n) < eps,   r_n = C sqrt(|P| gamma_n / n)
+    Pr(d* > best_n + r_n for some n) < eps,   r_n = C sqrt(|P| gamma_n / n).
 
-(the paper prints "for all n", from which its corollary would not follow; its proof gives "for some n").
+The paper prints "for all n", from which its corollary would not follow; its proof gives "for some n".
 
 For a Matern kernel of smoothness nu, gamma_n = O(n^(e) log n) with e = |P|(|P|+1) / (2 nu + |P|(|P|+1)); without the
 logarithm, nu = 3/2 gives the printed r_n = C sqrt(|P| / n^(3 / (3 + |P|(|P|+1)))). For the squared exponential,
@@ -30,20 +30,20 @@ from ctxval.errors import CertificateError, InputError
 KernelName = Literal["matern-3/2", "matern-5/2", "squared-exponential"]
 
 _FIXED = ("GPUCB",)
-"""Searches with a fixed beta and with hyperparameters that are estimated."""
+"""Types of searches that fix beta and estimate the hyperparameters."""
 
 _SMOOTHNESS: dict[str, float] = {"matern-3/2": 1.5, "matern-5/2": 2.5}
-"""nu of the kernels that have one."""
+"""The smoothness nu of each Matern kernel."""
 
 
 def rate(n: int, dimension: int, kernel: KernelName = "matern-3/2") -> float:
     """Return ``r_n / C``.
 
     Raises:
-        CertificateError: n or the dimension are not positive, or the kernel is unknown.
+        CertificateError: if n or the dimension is not positive, or the kernel is unknown.
     """
     if n < 1 or dimension < 1:
-        raise CertificateError(f"the rate needs n and the dimension at least 1, got {n} and {dimension}.")
+        raise CertificateError(f"n and the dimension must be at least 1, got {n} and {dimension}.")
     if kernel == "squared-exponential":
         return float(np.sqrt(dimension * np.log(max(n, np.e)) ** (dimension + 1) / n))
     if kernel not in _SMOOTHNESS:
@@ -54,13 +54,17 @@ def rate(n: int, dimension: int, kernel: KernelName = "matern-3/2") -> float:
 
 @dataclass(frozen=True)
 class TheoremConstants:
-    """What the theorem behind Proposition 1 needs to be known, for a task space scaled to the unit cube.
+    """Constants of the theorem behind Proposition 1, for a task space scaled to the unit cube.
 
     Attributes:
-        scale: standard deviation of the distance under the prior, in its units.
-        noise: variance of the observations relative to the square of the scale; the theorem needs some.
-        a, b: of the paths' slopes, ``Pr(sup |df/dx_j| > scale L) <= a exp(-(L / b)^2)`` for each j and L > 0.
-        gain: the information gain is at most this times its rate, ``gamma_n <= gain n^e``.
+        scale: standard deviation of the distance under the prior, in the distance's units.
+        noise: variance of the observations' noise, divided by the square of ``scale``; it must be positive.
+        a, b: constants of the tail of the paths' slopes, ``Pr(sup |df/dx_j| > scale L) <= a exp(-(L / b)^2)`` for each
+            j and L > 0.
+        gain: factor of the information gain, ``gamma_n <= gain n^e``.
+
+    Raises:
+        CertificateError: if a constant is not a positive number.
     """
 
     scale: float
@@ -76,11 +80,11 @@ class TheoremConstants:
 
     @classmethod
     def parse(cls, text: str) -> TheoremConstants:
-        """Return the constants that a text has, in the order of the attributes, with commas in between.
+        """Return the constants from a text: five numbers in the order of the attributes, separated by commas.
 
         Raises:
-            InputError: they are not five numbers.
-            CertificateError: one of them is not positive.
+            InputError: if the text is not five numbers.
+            CertificateError: if one of them is not positive.
         """
         try:
             numbers = [float(part) for part in text.split(",")]
@@ -93,8 +97,9 @@ class TheoremConstants:
     def constant(self, n: int, dimension: int, confidence: float, kernel: KernelName = "matern-3/2") -> float:
         """Return the C with which ``r_n`` is the theorem's bound ``sqrt(C_1 beta_n gamma_n / n) + 2 / n`` on the gap.
 
-        From Srinivas, Krause, Kakade and Seeger 2012, Theorem 2, with their C_1 and beta_n; the least gap of n
-        executions is at most the mean one. It grows with the logarithm of n, which the paper hides in its constant.
+        Theorem 2 of Srinivas, Krause, Kakade and Seeger 2012 bounds the mean gap of n executions, with its C_1 and
+        beta_n; the smallest gap is at most the mean one. C grows with the logarithm of n, which the paper treats as
+        constant.
         """
         eps = 1 - require_probability("confidence", confidence)
         first = 8 / np.log1p(1 / self.noise)
@@ -108,11 +113,11 @@ class TheoremConstants:
 @part("convergence")
 @dataclass(frozen=True, repr=False)
 class Convergence(CertificateKind):
-    """Bound on d* by Proposition 1 of the paper, after GP-UCB.
+    """Bound on d* by Proposition 1 of the paper, for trials of GP-UCB.
 
     Attributes:
-        constant: C, in the distance's units; a bound by it is withdrawn.
-        theorem: what C is computed from, in place of it.
+        constant: C, in the distance's units; nothing supports a stated C, so a bound that uses it is withdrawn.
+        theorem: the constants from which C is computed if ``constant`` is not given.
     """
 
     name: ClassVar[str] = "convergence"
@@ -124,29 +129,30 @@ class Convergence(CertificateKind):
         """Return :func:`certify_convergence` of the trials.
 
         Raises:
-            CertificateError: C is missing, another search than GP-UCB chose the tasks, or the theory refuses them.
+            CertificateError: if C is missing, if another search than GP-UCB chose the tasks, or if the theory does not
+                allow the trials.
         """
         if sample.search not in (None, "GPUCB"):
             raise CertificateError(f"Proposition 1 is about tasks that GP-UCB chose; {sample.search} chose these.")
         constant = self.theorem if self.constant is None else self.constant
         if constant is None:
             raise CertificateError(
-                "Proposition 1 needs its constant C, which the paper does not give: state what it is computed from "
-                "(--theorem)."
+                "Proposition 1 needs its constant C, which the paper does not give; state the constants of the theorem "
+                "from which C is computed (--theorem)."
             )
         return certify_convergence(sample, constant, confidence, search=sample.search)
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Refuse an audit.
+        """Refuse an audit: the proposition cannot use independent draws.
 
         Raises:
             CertificateError: always.
         """
-        raise CertificateError("Proposition 1 is about tasks that GP-UCB chose: it has no use for an audit.")
+        raise CertificateError("Proposition 1 is about tasks that GP-UCB chose; it has no use for an audit.")
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
-        """Return what it needs of the theorem."""
+        """Return that it rests on the theorem."""
         return ["the theorem's assumptions, with the constants that you stated"]
 
 
@@ -162,16 +168,16 @@ def certify_convergence(
 
     Args:
         sample: the trials of a GP-UCB campaign; n counts those that the acquisition function chose.
-        constant: what C is computed from, or C itself in the distance's units; the paper does not give it, and nothing
-            can compute it from the trials, so that a bound by a bare C is withdrawn.
-        confidence: 1 - eps.
-        kernel: of the prior.
-        search: the type of the search that chose the tasks, if it is known; the bound of a search whose beta is fixed
-            and whose hyperparameters are fitted is withdrawn.
+        constant: the constants from which C is computed, or C itself in the distance's units. The paper does not give
+            C, and the trials do not determine it, so the bound is withdrawn if C itself is stated.
+        confidence: 1 - eps, the probability with which the bound holds.
+        kernel: the kernel of the prior.
+        search: the type of the search that chose the tasks, if it is known. The bound is withdrawn if that search
+            fixes beta and estimates the hyperparameters.
 
     Raises:
-        CertificateError: no distance is known, an execution failed, no task was chosen by an acquisition function, or C
-            is not positive.
+        CertificateError: if no distance is known, an execution failed, no task was chosen by an acquisition function,
+            or C is not positive.
     """
     require_probability("confidence", confidence)
     _require_usable(sample, constant)
@@ -207,7 +213,7 @@ def _require_usable(sample: Sample, constant: float | TheoremConstants) -> None:
     """Refuse a constant that is not positive, and trials without a distance.
 
     Raises:
-        CertificateError: it is not, or there are some.
+        CertificateError: if the constant is not positive, if a trial has no distance, or if there is no trial.
     """
     if not isinstance(constant, TheoremConstants) and not (constant > 0 and np.isfinite(constant)):
         raise CertificateError(f"the constant C of Proposition 1 must be a positive number, got {constant!r}.")
@@ -219,11 +225,11 @@ def _require_usable(sample: Sample, constant: float | TheoremConstants) -> None:
 
 
 def _doubt(constant: float, computed: bool, search: str | None) -> str | None:
-    """Return why the theorem says nothing of these trials; None if it does what is stated."""
+    """Return why the theorem does not apply to these trials; None if it applies under its assumptions."""
     if not computed:
         return (
             f"C = {constant:g} is a number of yours that no theorem and no trial supports, so the bound is withdrawn; "
-            "--theorem computes C from what the theorem needs to be known"
+            "--theorem computes C from the constants of the theorem"
         )
     if search in _FIXED:
         return (
@@ -234,12 +240,12 @@ def _doubt(constant: float, computed: bool, search: str | None) -> str | None:
 
 
 def require_iterations(sample: Sample) -> int:
-    """Return how many tasks an acquisition function chose.
+    """Return the number of tasks that an acquisition function chose.
 
     Raises:
-        CertificateError: none.
+        CertificateError: if it chose none of them.
     """
     count = len(sample.only("acquisition"))
     if not count:
-        raise CertificateError("Proposition 1 is about tasks that GP-UCB chose, and none of these was.")
+        raise CertificateError("Proposition 1 is about tasks that GP-UCB chose, but none of these was.")
     return count

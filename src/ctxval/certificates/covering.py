@@ -1,4 +1,4 @@
-"""How near the trials come to every task, and which executions would come nearer."""
+"""Coverage of the task space: the distance from any task to its nearest trial, and executions that reduce it."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from ctxval._util.arrays import Array
 from ctxval.errors import CertificateError
 
 RESOLUTION = 0.125
-"""How far from every trial a task may be, in diagonals of the task space, unless the user states more; what lies
-farther away may be unlike anything that was seen (docs/calibration.md)."""
+"""Default of the largest distance from a task to its nearest trial, in diagonals of the task space. Farther away the
+distance d may behave in ways that no trial has shown (docs/calibration.md)."""
 
 _PROBES = 8192
-"""Random tasks, and as many random corners, whose distances to the trials are looked at."""
+"""Number of random tasks, and of random corners, from which the coverage is computed."""
 
-_BESIDE = 0.125
-"""How far a corner may be from every trial, as a share of what any other task may be. A trial that is merely near to a
-corner says little of it: there are none beyond, and a distance often rises steeply towards the corner that is worst."""
+_NEXT_TO = 0.125
+"""Largest distance from a corner to its nearest trial, as a share of what is allowed for other tasks. A trial merely
+near a corner tells little about it: no trial lies beyond, and d often rises steeply towards the worst corner."""
 
 _MOST_PARAMETERS = 4
-"""Parameters up to which corners are asked for: there are 2^d of them."""
+"""Largest number of parameters for which corners must be executed, since there are 2^d of them."""
 
 
 def require_resolution(value: float) -> float:
-    """Return how far a task may be from every trial, in diagonals.
+    """Return the resolution: the largest distance from a task to its nearest trial, in diagonals of the task space.
 
     Raises:
-        CertificateError: it is not a positive number.
+        CertificateError: if it is not a positive number.
     """
     if not 0 < value < float("inf"):
         raise CertificateError(f"the resolution must be a positive number of diagonals, got {value!r}.")
@@ -39,40 +39,45 @@ def require_resolution(value: float) -> float:
 
 
 def resolved_volume(resolution: float, dimension: int) -> float:
-    """Return the share of the unit cube's volume that a ball of this many diagonals' radius has, at most 1."""
+    """Return the volume of a ball as a share of the unit cube, at most 1; its radius is in diagonals of the cube."""
     radius = resolution * np.sqrt(dimension)
     log_volume = 0.5 * dimension * np.log(np.pi) - gammaln(0.5 * dimension + 1) + dimension * np.log(radius)
     return float(np.exp(min(log_volume, 0.0)))
 
 
 def farthest_task(X: Array) -> float:
-    """Return how far a point of the cube is from ``(n, d)`` at most, in diagonals, by many random ones and corners."""
+    """Return the largest distance from a point of the cube to its nearest row of X ``(n, d)``, in diagonals.
+
+    It is computed on many random points and corners.
+    """
     return float(_gaps(X, _probes(X.shape[1])).max())
 
 
 def bare_corners(X: Array, resolution: float) -> Array:
-    """Return the corners ``(k, d)`` of the cube that no trial is at or beside; of few parameters, else none.
+    """Return the corners ``(k, d)`` of the cube that no trial is at or next to; none if d is larger than 4.
 
     Args:
         X: the trials' points ``(n, d)``.
-        resolution: how far a task may be, in diagonals; a corner must be eight times nearer. With 1 none is bare.
+        resolution: largest distance from a task to its nearest trial, in diagonals; for a corner it is an eighth of
+            that. If it is 1 or more, no corner is returned.
     """
     d = X.shape[1]
     if d > _MOST_PARAMETERS or resolution >= 1:
         return np.empty((0, d))
     corners = np.array(list(product((0.0, 1.0), repeat=d)))
-    return np.asarray(corners[_gaps(X, corners) > _BESIDE * resolution])
+    return np.asarray(corners[_gaps(X, corners) > _NEXT_TO * resolution])
 
 
 def covering(X: Array, resolution: float, most: int) -> Array | None:
-    """Return the points ``(k, d)`` whose execution would leave no task too far from every trial; None without such.
+    """Return points ``(k, d)`` whose execution would cover the task space; None if more than ``most`` are needed.
 
-    First the bare corners, then each is the task that is farthest from the trials and from the points before it.
+    The corners without a trial come first. Each further point is the task that is farthest from the trials and from
+    the points before it.
 
     Args:
         X: the trials' points ``(n, d)``.
-        resolution: how far a task may be, in diagonals.
-        most: how many points there may be.
+        resolution: largest distance from a task to its nearest trial, in diagonals.
+        most: the largest number of points.
     """
     probes = _probes(X.shape[1])
     points: list[Array] = list(bare_corners(X, resolution))
@@ -88,17 +93,17 @@ def covering(X: Array, resolution: float, most: int) -> Array | None:
 
 
 def most_contested(points: Array, X: Array, resolution: float) -> Array | None:
-    """Return the point that many others are near to and every trial is far from; None where all are beside trials.
+    """Return the point that is near many others and far from every trial; None if each of them is next to a trial.
 
     Args:
-        points: where a distance may be highest, as the highest draws of it have it, shape ``(k, d)``.
+        points: maximisers of the largest draws of d*, shape ``(k, d)``.
         X: the trials' points ``(n, d)``.
-        resolution: how far a task may be from every trial, in diagonals.
+        resolution: largest distance from a task to its nearest trial, in diagonals.
     """
     gaps = _gaps(X, points)
     near = (cdist(points, points) / np.sqrt(X.shape[1]) <= resolution / 2).sum(axis=1)
     best = int((gaps * near).argmax())
-    return points[best] if gaps[best] > _BESIDE * resolution else None
+    return points[best] if gaps[best] > _NEXT_TO * resolution else None
 
 
 def _probes(d: int) -> Array:

@@ -1,12 +1,12 @@
-"""Do the trials speak against the Gaussian process, and do they cover the tasks? When a bound is not to be believed.
+"""Diagnostics that withdraw a bound: the trials contradict the Gaussian process, or they do not cover the tasks.
 
 Each trial is predicted from those before it, and from all others.
 
 Under the process, the standardised error of each prediction from the trials before it follows a t distribution, and
-these errors are independent, whatever chose the tasks (recursive residuals; Brown, Durbin and Evans 1975). Trials that
-people chose or imported have no order that means anything; each of them is predicted from all others, and its
-standardised error follows a t distribution as well (externally studentised residuals; Cook and Weisberg 1982), if their
-tasks were not chosen by the distances.
+these errors are independent, whatever chose the tasks (recursive residuals; Brown, Durbin and Evans 1975). The order of
+trials that people chose or imported has no meaning, so each of them is predicted from all others. Its standardised
+error follows a t distribution as well (externally studentised residuals; Cook and Weisberg 1982), if the tasks were
+not chosen by the distances.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, far
 from ctxval.gp.hyperposterior import Conditioned
 
 LEVEL = 0.01
-"""How unlikely a surprise must be for the bound to be withdrawn."""
+"""Significance level: a surprise that is less probable than this withdraws the bound."""
 
 _MOST = 100
-"""Executions up to which it is told how many would cover the tasks."""
+"""Largest number of missing executions that a message states exactly."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,12 @@ class Diagnosis:
     """How well the process predicts its own data.
 
     Attributes:
-        surprise: the probability that the largest upward surprise of so many trials is as large as the one seen.
-        trial: in which trial it was seen.
-        left_out: root mean square of the leave-one-out errors in their standard deviations; about 1 if all is well.
-        farthest: how far from every trial a task is at most, in diagonals of the task space.
-        doubt: one sentence, where the bound is withdrawn.
+        surprise: p-value of the largest error upward: the probability, under the process, that the largest one of all
+            trials is at least as large.
+        trial: number of the trial with the largest error upward.
+        left_out: root mean square of the standardised leave-one-out errors; about 1 if the process fits the data.
+        farthest: largest distance from a task to its nearest trial, in diagonals of the task space.
+        doubt: why the bound is withdrawn, in one sentence; None if it is not.
     """
 
     surprise: float
@@ -50,7 +51,7 @@ class Diagnosis:
     doubt: str | None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the numbers."""
+        """Return the numbers, ready for JSON."""
         return {"surprise": self.surprise, "trial": self.trial, "left_out": self.left_out, "farthest": self.farthest}
 
     def __repr__(self) -> str:
@@ -66,15 +67,16 @@ def diagnose(
     level: float = LEVEL,
     resolution: float = RESOLUTION,
 ) -> Diagnosis:
-    """Return how the values, in the order of the trials, agree with the process, and how well the trials cover it.
+    """Return how well the values agree with the process, and how well the trials cover the tasks.
 
     Args:
-        conditioned: the values under draws of the hyperparameters.
+        conditioned: processes conditioned on the values in the order of the trials, one for each draw of the
+            hyperparameters.
         X: the trials' points ``(n, d)``.
-        numbers: of the trials; 0, 1, ... by default.
-        unordered: which trials have no order that means anything, shape ``(n,)``; none by default.
-        level: how unlikely a surprise withdraws the bound.
-        resolution: how far from every trial a task may be without withdrawing it, in diagonals.
+        numbers: numbers of the trials; 0, 1, ... by default.
+        unordered: which trials have an order without meaning, shape ``(n,)``; none by default.
+        level: a surprise that is less probable than this withdraws the bound.
+        resolution: a task that is farther than this from every trial withdraws the bound, in diagonals.
     """
     exceed, before = _surprises(conditioned, np.zeros(len(X), dtype=bool) if unordered is None else unordered)
     worst = int(np.nanargmin(exceed))
@@ -87,7 +89,7 @@ def diagnose(
         doubt = (
             f"trial {trial} came out {-ndtri(max(exceed[worst], 1e-300)):.1f} standard deviations above what the "
             f"{'trials before it' if before[worst] else 'other trials'} predict: the distance is not as smooth as the "
-            "bound takes it to be, and the bound is withdrawn"
+            "bound assumes, so the bound is withdrawn"
         )
     elif farthest > resolution:
         doubt = _uncovered(X, farthest, resolution)
@@ -100,15 +102,14 @@ def _uncovered(X: Array, farthest: float, resolution: float) -> str:
     missing = covering(X, resolution, _MOST)
     many = f"more than {_MOST}" if missing is None else f"{len(missing)}"
     return (
-        f"some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the "
-        f"{resolution:g} within which the distance is taken to be like what was seen, and the bound is withdrawn; "
-        f"{many} more executions would come near to every task (--until-decided makes them), or an audit bounds how "
-        "many tasks are worse"
+        f"some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the resolution of "
+        f"{resolution:g}, so the bound is withdrawn; {many} more executions would come near to every task "
+        "(--until-decided makes them), or an audit bounds how many tasks are worse"
     )
 
 
 def _surprises(conditioned: list[Conditioned], unordered: Mask) -> tuple[Array, Mask]:
-    """Return Pr(a value as large) for each trial ``(n,)``, NaN if not tested, and which ones the earlier predict."""
+    """Return upper tail probabilities ``(n,)``, NaN if not tested, and which trials are predicted from earlier ones."""
     exceed = np.full(len(unordered), np.nan)
     before = ~unordered
     exceed[2:] = np.mean([_exceedances(one) for one in conditioned], axis=0)
@@ -118,7 +119,7 @@ def _surprises(conditioned: list[Conditioned], unordered: Mask) -> tuple[Array, 
 
 
 def _left_out_exceedances(conditioned: Conditioned) -> Array:
-    """Return Pr(a value as large) for each trial given all others, shape ``(n,)``."""
+    """Return the upper tail probability of each value given all others, shape ``(n,)``."""
     y, n = conditioned.y, len(conditioned.y)
     inverse = cho_solve((conditioned.L, True), np.eye(n), check_finite=False)
     ones = inverse.sum(axis=1)
@@ -132,13 +133,13 @@ def _left_out_exceedances(conditioned: Conditioned) -> Array:
 def _bare(bare: Array, d: int) -> str:
     where = "ends of the task parameter's range" if d == 1 else "corners of the task space"
     return (
-        f"no trial is at or beside {len(bare)} of the {2**d} {where}, towards which the distance may rise unseen, and "
-        f"the bound is withdrawn; {len(bare)} more executions would be (--until-decided makes them)"
+        f"no trial is at or next to {len(bare)} of the {2**d} {where}, towards which the distance may rise unseen, so "
+        f"the bound is withdrawn; {len(bare)} more executions would be there (--until-decided makes them)"
     )
 
 
 def _exceedances(conditioned: Conditioned) -> Array:
-    """Return Pr(a value as large) for trials 3 to n, given those before each, shape ``(n - 2,)``."""
+    """Return the upper tail probabilities of values 3 to n, each given those before it, shape ``(n - 2,)``."""
     y = conditioned.y
     whitened = solve_triangular(conditioned.L, np.stack([np.ones(len(y)), y], axis=1), lower=True, check_finite=False)
     a, b = whitened.T

@@ -1,4 +1,4 @@
-"""How many more executions would decide? Futures of the campaign are played through on what the trials leave open."""
+"""Forecast of the executions until a verdict, from simulated continuations of the campaign under the posterior."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from ctxval.certificates.sample import Sample
 from ctxval.gp.hyperposterior import Conditioned
 
 HORIZON = 200
-"""Executions that are looked ahead at most."""
+"""Largest number of executions in a simulated future."""
 
 _CANDIDATES = 400
-"""Random tasks of each future, besides maximisers of draws of d*."""
+"""Number of random tasks in each future; maximisers of draws of d* come on top."""
 
 _BETA = 2.0
-"""Of GP-UCB in each future."""
+"""Confidence parameter of GP-UCB in each future."""
 
 _JITTER = 1e-9
-"""Added to variances, relative to the distance's, so that a covariance of near tasks can be factorised."""
+"""Added to variances, relative to the distance's variance, so that the covariance of near tasks can be factorised."""
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What is expected of the executions still to come.
+    """Forecast of further executions, from simulated futures of the campaign.
 
     Attributes:
-        executions: until half of the futures are decided; None where that takes more than ``HORIZON``.
-        validated: share of the futures that end with the threshold kept.
-        falsified: share that end with a counterexample.
+        executions: number of executions after which half of the futures are decided; None if it exceeds ``HORIZON``.
+        validated: share of the futures that validate the threshold.
+        falsified: share of the futures that find a counterexample.
     """
 
     executions: int | None
@@ -49,21 +49,21 @@ def forecast(
 ) -> Forecast:
     """Return how many more executions of GP-UCB decide whether d* is at most the threshold.
 
-    Each future takes one draw of the hyperparameters, of those that stand in the way of a validation, draws a true
-    distance from the posterior on a set of candidate tasks, and searches it; it is decided when a distance above the
-    threshold is executed, or when the upper bound falls to the threshold. The bound's width in standard deviations is
-    the one that it has now.
+    Each future takes one draw of the hyperparameters, from those whose draws of d* exceed the threshold if there are
+    any. It draws a true distance function from the posterior on a set of candidate tasks, and searches it with GP-UCB.
+    It is decided when a distance above the threshold is executed, or when the upper bound falls to the threshold. The
+    bound keeps the number of standard deviations above the mean that it has now.
 
     Args:
         sample: the trials.
         found: draws of d* from the same trials.
-        threshold: tau.
-        confidence: of the bound.
-        seed: of the futures.
-        futures: how many.
+        threshold: tau, in the distance's units.
+        confidence: confidence level of the bound.
+        seed: seed of the futures.
+        futures: number of futures.
 
     Raises:
-        CertificateError: so high a confidence needs more draws of d*.
+        CertificateError: if the confidence is too high for so few draws of d*.
     """
     rng = np.random.default_rng(seed)
     lengths, kept = [], 0
@@ -72,7 +72,7 @@ def forecast(
         owners = found.owners if not len(in_the_way) else in_the_way
         for k in range(futures):
             conditioned = found.conditioned[owners[k * len(owners) // futures]]
-            length, validated = _Future(sample, found, conditioned, confidence, rng).play(threshold)
+            length, validated = _Future(sample, found, conditioned, confidence, rng).simulate(threshold)
             lengths.append(length)
             kept += validated
     decided = np.isfinite(lengths)
@@ -81,7 +81,7 @@ def forecast(
 
 
 class _Future:
-    """A posterior on finitely many tasks, and a campaign that has not happened yet."""
+    """A simulated continuation of the campaign: a posterior on finitely many tasks, and a truth drawn from it."""
 
     def __init__(
         self, sample: Sample, found: Maxima, conditioned: Conditioned, confidence: float, rng: np.random.Generator
@@ -96,7 +96,7 @@ class _Future:
         self.truth = self.mean + L @ rng.normal(size=len(candidates))
         tops = (self.mean[:, None] + L @ rng.normal(size=(len(candidates), 256))).max(axis=0)
         self.width = self._width(max(float(np.quantile(tops, confidence)), self.best))
-        # The present bound is that of all draws together: what they leave undecided is not decided by one of them.
+        # The first bound is that of all draws together: one draw must not decide what all together leave undecided.
         self.bound = max(float(self.warp.forward(found.upper(confidence))), self.best)
 
     def _width(self, bound: float) -> float:
@@ -113,8 +113,8 @@ class _Future:
     def _upper(self, width: float) -> float:
         return float((self.mean + width * self._deviation()).max())
 
-    def play(self, threshold: float) -> tuple[float, bool]:
-        """Return after how many executions it is decided, infinity for never, and whether the threshold is kept."""
+    def simulate(self, threshold: float) -> tuple[float, bool]:
+        """Return the number of executions until it is decided (infinity if never) and whether the threshold is kept."""
         limit = float(self.warp.forward(threshold))
         for executions in range(HORIZON + 1):
             if self.best > limit:
@@ -139,7 +139,7 @@ class _Future:
 
 
 def _joint(conditioned: Conditioned, X: Array, Z: Array) -> tuple[Array, Array]:
-    """Return posterior mean ``(m,)`` and covariance ``(m, m)`` at Z, with the uncertainty of the prior's mean."""
+    """Return posterior mean ``(m,)`` and covariance ``(m, m)`` at Z, including the uncertainty of the prior's mean."""
     hyperparameters = conditioned.hyperparameters
     k = hyperparameters.kernel(Z, X)
     weights = cho_solve((conditioned.L, True), k.T, check_finite=False)

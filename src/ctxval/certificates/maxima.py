@@ -1,8 +1,8 @@
 r"""Draws of ``d* = max_p d(p)`` from its posterior given all trials, however they were chosen.
 
 Paths of the Gaussian process are drawn from the posterior, and each is maximised over the task space. Smoothness,
-length-scales, mean, variance and noise are drawn as well, not plugged in, and made no smoother than the trials that are
-spread best say.
+length-scales, mean, variance and noise are drawn from their posterior too, instead of being fixed at estimates. A draw
+that is smoother than one from the well-spread trials alone is made as rough as that one.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparame
 from ctxval.gp.sample_paths import draw_paths, maxima
 
 FEWEST = 4
-"""Trials without which nothing is said."""
+"""The fewest trials for a bound."""
 
 STOCHASTIC = (1e-6, 1.0)
 """Bounds of the noise variance of a stochastic system, relative to the variance of the distance."""
 
 _ROUNDING = 1e-14
-"""Distances that differ by less, relative to their size, are one distance and rounding."""
+"""Distances that differ by less than this share of the largest one differ by rounding alone."""
 
 _EXTREME = 1e100
-"""Distances beyond it, or that differ by less than its inverse, have squares that no float holds."""
+"""The largest allowed distance, and the inverse of the smallest allowed difference: their squares must be finite."""
 
 _REPEATED = 1e-6
-"""Two executions of a task may differ by so much of all distances' spread where the system is deterministic."""
+"""Largest difference between two executions of a task on a deterministic system, as a share of the distances' range."""
 
-_LOTS = 32
-"""Parts of the chain of hyperparameters that are resampled for the error of a bound."""
+_BLOCKS = 32
+"""Number of blocks of the chain of hyperparameters in the bootstrap of a bound's standard error."""
 
 _RESAMPLES = 200
-"""How often they are resampled."""
+"""Number of bootstrap samples."""
 
 _SEEDS = 1_000_003
-"""Between the seeds of chains whose draws are taken together."""
+"""Distance between the seeds of chains whose draws are pooled."""
 
 _MOST = 4
-"""Times as many draws of d* as usual that a bound near a threshold may take."""
+"""Largest number of chains for a bound near a threshold; one chain is usual."""
 
 _EXACTNESS = 3.0 * np.sqrt(EXACT)
-"""How far a path may miss exact values, in standard deviations of the distance."""
+"""Tolerance with which a path passes through exact values, in standard deviations of the distance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +55,10 @@ class Maxima:
     """Draws of d* from its posterior.
 
     Attributes:
-        draws: sorted, shape ``(S,)``.
-        points: a maximiser of each, in the unit cube, shape ``(S, d)``.
-        conditioned: the hyperparameters drawn.
-        owners: under which of them each was drawn, shape ``(S,)``.
+        draws: the draws in ascending order, shape ``(S,)``.
+        points: a maximiser of each draw's path, in the unit cube, shape ``(S, d)``.
+        conditioned: the processes under each draw of the hyperparameters.
+        owners: index into ``conditioned`` of each draw, shape ``(S,)``.
     """
 
     draws: Array
@@ -70,32 +70,33 @@ class Maxima:
         return call(self, len(self.draws), draws=self.draws, points=self.points, hyperparameters=len(self.conditioned))
 
     def upper(self, confidence: float) -> float:
-        """Return the bound that holds with this probability.
+        """Return the bound on d* that holds with this probability.
 
         Raises:
-            CertificateError: so high a confidence needs more draws.
+            CertificateError: if the confidence is no probability, or too high for so few draws.
         """
         rank = max(1, int(np.ceil((len(self.draws) + 1) * require_probability("confidence", confidence) - 1e-9)))
         if rank > len(self.draws):
             raise CertificateError(
-                f"a confidence of {confidence:g} needs more than the {len(self.draws)} draws of d* that there are."
+                f"a confidence of {confidence:g} needs more than the {len(self.draws)} draws of d* that were made."
             )
         return float(self.draws[rank - 1])
 
     def error(self, confidence: float) -> float:
-        """Return the standard error of the bound: what it differs by from one seed of the draws to another.
+        """Return the standard error of the bound: its standard deviation over seeds of the draws.
 
-        Of lots of the hyperparameters' chain, drawn with replacement: draws that follow each other are alike, and so
-        are those that share their hyperparameters. Few draws are above a bound of a high confidence, so that their own
-        spread may be too small; the bound with less of them above it has one too, and the larger of the two is taken.
+        It is computed by a block bootstrap over the chain of hyperparameters, because successive draws are correlated,
+        and so are draws that share hyperparameters. If the confidence is high, few draws are above the bound and their
+        spread may be too small. So the error of a bound of lower confidence is computed too, and the larger is
+        returned.
         """
         share = require_probability("confidence", confidence)
-        lots = min(_LOTS, len(self.conditioned))
-        if lots < 2:
+        blocks = min(_BLOCKS, len(self.conditioned))
+        if blocks < 2:
             return 0.0
-        lot_of = self.owners * lots // len(self.conditioned)
-        times = np.random.default_rng(0).multinomial(lots, np.full(lots, 1 / lots), size=_RESAMPLES)
-        weights = np.cumsum(times[:, lot_of], axis=1, dtype=np.float64)
+        block_of = self.owners * blocks // len(self.conditioned)
+        times = np.random.default_rng(0).multinomial(blocks, np.full(blocks, 1 / blocks), size=_RESAMPLES)
+        weights = np.cumsum(times[:, block_of], axis=1, dtype=np.float64)
         total = weights[:, -1:]
 
         def spread(confidence: float) -> float:
@@ -105,7 +106,7 @@ class Maxima:
         return max(spread(share), spread(1 - (1 - share) / np.sqrt(2)))
 
     def probability(self, threshold: float) -> float:
-        """Return Pr(d* <= threshold), rounded down to what so many draws can tell."""
+        """Return a lower estimate of Pr(d* <= threshold): the number of draws that keep it, divided by S + 1."""
         return float((self.draws <= threshold).sum() / (len(self.draws) + 1))
 
 
@@ -122,21 +123,22 @@ def draw_maxima(
 
     Args:
         sample: trials of any origin.
-        draws: of hyperparameters.
-        paths: for each of them.
-        seed: of the draws.
+        draws: number of draws of hyperparameters.
+        paths: number of paths for each draw of hyperparameters.
+        seed: seed of the draws.
         stochastic: whether two executions of one task may differ; then d* is the largest expected distance.
-        prior: of the hyperparameters.
+        prior: prior of the hyperparameters; if None, the default for a deterministic or a stochastic system.
 
     Raises:
-        CertificateError: an execution failed, or the trials are too few or all alike.
+        CertificateError: if an execution failed, there are too few trials, their distances are all equal or too
+            extreme, or two executions of one task differ although the system is not declared stochastic.
     """
-    X, y = _required(sample)
+    X, y = _required_data(sample)
     if not stochastic:
         _require_one_distance_each(sample)
     rng = np.random.default_rng(seed)
-    # Noise on the logarithms would bound the median: the expected distance is not the exponential of the expected one.
-    # And what is noise and what is roughness only all trials together can tell.
+    # No logarithm with noise: the exponential of an expected logarithm is not the expected distance.
+    # No second chain on well-spread trials: only all trials together can separate noise from roughness.
     usual = Prior(noise=STOCHASTIC, offset=None, spread_share=1.0) if stochastic else Prior()
     believed = usual if prior is None else prior
     best_first = X[np.argsort(-y, kind="stable")]
@@ -159,49 +161,57 @@ def draw_maxima(
 def settle_maxima(
     sample: Sample, threshold: float, confidence: float, *, seed: int = 0, stochastic: bool = False
 ) -> Maxima:
-    """Return draws of d*, up to four times as many as usual while the threshold is within two errors of the bound.
+    """Return draws of d*, enough of them to tell on which side of a threshold the bound is, if that is possible.
 
-    The first of them are those of :func:`draw_maxima`; the others come from chains of their own.
+    The draws of :func:`draw_maxima` are doubled while the threshold is within two standard errors of the bound, up to
+    four times as many. The additional draws come from separate chains.
 
     Raises:
-        CertificateError: as of :func:`draw_maxima`, or so high a confidence needs more draws.
+        CertificateError: under the conditions of :func:`draw_maxima`, or if the confidence is too high for so few
+            draws.
     """
     found = draw_maxima(sample, seed=seed, stochastic=stochastic)
-    lots = [found]
-    while len(lots) < _MOST and abs(found.upper(confidence) - threshold) < ERRORS * found.error(confidence):
-        more = range(len(lots), 2 * len(lots))
-        lots += [draw_maxima(sample, seed=_SEEDS * lot + seed, stochastic=stochastic) for lot in more]
-        found = _together(lots)
+    chains = [found]
+    while len(chains) < _MOST and abs(found.upper(confidence) - threshold) < ERRORS * found.error(confidence):
+        more = range(len(chains), 2 * len(chains))
+        chains += [draw_maxima(sample, seed=_SEEDS * chain + seed, stochastic=stochastic) for chain in more]
+        found = _pooled(chains)
     return found
 
 
-def _together(lots: list[Maxima]) -> Maxima:
-    draws, points = np.concatenate([one.draws for one in lots]), np.concatenate([one.points for one in lots])
-    before = np.cumsum([0, *(len(one.conditioned) for one in lots[:-1])])
-    owners = np.concatenate([one.owners + first for one, first in zip(lots, before, strict=True)])
+def _pooled(chains: list[Maxima]) -> Maxima:
+    """Return the draws of all chains as one."""
+    draws, points = np.concatenate([one.draws for one in chains]), np.concatenate([one.points for one in chains])
+    before = np.cumsum([0, *(len(one.conditioned) for one in chains[:-1])])
+    owners = np.concatenate([one.owners + first for one, first in zip(chains, before, strict=True)])
     order = np.argsort(draws, kind="stable")
-    return Maxima(draws[order], points[order], [each for one in lots for each in one.conditioned], owners[order])
+    return Maxima(draws[order], points[order], [each for one in chains for each in one.conditioned], owners[order])
 
 
-def _required(sample: Sample) -> tuple[Array, Array]:
+def _required_data(sample: Sample) -> tuple[Array, Array]:
+    """Return points ``(n, d)`` and distances ``(n,)`` of trials that allow a bound.
+
+    Raises:
+        CertificateError: if an execution has no distance, or if the distances are too few, all equal or too extreme.
+    """
     failed = sample.failed - len(sample.numbers_of("unmeasured"))
     if failed:
         raise CertificateError(
-            f"{failed} of {len(sample)} executions failed: what the distance is there is unknown, so nothing bounds "
+            f"{failed} of {len(sample)} executions failed: the distance of their tasks is unknown, so nothing bounds "
             f"d*; once the cause is removed, execute the same tasks again and say what it was (ctxval ask STORE "
             f'--again N --because "..."): {listed(sample.numbers_of("failed"))}.{advice_to_remeasure(sample)}'
         )
     if sample.failed:
         raise CertificateError(
-            f"what the distance is at some task is unknown, so nothing bounds d*.{advice_to_remeasure(sample)}"
+            f"the distance of some task is unknown, so nothing bounds d*.{advice_to_remeasure(sample)}"
         )
     if len(sample) < FEWEST:
         raise CertificateError(f"a posterior bound needs at least {FEWEST} trials, got {len(sample)}.")
     if np.ptp(sample.distances) == 0:
-        raise CertificateError(f"all {len(sample)} distances are {sample.distances[0]:g}: they say nothing of d*.")
+        raise CertificateError(f"all {len(sample)} distances are {sample.distances[0]:g}: they do not bound d*.")
     spread, largest = float(np.ptp(sample.distances)), float(np.abs(sample.distances).max())
     if spread < _ROUNDING * largest:
-        raise CertificateError(f"the distances differ from {largest:g} by rounding alone: they say nothing of d*.")
+        raise CertificateError(f"the distances differ from {largest:g} by rounding alone: they do not bound d*.")
     if spread < 1 / _EXTREME or largest > _EXTREME:
         raise CertificateError(
             f"the largest distance is {largest:g} and they differ by {spread:g}: a posterior bound needs numbers "
@@ -211,6 +221,11 @@ def _required(sample: Sample) -> tuple[Array, Array]:
 
 
 def _require_one_distance_each(sample: Sample) -> None:
+    """Refuse trials of a stochastic system.
+
+    Raises:
+        CertificateError: if two executions of one task have different distances.
+    """
     y, numbers = sample.distances, sample.numbers
     _, tasks = np.unique(sample.points, axis=0, return_inverse=True)
     for row, task in enumerate(tasks.ravel()):

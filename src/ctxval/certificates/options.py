@@ -1,4 +1,4 @@
-"""What a user decides about a certificate before the trials are judged by it, in one value."""
+"""Options of a verdict: the kind of certificate, its confidence and the acceptable volume."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from ctxval.certificates.posterior import Posterior
 from ctxval.errors import CertificateError, InputError
 
 CONFIDENCE = 0.95
-"""Confidence of a verdict, unless another one is stated."""
+"""Default confidence of a verdict."""
 
 LEAST_CONFIDENCE = 0.5
-"""Below it a statement is wrong as often as right."""
+"""Least confidence of a verdict: below it, a statement is wrong more often than right."""
 
 MOST_VOLUME = 0.5
-"""Above it a statement leaves out most of what it is about."""
+"""Largest acceptable volume of a verdict: above it, a statement leaves out most of the task space."""
 
 
 @dataclass(frozen=True)
 class CertificateOptions:
-    """By which certificate trials are judged.
+    """The certificate by which trials are judged, and the volume that it may leave out.
 
     Attributes:
         kind: the kind of certificate, with its own options.
-        confidence: of the certificate, at least 0.5.
-        volume: the share of the task space that may exceed the threshold; 0 accepts bounds on d* alone.
+        confidence: confidence level of the certificate, at least 0.5.
+        volume: the share of the task space that may exceed the threshold; if it is 0, only bounds on d* validate.
 
     Raises:
-        CertificateError: the confidence is no probability.
-        InputError: the confidence is below 0.5, or the volume negative or above 0.5.
+        CertificateError: if the confidence is no probability.
+        InputError: if the confidence is below 0.5, or the volume is negative or above 0.5.
     """
 
     kind: CertificateKind = field(default_factory=Posterior)
@@ -47,7 +47,7 @@ class CertificateOptions:
     def posterior(
         cls, confidence: float = CONFIDENCE, *, stochastic: bool = False, resolution: float = RESOLUTION
     ) -> CertificateOptions:
-        """Return the posterior bound with these options, as :class:`Posterior` has them."""
+        """Return options with the posterior bound; the arguments are those of :class:`Posterior`."""
         return cls(Posterior(stochastic, resolution), confidence)
 
     def __repr__(self) -> str:
@@ -58,8 +58,8 @@ def require_confidence(confidence: float) -> float:
     """Return the confidence of a verdict.
 
     Raises:
-        CertificateError: it is no probability.
-        InputError: it is below 0.5.
+        CertificateError: if it is no probability.
+        InputError: if it is below 0.5.
     """
     require_probability("the confidence", confidence)
     if 1 - confidence == 1:
@@ -76,7 +76,7 @@ def require_volume(volume: float) -> float:
     """Return the share of the task space that may exceed a threshold.
 
     Raises:
-        InputError: it is negative, or above 0.5.
+        InputError: if it is negative or above 0.5.
     """
     if not 0 <= volume <= MOST_VOLUME:
         raise InputError(

@@ -1,10 +1,10 @@
 r"""The Gaussian-process bound: the posterior of ``d* = max_p d(p)`` given all trials, however they were chosen.
 
-The bound is an order statistic of draws of d*: of S independent draws and the truth, all alike under the prior, the
-truth is at most the k-th smallest draw with probability ``k / (S + 1)``; ours share hyperparameters by the handful, so
-that it is nearly so. Bayes' rule does not ask why a task was chosen, nor why the campaign stopped, so the bound holds
-after adaptive sampling; what it does rest on is the prior, and :mod:`ctxval.certificates.diagnostics` says when the
-trials speak against it.
+The bound is an order statistic of draws of d*. Under the prior, S independent draws and the truth are exchangeable, so
+the truth is at most the k-th smallest draw with probability ``k / (S + 1)``. Here groups of draws share
+hyperparameters, so this holds approximately. Bayes' rule does not depend on why a task was chosen or why the campaign
+stopped, so the bound holds after adaptive sampling. It rests on the prior;
+:mod:`ctxval.certificates.diagnostics` finds trials that contradict it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ctxval.gp.hyperposterior import Conditioned
 from ctxval.gp.surrogate import fit_surrogate
 
 _NAMED = 3
-"""Task parameters whose resolution is told one by one."""
+"""Largest number of task parameters for which the resolution is stated in the units of each."""
 
 
 @part("posterior")
@@ -39,11 +39,11 @@ class Posterior(CertificateKind):
 
     Attributes:
         stochastic: whether two executions of one task may differ; then the largest expected distance is bounded.
-        resolution: how far from every trial a task may be, in diagonals of the task space, before the bound is
-            withdrawn; 1 trusts the process everywhere.
+        resolution: largest distance from a task to its nearest trial, in diagonals of the task space; beyond it the
+            bound is withdrawn. With 1 the bound is never withdrawn for this reason.
 
     Raises:
-        CertificateError: the resolution is not a positive number.
+        CertificateError: if the resolution is not a positive number.
     """
 
     name: ClassVar[str] = "posterior"
@@ -59,7 +59,7 @@ class Posterior(CertificateKind):
         return self.certify_by(None, sample, confidence)
 
     def certify_by(self, found: Maxima | None, sample: Sample, confidence: float) -> Certificate:
-        """Return it by draws of d* that were made before, from the same trials."""
+        """Return the certificate from draws of d* that were made from the same trials; if None, draw them."""
         return certify_posterior(
             sample, confidence, stochastic=self.stochastic, resolution=self.resolution, found=found
         )
@@ -67,16 +67,16 @@ class Posterior(CertificateKind):
     def certify_against(
         self, sample: Sample, threshold: float, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
-        """Return it of as many draws as a threshold near to the bound asks for, and a forecast if it is above."""
+        """Return the certificate from enough draws for the threshold, and a forecast if its bound is above that."""
         found = settle_maxima(sample, threshold, confidence, stochastic=self.stochastic)
         certificate = self.certify_by(found, sample, confidence)
         if certificate.doubt is not None or certificate.upper_bound <= threshold:
-            return certificate, None  # a process that the trials speak against foresees nothing
+            return certificate, None  # a process that the trials contradict predicts nothing
         return certificate, forecast(sample, found, threshold, confidence)
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
-        """Return what it needs of the distance."""
+        """Return what it assumes about the distance."""
         resolution = certificate.details.get("resolution")
         smooth = "the distance being as smooth between the trials as at them, also in regions without any trial"
         if resolution is not None and resolution["of_each_range"] < 1:
@@ -95,7 +95,7 @@ class Posterior(CertificateKind):
 
     @classmethod
     def qualification(cls, certificate: Certificate, space: TaskSpace | None = None) -> str:
-        """Return what a validation says of a resolution that is not the usual one."""
+        """Return the end of a sentence that names a resolution other than the default; empty if it is the default."""
         resolution = certificate.details.get("resolution")
         if resolution is None or resolution["diagonals"] == RESOLUTION:
             return ""
@@ -136,16 +136,16 @@ def certify_posterior(
 
     Args:
         sample: trials of any origin.
-        confidence: 1 - eps.
+        confidence: 1 - eps, the probability with which the bound holds.
         stochastic: whether two executions of one task may differ; then the largest expected distance is bounded.
-        resolution: how far from every trial a task may be, in diagonals of the task space, before the bound is
-            withdrawn; 1 trusts the process everywhere.
-        seed: of the draws.
-        found: draws of d* made before, from the same trials.
+        resolution: largest distance from a task to its nearest trial, in diagonals of the task space; beyond it the
+            bound is withdrawn. With 1 the bound is never withdrawn for this reason.
+        seed: seed of the draws.
+        found: draws of d* from the same trials, if they were made before.
 
     Raises:
-        CertificateError: an execution failed, the trials are too few or all alike, the confidence is too high, or the
-            resolution is not positive.
+        CertificateError: if an execution failed, the trials do not allow a bound (see :func:`draw_maxima`), the
+            confidence is too high for the number of draws, or the resolution is not positive.
     """
     require_probability("confidence", confidence)
     require_resolution(resolution)
@@ -190,7 +190,7 @@ _STANDARD_ERROR = " (plus or minus one standard error of the random draws that i
 
 
 def _both_outcomes(sample: Sample, stochastic: bool) -> str | None:
-    """Return why failures that were made good for no stated reason withdraw the bound."""
+    """Return why the bound is withdrawn if a failed task later succeeded for no stated reason; None if none did."""
     unexplained = [one for one in sample.made_good if one.because is None]
     if not unexplained:
         return None
@@ -225,13 +225,13 @@ def _assumptions(stochastic: bool, resolution: float) -> tuple[str, ...]:
 
 
 def _resolution(resolution: float, dimension: int) -> dict[str, float]:
-    """Return the resolution in diagonals, as a share of each parameter's range, and its ball's share of the space."""
+    """Return the resolution in diagonals, as a share of each parameter's range, and as a volume of the task space."""
     share = resolution * float(np.sqrt(dimension))
     return {"diagonals": resolution, "of_each_range": share, "of_the_space": resolved_volume(resolution, dimension)}
 
 
 def _summary(conditioned: list[Conditioned]) -> dict[str, Any]:
-    """Return the hyperparameters in short: medians of the length-scales, and how likely the rougher kernel is."""
+    """Return a summary of the hyperparameters: shares of the kernels and the scales, medians of the length-scales."""
     scales = np.exp([one.hyperparameters.log_scales for one in conditioned])
     rough = float(np.mean([one.hyperparameters.nu == 1.5 for one in conditioned]))
     return {
@@ -242,9 +242,14 @@ def _summary(conditioned: list[Conditioned]) -> dict[str, Any]:
 
 
 def instantaneous_bound(sample: Sample, beta: float = 2.0) -> dict[str, float] | None:
-    """Return the largest UCB of the paper's GP, hyperparameters plugged in, and its gap to the best distance found.
+    """Return the largest UCB of the paper's GP with estimated hyperparameters, and its gap to the best distance found.
 
-    It is below d* about as often as above, and costs a fortieth of a posterior bound. None where nothing can be fitted.
+    It is below d* about as often as above, and costs a fortieth of a posterior bound. Returns None if fewer than two
+    distances are known.
+
+    Args:
+        sample: the trials.
+        beta: confidence parameter of the UCB.
     """
     try:
         surrogate = fit_surrogate(sample.points, sample.distances)

@@ -1,4 +1,4 @@
-"""Where trials come from: the task space, the search, and what was changed in their store."""
+"""The origin of trials: the task space, the search, and changes of their store."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from ctxval.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Provenance:
-    """What is known of a campaign besides its trials, as far as it concerns a certificate.
+    """Facts on a campaign, besides its trials, that concern a certificate.
 
     Attributes:
-        space: the task space, to tell lengths in its units; None if it is not known.
+        space: the task space, to state lengths in its units; None if it is not known.
         search: the type of the search that chose the tasks; None if it is not known.
         remarks: sentences that a certificate lists among its assumptions, such as what was changed on the system.
     """
@@ -28,7 +28,7 @@ class Provenance:
 
     @classmethod
     def of(cls, description: Mapping[str, Any], changes: Iterable[Change] = ()) -> Provenance:
-        """Return it from a store's description of its experiment and the changes that the store lists."""
+        """Return the provenance from a store's description of its experiment and its list of changes."""
         search = description.get("search")
         return cls(
             space=_space_of(description),
@@ -41,7 +41,7 @@ class Provenance:
 
 
 def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
-    """Return sentences on what was changed in a store after it was written, for a certificate's assumptions."""
+    """Return sentences on later changes of a store, for a certificate's assumptions."""
     found = []
     for change in changes:
         if change.what == "accepted":
@@ -56,7 +56,7 @@ def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
 
 
 def _space_of(description: Mapping[str, Any]) -> TaskSpace | None:
-    """Return the task space that is described; None if there is none that can be read."""
+    """Return the task space of a description; None if it has none that can be read."""
     try:
         described = dict(description["validation"]["space"])
         described.pop("type", None)
@@ -67,4 +67,4 @@ def _space_of(description: Mapping[str, Any]) -> TaskSpace | None:
             bounds[vector] = (low, high, *unit) if vector == name else ([*lows, low], [*highs, high], *unit)
         return TaskSpace(**bounds)
     except (KeyError, TypeError, ValueError, InputError):
-        return None  # nothing but the units in a sentence depends on it
+        return None  # only the units in a sentence depend on it

@@ -1,4 +1,4 @@
-"""Kinds of certificates by name, those of other packages among them."""
+"""Kinds of certificates by name, including those of other packages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Kind = TypeVar("Kind", bound=type[CertificateKind])
 class KindRegistry(Registry[CertificateKind]):
     """Kinds of certificates by name: built-in ones, those of installed packages, and those registered by a decorator.
 
-    A kind that was registered runs its user's code, so it never counts as data.
+    A registered kind is the user's own code, so :meth:`is_data` returns False for it.
     """
 
     def __init__(self) -> None:
@@ -29,10 +29,10 @@ class KindRegistry(Registry[CertificateKind]):
         self._registered: dict[str, type[CertificateKind]] = {}
 
     def register(self, kind: Kind) -> Kind:
-        """Add a kind, as a decorator of its class.
+        """Add a kind; it is used as a decorator of the class.
 
         Raises:
-            InputError: it is no kind of certificate, or another one has its name.
+            InputError: if the class is no kind of certificate, or another kind has its name.
         """
         name = _required(kind).name
         known = self.find(name) if name in self.built_in else self._registered.setdefault(name, kind)
@@ -41,11 +41,11 @@ class KindRegistry(Registry[CertificateKind]):
         return kind
 
     def find(self, name: str) -> type[CertificateKind]:
-        """Return a kind.
+        """Return the kind of a name.
 
         Raises:
-            UnknownNameError: there is none of that name.
-            InputError: the package that has it cannot be imported.
+            UnknownNameError: if no kind has that name.
+            InputError: if the package that provides it cannot be imported, or if it provides something else.
         """
         if name in self._registered:
             return self._registered[name]
@@ -56,15 +56,15 @@ class KindRegistry(Registry[CertificateKind]):
 
     @property
     def imported(self) -> tuple[str, ...]:
-        """The names of the kinds whose code is imported: built-in and registered ones."""
+        """The names of the kinds that are imported: built-in and registered ones."""
         return (*self.built_in, *self._registered)
 
     def of(self, certificate: Certificate) -> type[CertificateKind]:
-        """Return the kind of a certificate; :class:`CertificateKind` with its defaults if it is not known."""
+        """Return the kind of a certificate; the base class :class:`CertificateKind` if the kind is not known."""
         return self.find(certificate.kind) if certificate.kind in self else CertificateKind
 
     def with_option(self, option: str) -> tuple[str, ...]:
-        """Return the names of the imported kinds that have a use for an option."""
+        """Return the names of the imported kinds that have an option."""
         return tuple(name for name in self.imported if option in self.find(name).options())
 
     def __contains__(self, name: object) -> bool:
@@ -89,15 +89,16 @@ KINDS = KindRegistry()
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the built-in kinds in one record, for :func:`certify`; each kind takes those that are its own.
+    """Options of the built-in kinds in one record, for :func:`certify`; each kind uses those that are its own.
 
     Attributes:
-        stochastic: posterior: whether two executions of one task may differ.
-        discard: sampling-discarding: how many of the largest distances are discarded.
-        constant: convergence: C, in the distance's units.
-        theorem: convergence: what C is computed from, in place of it.
-        search: convergence: the type of the search that chose the tasks, if it is known.
-        resolution: posterior: how far from every trial a task may be, in diagonals of the task space.
+        stochastic: for the posterior bound: whether two executions of one task may differ.
+        discard: for sampling and discarding: how many of the largest distances are discarded.
+        constant: for the convergence bound: C, in the distance's units.
+        theorem: for the convergence bound: the constants from which C is computed if ``constant`` is not given.
+        search: for the convergence bound: the type of the search that chose the tasks, if it is known.
+        resolution: for the posterior bound: largest distance from a task to its nearest trial, in diagonals of the task
+            space.
         remarks: sentences that the certificate lists among its assumptions, such as what was changed on the system.
     """
 
@@ -116,9 +117,15 @@ class Options:
 def certify(sample: Sample, kind: str, confidence: float, options: Options | None = None) -> Certificate:
     """Return the certificate of a kind.
 
+    Args:
+        sample: the trials.
+        kind: the name of the kind.
+        confidence: the probability with which the statement must hold.
+        options: options of the kind; its defaults if None.
+
     Raises:
-        UnknownNameError: there is no such kind.
-        CertificateError: its theory does not allow these trials, or something that it needs is not given.
+        UnknownNameError: if no kind has that name.
+        CertificateError: if its theory does not allow these trials, or an option that it needs is missing.
     """
     chosen = Options() if options is None else options
     searched = sample if chosen.search is None else replace(sample, search=chosen.search)
@@ -126,11 +133,11 @@ def certify(sample: Sample, kind: str, confidence: float, options: Options | Non
 
 
 def require_use(kind: str, given: Iterable[str]) -> None:
-    """Refuse options that a kind would ignore: somebody who gives one believes that it counts.
+    """Refuse options that a kind would ignore: a user who gives one expects it to have an effect.
 
     Raises:
-        CertificateError: one is given that is for other kinds.
-        UnknownNameError: there is no such kind, or no kind has such an option.
+        CertificateError: if an option belongs to other kinds.
+        UnknownNameError: if no kind has that name, or no kind has such an option.
     """
     own = KINDS.find(kind).options()
     for option in given:
@@ -143,10 +150,10 @@ def require_use(kind: str, given: Iterable[str]) -> None:
 
 
 def require_possible(origins: Iterable[Origin], kind: str, options: Options) -> None:
-    """Make sure, before draws are paid for, that a certificate could use them.
+    """Check that a kind of certificate can use independent draws, before they are executed.
 
     Raises:
-        CertificateError: none could, however they come out.
-        UnknownNameError: there is no such kind.
+        CertificateError: if the certificate would be refused whatever the distances of the draws are.
+        UnknownNameError: if no kind has that name.
     """
     KINDS.find(kind).of(vars(options)).require_audit_helps(origins)

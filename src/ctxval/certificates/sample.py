@@ -1,4 +1,4 @@
-"""What a certificate may know of trials: points of the unit cube, distances, and why each trial was chosen."""
+"""The input of a certificate: points of the unit cube, distances, and why each trial was chosen."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
 
 PLANNED = "draws"
-"""What a note of an independent draw calls the number of draws that there were to be in all."""
+"""Key of the planned number of draws in the note of an independent draw."""
 
 _SAME_TASK = 1e-9
-"""How far points of the unit cube may be apart that are one task: parameters are scaled there and back."""
+"""Largest difference, in each coordinate, of unit-cube points that count as one task: scaling rounds them."""
 
 
 @dataclass(frozen=True)
 class MadeGood:
-    """A failure whose task was executed with success later.
+    """A failed trial whose task was executed with success later.
 
     Attributes:
         trial: number of the trial that failed.
-        by: number of the one that succeeded.
+        by: number of the trial that succeeded.
         because: what was changed on the system in between; None if nobody stated it.
     """
 
@@ -40,21 +40,21 @@ class MadeGood:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Executed trials, as far as a certificate may know of them: numbers and why they were chosen.
+    """Executed trials as a certificate sees them: points, distances, and why each task was chosen.
 
     Attributes:
-        points: of the unit cube, shape ``(n, d)``.
-        distances: shape ``(n,)``; NaN where the execution failed.
-        origins: n reasons why a trial was chosen.
-        states: n states; open trials are refused by every certificate.
-        numbers: of the trials, for messages; 0, 1, ... by default.
-        planned: for each trial, how many independent draws there were to be in all when it was drawn; 0 if they were to
-            end with the verdict, None if that is not known.
+        points: tasks as points of the unit cube, shape ``(n, d)``.
+        distances: their distances, shape ``(n,)``; NaN if the execution failed or could not be measured.
+        origins: why each task was chosen, n entries.
+        states: the state of each trial, n entries; none may be open.
+        numbers: numbers of the trials, for messages; 0, 1, ... by default.
+        planned: for each trial, the total number of independent draws that was planned when it was drawn; 0 if they
+            were to end with the verdict, None if that is not known.
         made_good: failures that are left out, because their tasks were executed with success later.
         search: the type of the search that chose the tasks; None if it is not known.
 
     Raises:
-        CertificateError: the parts do not fit together, or a trial is still open.
+        CertificateError: if the lengths differ, or a trial is still open.
     """
 
     points: Array
@@ -75,7 +75,8 @@ class Sample:
         lengths = {len(part) for part in parts}
         if len(lengths) != 1:
             raise CertificateError(
-                f"points, distances, origins, states, numbers and planned must be equally many, got {sorted(lengths)}."
+                "points, distances, origins, states, numbers and planned must be equally many, got lengths "
+                f"{sorted(lengths)}."
             )
         if "open" in self.states:
             waiting = [str(n) for n, state in zip(self.numbers, self.states, strict=True) if state == "open"]
@@ -89,17 +90,17 @@ class Sample:
 
     @classmethod
     def of(cls, trials: Sequence[Trial], search: str | None = None) -> Sample:
-        """Return what a certificate may know of trials; a task that failed before its execution has failed as well.
+        """Return the sample of a campaign's trials; a task that failed before its execution has failed as well.
 
-        A failure does not count if the same task was executed with success later, except for independent draws. Trials
-        that people chose or imported come in an order of no meaning, and are sorted by their tasks.
+        A failure is left out if the same task was executed with success later, unless it is an independent draw. The
+        order of trials that people chose or imported has no meaning, so they are sorted by their tasks.
 
         Args:
             trials: all trials of a campaign.
             search: the type of the search that chose their tasks, if it is known.
 
         Raises:
-            CertificateError: there is none, or one is still open.
+            CertificateError: if there is no trial, or one is still open.
         """
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
@@ -137,12 +138,12 @@ class Sample:
 
     @property
     def best(self) -> float:
-        """The largest distance; minus infinity where none is known."""
+        """The largest distance; minus infinity if no distance is known."""
         return float(np.nanmax(self.distances, initial=-np.inf))
 
     @property
     def failed(self) -> int:
-        """How many trials have no distance: they failed, or could not be measured."""
+        """The number of trials without a distance: they failed, or could not be measured."""
         return int(np.isnan(self.distances).sum())
 
     def numbers_of(self, state: State) -> list[int]:
@@ -151,7 +152,7 @@ class Sample:
 
     @property
     def failures(self) -> dict[str, list[Any]]:
-        """What failed, what could not be measured and what was made good, ready for JSON."""
+        """The trials that failed, that could not be measured and that were made good, ready for JSON."""
         return {
             "failed": self.numbers_of("failed"),
             "unmeasured": self.numbers_of("unmeasured"),
@@ -160,7 +161,7 @@ class Sample:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences on what failed, what could not be measured and what was made good."""
+        """Sentences on the trials that failed, that could not be measured and that were made good."""
         failed, unmeasured = self.numbers_of("failed"), self.numbers_of("unmeasured")
         found = [f"{listed(failed)} failed, and no distance is known there"] if failed else []
         if unmeasured:
@@ -174,24 +175,25 @@ class Sample:
 
 
 _LISTED = 5
-"""Numbers of trials that a message has at most."""
+"""Largest number of trials that a message lists."""
 
 
 def listed(numbers: Sequence[int]) -> str:
-    """Return numbers of trials as text, the first few of many."""
+    """Return numbers of trials as text; if there are many, only the first few."""
     first = ", ".join(map(str, numbers[:_LISTED])) + (", ..." if len(numbers) > _LISTED else "")
     return f"trial {first}" if len(numbers) == 1 else f"{len(numbers)} trials ({first})"
 
 
 def advice_to_remeasure(sample: Sample) -> str:
-    """Return what to do about trials that were executed but not measured, as a sentence after another one."""
+    """Return a sentence on what to do about trials that were executed but not measured; empty if there are none."""
     unmeasured = sample.numbers_of("unmeasured")
     if not unmeasured:
         return ""
     what = listed(unmeasured)
     return (
-        f" {what[0].upper()}{what[1:]} {_was(unmeasured)} executed, but the distance could not be measured: mend the "
-        "distance, and `ctxval remeasure STORE` measures what was recorded; what was not is to be executed again."
+        f" {what[0].upper()}{what[1:]} {_was(unmeasured)} executed, but the distance could not be measured: correct "
+        "the distance, then measure the recorded executions with `ctxval remeasure STORE`; if an execution was not "
+        "recorded, execute its task again."
     )
 
 
@@ -200,13 +202,13 @@ def _was(numbers: Sequence[int]) -> str:
 
 
 def _planned(trial: Trial) -> int | None:
-    """Return how many independent draws there were to be when a trial was drawn; 0 if the verdict was to end them."""
+    """Return the planned number of independent draws when a trial was drawn; 0 if the verdict was to end them."""
     planned = (trial.note or {}).get(PLANNED) if trial.origin == "iid" else None
     return planned if isinstance(planned, int) else None
 
 
 def _in_order(trials: list[Trial]) -> list[Trial]:
-    """Return trials with those of no meaningful order sorted, each in the place of another one of them."""
+    """Return the trials, with those that people chose or imported sorted among their own places."""
     places = [place for place, trial in enumerate(trials) if trial.origin == "manual"]
     ordered = sorted(
         (trials[place] for place in places),
@@ -219,7 +221,7 @@ def _in_order(trials: list[Trial]) -> list[Trial]:
 
 
 def _measured_later(trials: Sequence[Trial]) -> set[int]:
-    """Return the trials whose distance was told alone, in another definition, and whose tasks were executed again."""
+    """Return the trials that were executed again since, and whose distance was told alone under another definition."""
     known = [trial.unit_point for trial in trials if trial.distance is not None]
     waiting = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
     if not known or not waiting:
@@ -231,7 +233,7 @@ def _measured_later(trials: Sequence[Trial]) -> set[int]:
 def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
     """Return the trials that failed, but whose tasks were executed with success later.
 
-    Of several successes that is one whose reason was stated, if there is one, or else the first.
+    If there are several successes, the first one with a stated reason counts, or else the first one.
     """
     known = [trial for trial in trials if trial.distance is not None]
     failed = [trial for trial in trials if trial.state == "failed" and trial.origin != "iid"]

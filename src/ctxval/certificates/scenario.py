@@ -6,8 +6,8 @@ Beta(k + 1, N - k), so that
 
     Pr(V > eps) = sum_{i=0}^{k} binom(N, i) eps^i (1 - eps)^(N - i),
 
-and for any distribution Pr(V > eps) is at most that. The paper's sum ends at k - 1, which is too small a probability:
-already for k = 0 it would be empty, and claim that one draw bounds everything.
+and for any distribution Pr(V > eps) is at most that. The paper's sum ends at k - 1, which is too small: for k = 0 it
+would be empty, so a single draw would bound d on the whole task space.
 """
 
 from __future__ import annotations
@@ -28,41 +28,41 @@ from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
 
 _MOST_SAMPLES = 2**40
-"""Draws beyond which nobody is told how many are needed."""
+"""Largest number of draws that :func:`samples_needed` returns."""
 
 UNSEEN = (
     "M was not learned from these tasks, nor chosen after seeing them: a model that is retrained on them needs a new "
     "store and fresh draws"
 )
-"""What every statement by independent draws assumes."""
+"""The assumption that all bounds from independent draws share."""
 
 
 class _ByDraws(CertificateKind):
-    """A bound by independent draws alone."""
+    """A bound from independent draws alone."""
 
     bounds_maximum: ClassVar[bool] = False
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Refuse trials that were chosen otherwise.
+        """Refuse trials that are no independent draws.
 
         Raises:
-            CertificateError: there are some.
+            CertificateError: if there is such a trial.
         """
         if any(origin != "iid" for origin in origins):
             raise CertificateError(
-                f"a {self.name} bound takes independent draws alone, and there are others; say --kind audit."
+                f"a {self.name} bound takes independent draws alone, but there are others; say --kind audit."
             )
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
-        """Return what it needs of the draws."""
+        """Return what it assumes about the draws."""
         return rests_on_draws(certificate)
 
 
 @part("scenario")
 @dataclass(frozen=True, repr=False)
 class Scenario(_ByDraws):
-    """Bound on all tasks but a volume, from independent draws alone (scenario optimisation, SC)."""
+    """Bound on all tasks except a share of the task space, from independent draws alone (scenario optimisation, SC)."""
 
     name: ClassVar[str] = "scenario"
 
@@ -74,10 +74,10 @@ class Scenario(_ByDraws):
 @part("sampling-discarding")
 @dataclass(frozen=True, repr=False)
 class SamplingDiscarding(_ByDraws):
-    """Bound on all tasks but a volume, after some largest distances are discarded (sampling and discarding, SD).
+    """The scenario bound after the largest distances are discarded (sampling and discarding, SD).
 
     Attributes:
-        discard: how many of the largest distances are discarded, at least 1; chosen before they are known.
+        discard: how many of the largest distances are discarded, at least 1; it must be chosen before they are known.
     """
 
     name: ClassVar[str] = "sampling-discarding"
@@ -89,17 +89,17 @@ class SamplingDiscarding(_ByDraws):
         return certify_scenario(sample, confidence, self._require_discard())
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Refuse trials that were chosen otherwise, and ask for the number to discard.
+        """Refuse trials that are no independent draws, and require the number to discard.
 
         Raises:
-            CertificateError: there are some, or the number is missing.
+            CertificateError: if there is such a trial, or the number is missing.
         """
         self._require_discard()
         super().require_audit_helps(origins)
 
     def _require_discard(self) -> int:
         if not self.discard:
-            raise CertificateError("sampling and discarding needs to be told how many to discard, at least 1.")
+            raise CertificateError("sampling and discarding needs to know how many to discard, at least 1.")
         return self.discard
 
 
@@ -115,7 +115,7 @@ def tail(n: int, discarded: int, volume: float) -> float:
     """Return Pr(V > volume) after n draws of which the k largest are discarded.
 
     Raises:
-        CertificateError: k is negative or not below n, or the volume not a probability.
+        CertificateError: if k is negative or not below n, or the volume is no probability.
     """
     _require_counts(n, discarded)
     return float(bdtr(discarded, n, require_probability("volume", volume)))
@@ -125,7 +125,7 @@ def volume_bound(n: int, discarded: int, beta: float) -> float:
     """Return the least eps with ``Pr(V > eps) <= beta``.
 
     Raises:
-        CertificateError: k is negative or not below n, or beta not a probability.
+        CertificateError: if k is negative or not below n, or beta is no probability.
     """
     _require_counts(n, discarded)
     return float(betaincinv(discarded + 1, n - discarded, 1 - require_probability("beta", beta)))
@@ -135,7 +135,7 @@ def samples_needed(volume: float, beta: float, discarded: int = 0) -> int:
     """Return the least N with ``Pr(V > volume) <= beta``; for k = 0 it is ``log(beta) / log(1 - volume)``, rounded up.
 
     Raises:
-        CertificateError: volume or beta are not probabilities, or N would be beyond all use.
+        CertificateError: if volume or beta is no probability, or N would be above 2^40.
     """
     require_probability("beta", beta)
     low, high = discarded, discarded + 1
@@ -150,18 +150,19 @@ def samples_needed(volume: float, beta: float, discarded: int = 0) -> int:
 
 
 def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 0) -> Certificate:
-    """Bound the volume of the tasks whose distance exceeds the largest one left after discarding.
+    """Return a bound on the volume of the tasks whose distance exceeds the largest one left after discarding.
 
-    A failed execution counts as a violation, larger than any distance, so it must be among the discarded.
+    A failed execution counts as a violation, larger than any distance, so it must be among the discarded ones.
 
     Args:
         sample: independent uniform draws alone.
-        confidence: 1 - beta.
-        discarded: k; 0 is scenario optimisation. It must be chosen before the distances are looked at.
+        confidence: 1 - beta, the probability with which the statement holds.
+        discarded: k, the number of the largest distances to discard; 0 is scenario optimisation. It must be chosen
+            before the distances are known.
 
     Raises:
-        CertificateError: a trial is no independent draw, the number of draws depended on their distances, too few are
-            left, or more failed than are discarded.
+        CertificateError: if a trial is no independent draw, the number of draws depended on their distances, k is
+            not below the number of draws, or more executions failed than are discarded.
     """
     beta = 1 - require_probability("confidence", confidence)
     foreign = [origin for origin in sample.origins if origin != "iid"]
@@ -204,7 +205,12 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
 
 
 def when_planned(sample: Sample, drawn: int) -> str:
-    """Return what is known of when the number of draws was chosen, of which there are so many in all."""
+    """Return, as a clause of an assumption, when the number of draws was chosen.
+
+    Args:
+        sample: the draws that count.
+        drawn: number of all independent draws.
+    """
     planned = sample.planned[-1] if len(sample) else None
     if planned is None:
         return "their number was chosen before they were executed (the store does not know when)"
@@ -214,10 +220,10 @@ def when_planned(sample: Sample, drawn: int) -> str:
 
 
 def _require_one_number(sample: Sample, kind: str) -> None:
-    """Refuse draws whose number was chosen after some of them were known.
+    """Refuse draws whose number depended on their distances.
 
     Raises:
-        CertificateError: it was.
+        CertificateError: if the verdict ended them, or if their number was changed after some of them were known.
     """
     plans = list(dict.fromkeys(planned for planned in sample.planned if planned is not None))
     if 0 in plans:
@@ -233,7 +239,7 @@ def _require_one_number(sample: Sample, kind: str) -> None:
 
 
 def violations(sample: Sample) -> str:
-    """Return that draws without a distance count as violations, and which ones they are."""
+    """Return a clause that draws without a distance count as violations, with their numbers."""
     numbers = [*sample.numbers_of("failed"), *sample.numbers_of("unmeasured")]
     return (
         f"{sample.failed} of {len(sample)} executions of independent draws have no distance and count as violations, "

@@ -1,7 +1,8 @@
-"""The stopping rule of a campaign that runs until its verdict is reached, and the tasks that it executes before that.
+"""The stopping rule of a campaign that runs until its verdict, and the tasks that it executes before it stops.
 
-An upper bound on d* that keeps the threshold is not believed at once: first the tasks are executed that nothing came
-near to, then those where the highest draws of d* are. docs/calibration.md has how often the verdict is false.
+A campaign does not stop as soon as the upper bound on d* keeps the threshold. It first executes tasks that are far
+from all trials, then tasks at which the largest draws of d* lie. docs/calibration.md states how often the verdict is
+wrong.
 """
 
 from __future__ import annotations
@@ -26,12 +27,11 @@ from ctxval.errors import CertificateError, InputError
 
 @dataclass(frozen=True, eq=False)
 class StoppingDecision:
-    """What a campaign does next.
+    """Whether a campaign stops, and the next task that the rule asks for.
 
     Attributes:
-        decided: whether it stops: the verdict is reached, or will be if the open trials show nothing new.
-        next_point: the point of the unit cube ``(d,)`` whose execution the rule asks for before it stops; None if the
-            search chooses the next task.
+        decided: whether it stops: the verdict is reached, or will be reached if the open trials show nothing new.
+        next_point: the point of the unit cube ``(d,)`` to execute next; None if the search chooses the next task.
     """
 
     decided: bool = False
@@ -43,11 +43,11 @@ class StoppingDecision:
 
 @dataclass(frozen=True)
 class Screening:
-    """A cheap test of whether the bound is surely above the threshold.
+    """A cheap test whether the bound is clearly above the threshold.
 
     Attributes:
-        draws: of the hyperparameters.
-        margin: by how much the probability that d* keeps the threshold may be underestimated by so few draws.
+        draws: number of draws of the hyperparameters.
+        margin: allowance for the error of so few draws, in the probability that d* keeps the threshold.
     """
 
     draws: int
@@ -59,17 +59,18 @@ class Screening:
 
 @dataclass(frozen=True)
 class StoppingRule:
-    """When a campaign may stop because its verdict on a threshold is reached.
+    """The rule by which a campaign stops when its verdict on a threshold is reached.
 
     Attributes:
         threshold: tau, in the distance's units.
-        options: the certificate that the verdict is to be by; it must be the posterior bound.
-        screenings: tests that save the cost of the bound while it is far above the threshold.
-        confirmations: executions where the highest draws of d* are, after which the bound must still keep the
-            threshold: they mostly find what made it too low.
+        options: the certificate of the verdict; it must be the posterior bound.
+        screenings: cheap tests; while one shows that the bound is clearly above the threshold, it is not computed.
+        confirmations: number of trials after the bound first keeps the threshold; it must still keep the threshold
+            after them. They are executed where the largest draws of d* lie, and mostly correct a bound that is too
+            low.
 
     Raises:
-        InputError: the threshold is not a positive number, or the certificate not the posterior bound.
+        InputError: if the threshold is not a positive number, or the certificate is not the posterior bound.
     """
 
     threshold: float
@@ -83,13 +84,14 @@ class StoppingRule:
             raise InputError(f"--until-decided needs the posterior bound, got {self.options.kind.name!r}.")
 
     def decide(self, trials: Sequence[Trial], left: int) -> StoppingDecision:
-        """Return whether a campaign stops, and if not, which task must be executed first.
+        """Return whether a campaign stops and, if not, which task must be executed next.
 
-        While the verdict is far away, this costs much less than the verdict.
+        While the bound is far above the threshold, this costs much less than the verdict.
 
         Args:
-            trials: all of them; those that are open count as near to their tasks, and are not waited for.
-            left: how many more executions there can be.
+            trials: all trials of the campaign. Open trials count for the coverage of the task space, but their
+                distances are not waited for.
+            left: number of executions that are left.
         """
         if counterexample(trials, self.threshold) is not None:
             return StoppingDecision(decided=True)
@@ -105,7 +107,7 @@ class StoppingRule:
             return StoppingDecision()
         if len(missing):
             return StoppingDecision(next_point=missing[0])
-        # The open trials count as near to their tasks, so coverage is no doubt here any more.
+        # The trials cover the task space, open ones included, so only the threshold is left to check.
         drawn, kept = self._is_kept(sample)
         if not kept:
             return StoppingDecision()
@@ -120,7 +122,7 @@ class StoppingRule:
         return cast(Posterior, self.options.kind)
 
     def _has_stood(self, trials: Sequence[Trial]) -> bool:
-        """Return whether the bound of the earlier trials kept the threshold already, near to every task."""
+        """Return whether the earlier trials already covered the task space with a bound that kept the threshold."""
         if not trials or covering(_points(trials), self._posterior.resolution, 0) is None:
             return False
         try:
@@ -129,14 +131,14 @@ class StoppingRule:
             return False
 
     def _is_kept(self, sample: Sample) -> tuple[Maxima, bool]:
-        """Return draws of d*, and whether the bound keeps the threshold wherever the trials came near to."""
+        """Return draws of d*, and whether their bound keeps the threshold if coverage is left aside."""
         stochastic, confidence = self._posterior.stochastic, self.options.confidence
         drawn = settle_maxima(sample, self.threshold, confidence, stochastic=stochastic)
         certificate = certify_posterior(sample, confidence, stochastic=stochastic, resolution=1.0, found=drawn)
         return drawn, certificate.covers(self.threshold)
 
     def _is_surely_too_high(self, sample: Sample) -> bool:
-        """Return whether the posterior bound is above the threshold, by what costs less and nearly always tells."""
+        """Return whether the posterior bound is clearly above the threshold, by tests that cost less than the bound."""
         stochastic = self._posterior.stochastic
         instantaneous = None if stochastic else instantaneous_bound(sample)
         if instantaneous is not None and instantaneous["max_ucb"] > self.threshold:

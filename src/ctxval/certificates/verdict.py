@@ -1,4 +1,4 @@
-"""The three-valued answer: may M be trusted up to a threshold?"""
+"""The verdict on a threshold: validated, falsified or undecided."""
 
 from __future__ import annotations
 
@@ -21,20 +21,22 @@ from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
 Answer = Literal["validated", "falsified", "undecided"]
+"""The answer of a verdict to the question whether d* <= tau."""
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What the trials say about d* <= tau.
+    """The answer of the trials to the question whether d* <= tau.
 
     Attributes:
-        answer: falsified is an executed fact, validated a statement with a confidence, undecided the rest.
-        threshold: tau.
-        reason: one sentence.
-        witness: the executed trial with d(p) > tau, if falsified.
-        certificate: what validates, or failed to.
-        expected: what is expected of further executions, if undecided and it can be told.
-        rests_on: one sentence on what must hold for it, if validated.
+        answer: "falsified" if an executed distance exceeds tau, "validated" if a certificate keeps tau with its
+            confidence, else "undecided".
+        threshold: tau, in the distance's units.
+        reason: the reason for the answer, in one sentence.
+        witness: the executed trial with d(p) > tau; None if the answer is not "falsified".
+        certificate: the certificate that validates or does not suffice; None if there is none.
+        expected: a forecast of further executions; None if the answer is decided or nothing can be predicted.
+        rests_on: one sentence on the conditions of a validation; None if the answer is not "validated".
     """
 
     answer: Answer
@@ -64,10 +66,10 @@ class Verdict:
 
 
 def require_threshold(threshold: float) -> float:
-    """Return a threshold tau.
+    """Return a threshold tau, which must be a positive number.
 
     Raises:
-        InputError: it is not a positive number.
+        InputError: if it is not a positive number.
     """
     if not isinstance(threshold, int | float) or not threshold > 0 or threshold == float("inf"):
         raise InputError(f"the threshold must be a positive number, got {threshold!r}.")
@@ -75,23 +77,23 @@ def require_threshold(threshold: float) -> float:
 
 
 def counterexample(trials: Sequence[Trial], threshold: float) -> Verdict | None:
-    """Return the verdict that an executed distance above the threshold makes, None where there is none.
+    """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
 
     Raises:
-        InputError: the threshold is not a positive number.
+        InputError: if the threshold is not a positive number.
     """
     tau = require_threshold(threshold)
     above = [trial for trial in trials if trial.distance is not None and trial.distance > tau]
     if not above:
         return None
     worst = max(above, key=lambda trial: trial.distance or 0.0)
-    distance, limit = _told_apart(worst.distance or 0.0, tau)
+    distance, limit = _distinguishable(worst.distance or 0.0, tau)
     reason = f"trial {worst.number} was executed and its distance {distance} exceeds {limit}."
     return Verdict("falsified", tau, reason, worst)
 
 
-def _told_apart(value: float, tau: float) -> tuple[str, str]:
-    """Return two numbers as texts of as many digits as tell which one is larger."""
+def _distinguishable(value: float, tau: float) -> tuple[str, str]:
+    """Return two numbers as texts, with enough digits to show which one is larger."""
     for digits in range(4, 17):
         texts = at_most(value, digits) if value <= tau else f"{value:.{digits}g}", f"{tau:.{max(digits, 6)}g}"
         if np.sign(float(texts[0]) - float(texts[1])) == np.sign(value - tau):
@@ -107,18 +109,18 @@ def judge_by(
     volume: float = 0.0,
     space: TaskSpace | None = None,
 ) -> Verdict:
-    """Return the verdict of the trials and a certificate.
+    """Return the verdict by the trials and a certificate.
 
     Args:
-        certificate: of any kind.
-        trials: all of them.
-        threshold: tau.
-        volume: the share of the task space that may exceed the threshold; 0 accepts bounds on d* alone.
-        space: the tasks, to tell a resolution in their units.
+        certificate: a certificate of any kind.
+        trials: all trials of the campaign.
+        threshold: tau, in the distance's units.
+        volume: the share of the task space that may exceed the threshold; if it is 0, only bounds on d* validate.
+        space: the task space, to state a resolution in its units; None if it is not known.
 
     Raises:
-        InputError: the threshold is not a positive number, the volume is above 0.5, or the certificate's confidence is
-            below 0.5.
+        InputError: if the threshold is not a positive number, the volume is negative or above 0.5, or the
+            certificate's confidence is below 0.5.
     """
     tau = require_threshold(threshold)
     require_confidence(certificate.confidence)
@@ -140,7 +142,7 @@ def judge_by(
 def _bound_and_limit(certificate: Certificate, tau: float) -> tuple[str, str]:
     """Return a bound and the threshold as texts, the bound with its error if it has one."""
     upper = with_error(certificate.upper_bound, certificate.error)
-    return (upper, f"{tau:.6g}") if "±" in upper else _told_apart(certificate.upper_bound, tau)
+    return (upper, f"{tau:.6g}") if "±" in upper else _distinguishable(certificate.upper_bound, tau)
 
 
 def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
@@ -180,14 +182,14 @@ def judge(
     """Return the verdict by an executed counterexample, or by the certificate that the options ask for.
 
     Args:
-        trials: all of them.
+        trials: all trials of the campaign.
         threshold: tau, in the distance's units.
-        options: by which certificate; the posterior bound by default. If its theory refuses the trials, the verdict is
-            undecided.
-        provenance: what else is known of the campaign.
+        options: the kind of certificate, its confidence and the acceptable volume; the posterior bound by default. If
+            the theory of the certificate refuses the trials, the verdict is undecided.
+        provenance: the task space, the search and remarks on the campaign, as far as they are known.
 
     Raises:
-        InputError: the threshold is not a positive number.
+        InputError: if the threshold is not a positive number.
     """
     chosen, known = options or CertificateOptions(), provenance or Provenance()
     found = counterexample(trials, threshold)

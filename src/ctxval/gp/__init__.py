@@ -1,6 +1,6 @@
 """Gaussian processes: kernels, regression, draws of hyperparameters and sample paths, acquisition functions.
 
-Nothing here knows of control: points are those of the unit cube or of any other space, values are numbers.
+This package is independent of control: points are rows of numbers, often in the unit cube, and values are numbers.
 """
 
 from __future__ import annotations

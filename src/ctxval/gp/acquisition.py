@@ -15,7 +15,7 @@ from ctxval.gp.regression import GaussianProcess
 
 
 class Acquisition(Protocol):
-    """How much an execution at a point is worth."""
+    """A function whose value at a point measures the benefit of an execution there."""
 
     def __call__(self, X: Array) -> Array:
         """Return the values at points ``(m, d)`` of the unit cube, shape ``(m,)``."""
@@ -25,20 +25,20 @@ class Acquisition(Protocol):
 
 
 _DISTINCT = 1e-6
-"""How far a proposal is from every known point, in one coordinate at least."""
+"""Least distance of a proposal from every known point, in at least one coordinate."""
 _APART = 0.02
-"""How far a proposal is from points to keep away from, as a share of the cube's diagonal."""
+"""Least distance of a proposal from the points in ``away``, as a share of the cube's diagonal."""
 _STARTS = 4
-"""Candidates that are climbed from."""
+"""Number of candidates from which the acquisition function is climbed."""
 _SEPARATION = 0.05
-"""Least distance between them, as a share of the cube's diagonal."""
+"""Least distance between these candidates, as a share of the cube's diagonal."""
 _ITERATIONS = 20
-"""The most of one climb."""
+"""Largest number of iterations of one climb."""
 
 _FAR_BELOW = -1e3
-"""Standard deviations below the best value from which on series replace differences of large logarithms."""
+"""Below this number of standard deviations, a series replaces differences of large logarithms."""
 _CERTAIN = 1e-9
-"""The least standard deviation from which an improvement is expected."""
+"""Least standard deviation in the expected improvement; smaller ones are replaced by it."""
 _LOG_ROOT_2PI = 0.5 * float(np.log(2 * np.pi))
 
 
@@ -60,7 +60,7 @@ class UpperConfidenceBound:
         return np.asarray(mean + np.sqrt(self.beta * variance))
 
     def with_gradient(self, X: Array) -> tuple[Array, Array]:
-        """Return the bound ``(m,)`` and its gradient ``(m, d)``; that of the mean where the variance vanishes."""
+        """Return the bound ``(m,)`` and its gradient ``(m, d)``; where the variance is zero, the mean's gradient."""
         mean, variance, d_mean, d_variance = self.process.predict_with_gradient(X)
         sigma = np.sqrt(variance)[:, None]
         d_sigma = np.divide(d_variance, 2 * sigma, out=np.zeros_like(d_mean), where=sigma > 0)
@@ -70,7 +70,7 @@ class UpperConfidenceBound:
 
 @dataclass(frozen=True, eq=False)
 class LogExpectedImprovement:
-    """``log E max(f(p) - best, 0)``, also where that is far too small for a float (Ament et al. 2023, eqs. 8 and 9).
+    """``log E max(f(p) - best, 0)``, also if the expectation underflows (Ament et al. 2023, eqs. 8 and 9).
 
     Attributes:
         process: the surrogate.
@@ -102,7 +102,7 @@ def log_improvement(z: Array) -> Array:
     z = np.asarray(z, dtype=np.float64)
     near, middle = np.maximum(z, -1.0), np.clip(z, _FAR_BELOW, -1.0)
     direct = np.log(np.exp(-0.5 * near**2 - _LOG_ROOT_2PI) + near * ndtr(near))
-    # phi(z) (1 - |z| Phi(z) / phi(z)), where erfcx is that ratio without its small parts.
+    # phi(z) (1 - |z| Phi(z) / phi(z)); erfcx gives the ratio Phi / phi, whose parts would both underflow.
     ratio = np.sqrt(np.pi / 2) * erfcx(-middle / np.sqrt(2))
     scaled = -0.5 * middle**2 - _LOG_ROOT_2PI + np.log1p(middle * ratio)
     far = np.minimum(z, _FAR_BELOW)
@@ -152,16 +152,18 @@ def maximise(
 ) -> Array:
     """Return the point ``(d,)`` of the unit cube with the largest acquisition, distinct from all known points.
 
-    Uniform candidates and small moves around the known points; then the best few climb.
+    Candidates are uniform, or small moves of the known points. The function is climbed from the best few of them.
 
     Args:
-        acquisition: what to maximise.
-        dimension: d.
-        known: points never to propose again, shape ``(n, d)``; sorted best first, they seed the local candidates.
-        rng: where the candidates come from.
-        box: the part of the cube to stay in.
-        corners: whether to look at corners too, and in the end move single coordinates to bounds while that pays.
-        away: points ``(k, d)`` that are pending or have failed, to keep away from.
+        acquisition: the function to maximise.
+        dimension: the dimension d of the cube.
+        known: points that must not be proposed again, shape ``(n, d)``, best first; the first few seed the local
+            candidates.
+        rng: the source of the candidates.
+        box: the part of the cube that is searched; all of it if None.
+        corners: whether candidates include corners, and single coordinates are moved to bounds in the end while that
+            increases the value.
+        away: points ``(k, d)`` that are pending or have failed; the result keeps a distance from them.
     """
     low, high = (np.zeros(dimension), np.ones(dimension)) if box is None else box
     candidates = low + rng.random((min(2000, 256 * dimension), dimension)) * (high - low)
@@ -189,13 +191,13 @@ def maximise(
 
 
 def _snap(points: Array, low: Array, high: Array, rng: np.random.Generator) -> None:
-    """Move coordinates to bounds, a share of each point's that is drawn for it."""
+    """Move random coordinates to bounds, in place; the share of them is drawn for each point."""
     snapped = rng.random(points.shape) < rng.random((len(points), 1))
     points[snapped] = np.where(rng.random(points.shape) < 0.5, low, high)[snapped]
 
 
 def _polish(acquisition: Acquisition, points: Array, low: Array, high: Array) -> Array:
-    """Move one coordinate of the best point at a time to the bound that pays most, while one does."""
+    """Move one coordinate of the best point at a time to a bound, while that increases the value."""
     values = acquisition(points)
     point, value = points[np.argmax(values)], float(values.max())
     for _ in range(2 * len(low)):

@@ -1,6 +1,6 @@
 """Maximising a function without gradients over a box, in few and large batches.
 
-Many of the maxima that are sought lie at corners of the box.
+Many of these maxima lie at corners of the box, so corners are sampled more densely.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ Values = Callable[[Array], Array]
 """Points ``(m, d)`` -> values ``(m,)``."""
 
 _STARTS = 6
-"""Points from which the function is climbed."""
+"""Number of points from which the function is climbed."""
 _POLISHED = 3
-"""Best points of which several coordinates at a time are moved to bounds."""
+"""Number of best points whose coordinates are moved to bounds, several at a time."""
 _STEP = 1e-4
 """Step of the one-sided differences."""
 _SEPARATION = 0.1
 """Least distance between the starts, as a share of the box's diagonal."""
 _FEW = 3
-"""Dimensions up to which the best points are sampled ever more closely instead of climbed from."""
+"""Largest dimension in which samples ever closer to the best points replace the climbs."""
 _ZOOMS = (0.03, 0.01, 0.003, 0.001)
 """Standard deviations of these samples, as shares of the box."""
 
@@ -32,13 +32,13 @@ _ZOOMS = (0.03, 0.01, 0.003, 0.001)
 class Ascent:
     """One search for the maximum of a function over a box within the unit cube.
 
-    Sampling, then quasi-Newton climbs from the best samples, all at once, then moves of single coordinates to
+    The function is sampled. Quasi-Newton climbs start from the best samples, all at once. Then coordinates are moved to
     the box's bounds.
 
     Args:
         function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
-        low, high: the box, shapes ``(d,)``.
-        budget: at how many points the function may be evaluated.
+        low, high: the bounds of the box, shapes ``(d,)``.
+        budget: number of points at which the function may be evaluated.
     """
 
     def __init__(self, function: Values, low: Array, high: Array, budget: int) -> None:
@@ -52,11 +52,11 @@ class Ascent:
         """Return points ``(m, d)`` and values ``(m,)`` that were evaluated, the largest first.
 
         Args:
-            starts: points ``(s, d)`` to look at first.
-            rng: of the samples.
+            starts: points ``(s, d)`` to evaluate first.
+            rng: the source of the samples.
         """
         sampled = max(8, self._budget // 3)
-        self._look(np.concatenate([np.clip(starts, self._low, self._high), self._samples(sampled, rng)]))
+        self._evaluate(np.concatenate([np.clip(starts, self._low, self._high), self._samples(sampled, rng)]))
         if len(self._low) <= _FEW:
             self._zoom(rng)
         elif self._left() > 2 * (len(self._low) + 1):
@@ -68,7 +68,7 @@ class Ascent:
     def _left(self) -> int:
         return self._budget - sum(map(len, self._values))
 
-    def _look(self, points: Array) -> Array:
+    def _evaluate(self, points: Array) -> Array:
         values = np.asarray(self._function(points), dtype=np.float64)
         values = np.where(np.isfinite(values), values, -np.inf)
         self._points.append(points)
@@ -81,31 +81,31 @@ class Ascent:
         return points[order], values[order]
 
     def _samples(self, count: int, rng: np.random.Generator) -> Array:
-        """Return uniform points, of which half have most of their coordinates at bounds."""
+        """Return uniform points; in every second one, a random share of the coordinates is moved to bounds."""
         points = self._low + rng.random((count, len(self._low))) * (self._high - self._low)
         ends = np.where(rng.random(points.shape) < 0.5, self._low, self._high)
         snapped = rng.random(points.shape) < np.where(np.arange(count) % 2, rng.random(count), 0.0)[:, None]
         return np.where(snapped, ends, points)
 
     def _separated_best(self) -> Array:
-        """Return some of the best points, none a neighbour of a better one."""
+        """Return some of the best points, each at a distance from all better ones."""
         points, values = self._found()
         finite = points[np.isfinite(values)]
         reach = _SEPARATION * float(np.linalg.norm(self._high - self._low))
         return finite[separated_rows(finite, reach, _STARTS)]
 
     def _zoom(self, rng: np.random.Generator) -> None:
-        """Sample ever closer around the best points: cheaper than slopes in few dimensions, and kinks do no harm."""
+        """Sample ever closer to the best points: cheaper than slopes in few dimensions, and insensitive to kinks."""
         count = int(0.8 * self._left()) // len(_ZOOMS)
         for share in _ZOOMS:
             best = self._separated_best()
             if not len(best) or not count:
                 return
             moves = share * (self._high - self._low) * rng.normal(size=(count, len(self._low)))
-            self._look(np.clip(np.resize(best, (count, len(self._low))) + moves, self._low, self._high))
+            self._evaluate(np.clip(np.resize(best, (count, len(self._low))) + moves, self._low, self._high))
 
     def _climb(self, starts: Array) -> None:
-        """Climb from all starts at once along differences; what they reach is among the points looked at."""
+        """Climb from all starts at once along finite differences; the points reached are among those evaluated."""
         if not len(starts):
             return
         scale = max(float(np.abs(self._found()[1][0])), 1e-300)
@@ -118,11 +118,11 @@ class Ascent:
         climb(sloped, starts, self._low, self._high, scale=scale, iterations=calls, evaluations=calls)
 
     def _slopes(self, points: Array) -> tuple[Array, Array]:
-        """Return values and one-sided differences, inward where a bound is near."""
+        """Return values and slopes by one-sided differences, which point inward if a bound is near."""
         n, d = points.shape
         steps = np.where(points + _STEP <= self._high, _STEP, -_STEP)
         moved = points[:, None, :] + np.eye(d) * steps[:, None, :]
-        values = self._look(np.concatenate([points, moved.reshape(-1, d)]))
+        values = self._evaluate(np.concatenate([points, moved.reshape(-1, d)]))
         here, there = values[:n], values[n:].reshape(n, d)
         with np.errstate(invalid="ignore"):
             slopes = (there - here[:, None]) / steps
@@ -130,7 +130,7 @@ class Ascent:
         return here, np.where(np.isfinite(slopes), slopes, 0.0)
 
     def _polish(self, rng: np.random.Generator) -> bool:
-        """Move the best points' coordinates to bounds, one and some at a time; return whether that paid."""
+        """Move coordinates of the best points to bounds, singly and several at a time; return whether that helped."""
         points, values = self._found()
         d = len(self._low)
         best = points[:_POLISHED]
@@ -142,4 +142,4 @@ class Ascent:
         )
         moved = np.concatenate([single, several])
         gain = 1e-9 * abs(values[0]) if np.isfinite(values[0]) else 0.0
-        return bool(self._look(moved[: max(1, self._left())]).max() > values[0] + gain)
+        return bool(self._evaluate(moved[: max(1, self._left())]).max() > values[0] + gain)

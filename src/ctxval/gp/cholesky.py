@@ -28,11 +28,11 @@ class CholeskyFactor:
     L: Array
 
     def solve(self, right: Array) -> Array:
-        """Return ``K^-1 right``, shape ``(n,)`` or ``(n, k)`` as that of ``right``."""
+        """Return ``K^-1 right`` in the shape of ``right``, ``(n,)`` or ``(n, k)``."""
         return np.asarray(dpotrs(self.L, right, lower=1)[0])
 
     def whiten(self, right: Array) -> Array:
-        """Return ``L^-1 right``, whose columns are uncorrelated where those of ``right`` have covariance K."""
+        """Return ``L^-1 right``; if a column of ``right`` has covariance K, that of the result is the identity."""
         return np.asarray(dtrtrs(self.L, right, lower=1)[0])
 
     def inverse(self) -> Array:
@@ -57,7 +57,7 @@ class CholeskyFactor:
         return float(np.log(np.diag(self.L)).sum())
 
     def left_out_errors(self, weights: Array) -> Array:
-        """Return by how much each observation exceeds its prediction from all others.
+        """Return the difference between each observation and its prediction from all others.
 
         Args:
             weights: ``K^-1 y`` of observations y, shape ``(n,)`` or ``(n, k)``.
@@ -72,11 +72,11 @@ def factorise(covariance: Array, noises: float | Iterable[float]) -> CholeskyFac
     """Return the Cholesky factor of ``covariance + noise I``.
 
     Args:
-        covariance: of noise-free observations, shape ``(n, n)``; it is not changed.
+        covariance: covariance of the noise-free observations, shape ``(n, n)``; it is not changed.
         noises: the noise variance, or several of them, which are tried one after the other.
 
     Raises:
-        InputError: the matrix is not positive definite for any of these noise variances.
+        InputError: if the matrix is not positive definite for any of these noise variances.
     """
     tried = [noises] if isinstance(noises, float) else noises
     for noise in tried:
@@ -91,7 +91,7 @@ def factorise(covariance: Array, noises: float | Iterable[float]) -> CholeskyFac
 
 
 def tenfold(noise: float) -> Iterator[float]:
-    """Yield a noise variance, then ten times as much, and so on, up to 1e30 times."""
+    """Yield a noise variance, then ten times as much, and so on, up to 1e30 times as much."""
     for _ in range(31):
         yield noise
         noise *= 10

@@ -1,10 +1,10 @@
 """Draws of a Gaussian process's hyperparameters from their posterior, instead of one best guess.
 
-The process is ``f = mu + sigma g``, g with unit variance and a Matern kernel with one length-scale for each dimension,
-or, for values that cannot be negative, the logarithm of the values is.
-The prior is flat in mu and in log sigma, so that both integrate out in closed form (O'Hagan 1978; Rasmussen and
-Williams 2006, Sec. 2.7) and whatever is said does not depend on the units of f. What is left, the scale of the values,
-the smoothness, the length-scales and the noise, is drawn by slice sampling (Neal 2003), which has no step size to tune.
+The process is ``f = mu + sigma g``. Here g has unit variance and a Matern kernel with one length-scale for each
+dimension, and f is the values or, if none is negative, possibly their logarithm. The prior is flat in mu and in
+log sigma. So both integrate out in closed form (O'Hagan 1978; Rasmussen and Williams 2006, Sec. 2.7), and results do
+not depend on the units of f. The other hyperparameters are drawn by slice sampling (Neal 2003), which has no step size
+to tune: the scale of the values, the smoothness, the length-scales and the noise.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ EXACT = 1e-10
 """Noise variance, relative to sigma^2, of values without noise: it keeps the Cholesky factor safe."""
 
 _FEWEST = 6
-"""The fewest well-spread data whose hyperparameters are drawn separately."""
+"""Least number of well-spread data from which hyperparameters are drawn separately."""
 
 _STEP = 1.0
 """Width of the slice sampler's first interval."""
 _MOST_STEPS = 8
-"""Widths that this interval may grow to."""
+"""Largest width of the interval, in widths of the first one."""
 _MOST_SHRINKS = 60
-"""Proposals for which it may shrink; then the state stays."""
+"""Largest number of proposals for which the interval shrinks; after that the state stays."""
 _BURN_IN = 20
-"""Sweeps of the chain before the first draw."""
+"""Number of sweeps of the chain before the first draw."""
 _FARTHEST = 12.0
-"""The largest logarithm of a length-scale, in magnitude."""
+"""Largest magnitude of the logarithm of a length-scale."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Warp:
 
     Attributes:
         offset: c of ``log(y + c)``; infinity for the values themselves.
-        unit: what the values themselves are measured in when their likelihood is compared with that of the logarithm,
-            whose mean has no unit.
+        unit: unit of the values in their likelihood, if ``offset`` is infinite; it makes that likelihood comparable
+            with that of the logarithm, which has no unit.
     """
 
     offset: float = np.inf
@@ -63,12 +63,12 @@ class Warp:
         return values if np.isinf(self.offset) else np.exp(np.minimum(values, _LARGEST)) - self.offset
 
     def log_slope(self, y: Array) -> float:
-        """Return the sum of the logarithms of the slopes at values ``(n,)``, the flat prior of mu included."""
+        """Return the sum of the logarithms of the warp's slopes at values ``(n,)``, including the flat prior of mu."""
         return -float(np.log(self.unit)) if np.isinf(self.offset) else -float(np.log(y + self.offset).sum())
 
 
 _LARGEST = 700.0
-"""The largest exponent."""
+"""Largest exponent, so that ``exp`` does not overflow."""
 
 
 @dataclass(frozen=True)
@@ -79,14 +79,15 @@ class Prior:
         smoothness: values of nu of the Matern kernel, equally likely.
         length_scale: median of the log-normal length-scales in the unit cube, times the square root of the dimension.
         deviation: standard deviation of their logarithms.
-        noise: bounds of the noise variance relative to sigma^2, log-uniform between; equal bounds fix it.
-        offset: of the logarithm, in means of the values; the logarithm is as likely as the values themselves, where
-            none is negative. None leaves it out.
-        spread_share: share of the data, the best spread over the cube, from which hyperparameters are drawn a second
-            time. A search crowds its points where the values are smooth and high, and these points speak for
-            smoothness everywhere. Each draw from all data is made as rough as one from the well-spread data, if that
-            one is rougher. With 1 this is left out: then bounds are exact on draws of the prior, and too low on
-            kinks, jumps and heavy tails (docs/calibration.md).
+        noise: bounds of the noise variance relative to sigma^2; it is log-uniform between them, and equal bounds fix
+            it.
+        offset: c of ``log(y + c)``, in means of the values. If no value is negative, the logarithm and the values
+            themselves are equally likely. None excludes the logarithm.
+        spread_share: share of the data, well spread over the cube, from which hyperparameters are drawn a second time.
+            A search crowds its points where the values are smooth and high, and these points suggest smoothness
+            everywhere. So each draw from all data is made as rough as one from the well-spread data, if that one is
+            rougher. If the share is 1, there is no second draw: then bounds are exact on draws of the prior, and too
+            low on kinks, jumps and heavy tails (docs/calibration.md).
     """
 
     smoothness: tuple[float, ...] = (1.5, 2.5)
@@ -119,7 +120,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Hyperparameters:
-    """One draw.
+    """One draw of the hyperparameters.
 
     Attributes:
         nu: the kernel's smoothness.
@@ -152,14 +153,14 @@ class Conditioned:
     """A Gaussian process with one draw of hyperparameters, conditioned on data.
 
     Attributes:
-        hyperparameters: the draw.
+        hyperparameters: the draw of the hyperparameters.
         warp: the scale of the values.
         y: the values on that scale, shape ``(n,)``.
         factor: Cholesky factor of the observations' correlations.
         mean: the most likely mu.
-        mean_variance: its variance relative to sigma^2.
+        mean_variance: variance of mu relative to sigma^2.
         scale2: the most likely sigma^2, with ``n - 1`` degrees of freedom.
-        log_likelihood: of the data, mu and sigma integrated out, up to a constant.
+        log_likelihood: log likelihood of the data with mu and sigma integrated out, up to a constant.
     """
 
     hyperparameters: Hyperparameters
@@ -181,10 +182,16 @@ class Conditioned:
 
 
 def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: Warp | None = None) -> Conditioned:
-    """Condition on data ``(n, d)``, ``(n,)`` with these hyperparameters, on the values' own scale by default.
+    """Return the process with these hyperparameters, conditioned on values ``(n,)`` at points ``(n, d)``.
+
+    Args:
+        hyperparameters: smoothness, length-scales and noise.
+        X: points ``(n, d)``.
+        values: values ``(n,)``.
+        warp: the scale on which the values are a Gaussian process; their own scale if None.
 
     Raises:
-        InputError: the correlations are not positive definite.
+        InputError: if the correlations are not positive definite.
     """
     scale = Warp() if warp is None else warp
     n, y = len(values), scale.forward(values)
@@ -208,8 +215,15 @@ def draw_hyperparameters(
 ) -> list[Conditioned]:
     """Return draws from the posterior of the hyperparameters, given values ``(n,)`` at unit-cube points ``(n, d)``.
 
+    Args:
+        X: points ``(n, d)``.
+        y: values ``(n,)``.
+        count: number of draws.
+        rng: the source of randomness.
+        prior: prior of the hyperparameters; the default :class:`Prior` if None.
+
     Raises:
-        InputError: fewer than three values, all of them equal, or not finite.
+        InputError: if there are fewer than three values, all of them are equal, or one is not finite.
     """
     if len(y) < 3 or not np.isfinite(y).all() or np.ptp(y) == 0:
         raise InputError(f"hyperparameters need at least three finite values that differ, got {y.tolist()}.")
@@ -224,7 +238,11 @@ def draw_hyperparameters(
 
 
 def _as_rough_as(own: Hyperparameters, other: Hyperparameters) -> Hyperparameters:
-    """Return hyperparameters with the length-scales shrunk to those of others in the mean, and no smoother."""
+    """Return hyperparameters that are made at least as rough as others.
+
+    The smaller smoothness of the two is taken. If the geometric mean of the length-scales is larger than that of the
+    others, they are shrunk to it by a common factor.
+    """
     shrink = min(0.0, float((other.log_scales - own.log_scales).mean()))
     return Hyperparameters(min(own.nu, other.nu), own.log_scales + shrink, own.log_noise)
 
@@ -267,7 +285,7 @@ class _Sampler:
         return conditioned.log_likelihood + self.prior.log_density(state[:-1])
 
     def _sweep(self) -> None:
-        """Move along each length-scale, all of them together and the noise, then to another smoothness or scale."""
+        """Move along all length-scales together, each length-scale and the noise; then draw smoothness and scale."""
         directions = [np.append(np.ones(self.d), 0.0)]
         if self.d > 1:
             directions += list(np.eye(self.d + 1)[: self.d])
@@ -287,7 +305,7 @@ class _Sampler:
 
 
 def _well_spread(X: Array, y: Array, count: int) -> Rows:
-    """Return the rows of the largest value and of the points farthest from those before, in the data's order."""
+    """Return, in the data's order, the row of the largest value and those of points chosen farthest-first from it."""
     first = int(y.argmax())
     gaps = np.linalg.norm(X - X[first], axis=1)
     gaps[first] = -np.inf

@@ -1,7 +1,7 @@
 """Covariance functions with analytic gradients (Rasmussen and Williams 2006, chapters 4 and 5).
 
-A kernel is a stateless recipe: its hyperparameters come as one vector theta of natural logarithms, so that every
-real theta is valid. ``X`` and ``Z`` are points, shapes ``(n, d)`` and ``(m, d)``.
+A kernel has no state: its hyperparameters are passed as one vector theta of natural logarithms, so every real theta is
+valid. ``X`` and ``Z`` are points, shapes ``(n, d)`` and ``(m, d)``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Kernel(Protocol):
     """A covariance function k(x, z; theta)."""
 
     def bounds(self, dimension: int) -> Bounds:
-        """Return the box of theta within which the hyperparameters are searched; its length is that of theta."""
+        """Return the bounds of each entry of theta, within which the hyperparameters are searched."""
 
     def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
         """Return the covariances ``(n, m)``."""
@@ -31,7 +31,7 @@ class Kernel(Protocol):
         """Return the variances k(x, x), shape ``(n,)``."""
 
     def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
-        """Return ``sum_ij W_ij dK_ij/dtheta`` for K = k(X, X) and a symmetric W, the shape of theta."""
+        """Return ``sum_ij W_ij dK_ij/dtheta`` for K = k(X, X) and a symmetric W, in the shape of theta."""
 
     def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
         """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``."""
@@ -45,13 +45,13 @@ class Matern:
     """Matern kernel of smoothness 3/2 or 5/2; theta = log of (variance, length-scales).
 
     Attributes:
-        nu: 1.5 (the paper's) or 2.5.
-        ard: one length-scale for each dimension instead of one for all.
+        nu: smoothness, 1.5 (the paper's) or 2.5.
+        ard: whether each dimension has its own length-scale; if not, all share one.
         length_scale: bounds of the length-scales in the unit cube.
         variance: bounds of the variance, for values of unit variance.
 
     Raises:
-        InputError: another nu.
+        InputError: if nu is neither 1.5 nor 2.5.
     """
 
     nu: float = 1.5
@@ -130,10 +130,10 @@ class Matern:
 
 @dataclass(frozen=True)
 class Linear:
-    """Linear kernel ``v (1 + sum_j (x_j - 1/2)^2 ...)``: ``v_0 + v_1 (x - c)'(z - c)``; theta = log of (v_0, v_1).
+    """Linear kernel ``v_0 + v_1 (x - c)'(z - c)``; theta = log of (v_0, v_1).
 
     Attributes:
-        centre: c, the same in each dimension; the middle of the unit cube.
+        centre: c, the same in each dimension; the default is the middle of the unit cube.
         variance: bounds of both variances, for values of unit variance.
     """
 

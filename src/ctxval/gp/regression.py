@@ -23,18 +23,18 @@ LogDensity = Callable[[Array], tuple[float, Array]]
 """Hyperparameters -> (the logarithm of their density, its gradient)."""
 
 NOISE = 1e-6
-"""The least noise variance, for values of unit variance: it keeps the Cholesky factor safe."""
+"""The least noise variance, for values of unit variance: it keeps the covariance matrix positive definite."""
 
 _IMPOSSIBLE = 1e25
-"""Minus the log density of hyperparameters whose covariance matrix is not positive definite."""
+"""Negative log density that is assigned to hyperparameters if their covariance matrix is not positive definite."""
 _MANY = 30
-"""Beyond so many observations the likelihood has one clear mode, and one climb finds it."""
+"""Beyond this number of observations the likelihood has one clear mode, and one climb finds it."""
 _ITERATIONS = 50
-"""The most of each climb of :func:`fit`."""
+"""Largest number of iterations of each climb of :func:`fit`."""
 _TOLERANCE = 1e-7
-"""Relative change of the log density at which such a climb ends."""
+"""Relative change of the log density at which a climb of :func:`fit` ends."""
 _SMOOTHNESS = np.array([0.25, 0.5, 0.75])
-"""Places of the first length-scales between the logarithms of their bounds."""
+"""Initial length-scales, as positions between the logarithms of their bounds (0: lower, 1: upper)."""
 
 
 def zero_mean(X: Array) -> Array:
@@ -76,7 +76,7 @@ class GaussianProcess:
         return self.predict_with_gradient(X)[2:]
 
     def predict_with_gradient(self, X: Array) -> tuple[Array, Array, Array, Array]:
-        """Return mean and variance ``(m,)`` and their gradients ``(m, d)``, for less than the two one by one."""
+        """Return mean and variance ``(m,)`` and their gradients ``(m, d)``; cheaper than two separate calls."""
         k = self.kernel(self.theta, X, self.X)
         dk = self.kernel.input_gradient(self.theta, X, self.X)
         weights = self.factor.solve(k.T).T
@@ -89,7 +89,8 @@ class GaussianProcess:
     def left_out(self) -> tuple[Array, Array]:
         """Return mean and variance ``(n,)`` of each observation given all others.
 
-        Rasmussen and Williams 2006, eq. 5.12.
+        Source:
+            Rasmussen and Williams 2006, eq. 5.12.
         """
         return self.y - self.factor.left_out_errors(self.alpha), 1 / self.factor.precisions
 
@@ -108,11 +109,11 @@ class MultiOutputProcess:
     Attributes:
         kernel, theta: the covariance and the logarithms of its hyperparameters.
         X, Y: observations, shapes ``(n, d)`` and ``(n, k)``.
-        noises: variances of the observations' noise; the first for which the covariance matrix is positive definite
-            is taken.
+        noises: variances of the observations' noise, which are tried in this order until the covariance matrix is
+            positive definite.
 
     Raises:
-        InputError: on use, if there is no such noise variance.
+        InputError: on first use, if the covariance matrix is positive definite for none of them.
     """
 
     kernel: Kernel
@@ -132,7 +133,7 @@ class MultiOutputProcess:
         return self.factor.solve(self.Y)
 
     def predict(self, X: Array) -> tuple[Array, Array]:
-        """Return the posterior means ``(m, k)`` at ``(m, d)``, and the variance ``(m,)`` that all outputs share."""
+        """Return the posterior means ``(m, k)`` at ``(m, d)``, and the variance ``(m,)``, which all outputs share."""
         k = self.kernel(self.theta, X, self.X)
         half = self.factor.whiten(k.T)
         variance = self.kernel.diagonal(self.theta, X) - (half**2).sum(axis=0)
@@ -147,7 +148,7 @@ class MultiOutputProcess:
 
 
 def _mean_gradient(mean: Mean, X: Array) -> Array:
-    """Return the gradient of a prior mean by central differences: it is a plain function."""
+    """Return the gradient of a prior mean by central differences, since a mean is a function without derivatives."""
     if mean is zero_mean:
         return np.zeros_like(X)
     n, d = X.shape
@@ -162,8 +163,8 @@ def condition(
     """Return the process with these hyperparameters, conditioned on observations ``(n, d)``, ``(n,)``.
 
     Raises:
-        ShapeError: X and y do not fit together.
-        InputError: the covariance matrix is not positive definite.
+        ShapeError: if the shapes of X and y do not fit together.
+        InputError: if the covariance matrix is not positive definite.
     """
     if X.ndim != 2 or y.shape != (len(X),):
         raise ShapeError(f"observations need X (n, d) and y (n,), got {X.shape} and {y.shape}.")
@@ -180,7 +181,7 @@ def _log_likelihood(factor: CholeskyFactor, alpha: Array, residual: Array) -> fl
 def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, Array]:
     """Return ``sum_o log p(Y[:, o])`` up to a constant, and its derivative W with respect to K.
 
-    ``sum(W * dK)`` is the change of the value with a change dK of the covariance.
+    If the covariance changes by a small dK, the value changes by ``sum(W * dK)``.
 
     Args:
         K: covariance of the noise-free outputs, ``(n, n)``.
@@ -188,7 +189,7 @@ def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, 
         Y: outputs that share the covariance, ``(n, k)``.
 
     Raises:
-        InputError: the covariance is not positive definite.
+        InputError: if the covariance is not positive definite.
 
     Source:
         Rasmussen and Williams 2006, eqs. 5.8 and 5.9.
@@ -204,7 +205,18 @@ def log_marginal_likelihood(
 ) -> tuple[float, Array]:
     """Return log p(residual | X, theta, noise) and its gradient with respect to (theta, log noise).
 
-    ``residual`` is the observations less the prior mean (Rasmussen and Williams 2006, eq. 5.9).
+    Args:
+        kernel: the covariance.
+        theta: logarithms of its hyperparameters.
+        noise: variance of the observations' noise.
+        X: observed points ``(n, d)``.
+        residual: the observations minus the prior mean, ``(n,)``.
+
+    Raises:
+        InputError: if the covariance is not positive definite.
+
+    Source:
+        Rasmussen and Williams 2006, eq. 5.9.
     """
     factor = factorise(kernel(theta, X, X), noise)
     alpha = factor.solve(residual)
@@ -227,8 +239,8 @@ def fit(
 ) -> GaussianProcess:
     """Return the process with the most likely hyperparameters within the kernel's bounds.
 
-    The prior of the hyperparameters is uniform on the box of the kernel's bounds (line 2 of the paper's algorithm)
-    unless ``log_prior`` is given; then its mode is sought.
+    By default the prior of the hyperparameters is uniform within the kernel's bounds (line 2 of the paper's algorithm).
+    If ``log_prior`` is given, the result is the mode of the posterior.
 
     Args:
         kernel: the covariance.
@@ -236,8 +248,11 @@ def fit(
         y: observed values ``(n,)``, about unit variance.
         noise: bounds of the noise variance; equal bounds fix it.
         mean: prior mean function.
-        log_prior: density of (theta, log noise).
-        starts: where to start the climbs, shape ``(s, len(theta) + 1)``; the default spreads over length-scales.
+        log_prior: logarithm of the prior density of (theta, log noise), with its gradient.
+        starts: starts of the climbs, shape ``(s, len(theta) + 1)``; several length-scales by default.
+
+    Raises:
+        InputError: if the covariance matrix is not positive definite for the hyperparameters found.
     """
     bounds = [*kernel.bounds(X.shape[1]), (float(np.log(noise[0])), float(np.log(noise[1])))]
     residual = y - mean(X)
@@ -265,15 +280,15 @@ def most_likely(
     iterations: int = 60,
     tolerance: float | None = None,
 ) -> Array:
-    """Return the hyperparameters with the largest density that climbs with L-BFGS-B find within bounds.
+    """Return the hyperparameters of largest density within bounds, by climbs with L-BFGS-B from several starts.
 
     Args:
-        log_density: raises an InputError if the covariance matrix of hyperparameters is not positive definite; they
-            count as impossible.
-        starts: shape ``(s, k)``.
-        bounds: of each of the k hyperparameters.
-        best_start: whether only the most likely start is climbed from, instead of all.
-        iterations: the most of one climb.
+        log_density: the function to maximise. It may raise an InputError if the covariance matrix is not positive
+            definite; these hyperparameters count as impossible.
+        starts: starts of the climbs, shape ``(s, k)``.
+        bounds: bounds of each of the k hyperparameters.
+        best_start: whether to climb from the most likely start only, instead of from all.
+        iterations: largest number of iterations of one climb.
         tolerance: relative change of the log density at which a climb ends; the default of L-BFGS-B if None.
     """
 

@@ -1,8 +1,8 @@
 """Sample paths of a Gaussian process given data, and their maxima over the unit cube.
 
-A path of the posterior is a path of the prior, corrected by what it gets wrong at the data (Matheron's rule; Wilson,
-Borovitskiy, Terenin, Mostowsky and Deisenroth 2020). The prior's path is a sum of random waves; the correction is
-exact.
+A path of the posterior is a path of the prior plus a correction of its errors at the data (Matheron's rule; Wilson,
+Borovitskiy, Terenin, Mostowsky and Deisenroth 2020). The prior's path is approximated by a sum of random waves; the
+correction is exact.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from ctxval._util.boxes import climb, moves_to_bounds
 from ctxval.gp.hyperposterior import EXACT, Conditioned
 
 WAVES = 512
-"""Frequencies of a prior path: its covariance errs by about ``1 / sqrt(2 WAVES)``, a path's maximum by much less."""
+"""Number of frequencies of a prior path. The error of its covariance is about ``1 / sqrt(2 WAVES)``, and that of a
+path's maximum much smaller."""
 
 _STARTS = 4
-"""Points from which each path is climbed."""
+"""Number of points from which each path is climbed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +30,10 @@ class Paths:
     Attributes:
         conditioned: the hyperparameters, conditioned on the data.
         X: the data's points ``(n, d)``.
-        frequencies: of the waves ``(F, d)``.
-        amplitudes: of cosines and sines, shape ``(2 F, s)``.
-        corrections: weights of the data's correlations ``(n, s)``.
-        means, scales: mu and sigma of each path ``(s,)``.
+        frequencies: frequencies of the waves, shape ``(F, d)``.
+        amplitudes: amplitudes of cosines and sines, shape ``(2 F, s)``.
+        corrections: weights of the correlations with the data, shape ``(n, s)``.
+        means, scales: mu and sigma of each path, shapes ``(s,)``.
     """
 
     conditioned: Conditioned
@@ -52,18 +53,18 @@ class Paths:
         return np.asarray(self.means + self.scales * (waves + self._correlations(Z) @ self.corrections))
 
     def roughly(self, Z: Array) -> Array:
-        """Return the values of a call, waves in single precision: ten times as fast, enough to choose candidates."""
+        """Return the same values with waves in single precision: ten times as fast, and enough to choose candidates."""
         single = np.float32
         waves = _waves(Z.astype(single), self.frequencies.astype(single)) @ self.amplitudes.astype(single)
-        # The corrections are sums of large terms that cancel: single precision would not do.
+        # The corrections are sums of large terms that cancel, so they need double precision.
         return np.asarray(self.means + self.scales * (waves + self._correlations(Z) @ self.corrections))
 
     def own(self, Z: Array) -> Array:
-        """Return the values of each path at points of its own ``(s, q, d)``, shape ``(s, q)``."""
+        """Return the values of each path at its own points ``(s, q, d)``, shape ``(s, q)``."""
         return self.own_with_gradient(Z)[0]
 
     def own_with_gradient(self, Z: Array) -> tuple[Array, Array]:
-        """Return values ``(s, q)`` and gradients ``(s, q, d)`` of each path at points of its own ``(s, q, d)``."""
+        """Return values ``(s, q)`` and gradients ``(s, q, d)`` of each path at its own points ``(s, q, d)``."""
         s, q, d = Z.shape
         flat = Z.reshape(-1, d)
         waves = _waves(flat, self.frequencies).reshape(s, q, -1)
@@ -97,10 +98,10 @@ def draw_paths(conditioned: Conditioned, X: Array, count: int, rng: np.random.Ge
     """Return paths on the process's scale given points ``(n, d)``, with mu and sigma drawn from their posterior.
 
     Args:
-        conditioned: the data under one draw of hyperparameters.
-        X: the data's points.
-        count: how many paths.
-        rng: of all random numbers.
+        conditioned: the process under one draw of hyperparameters, conditioned on the data.
+        X: the data's points ``(n, d)``.
+        count: number of paths.
+        rng: the source of all random numbers.
     """
     hyperparameters, (n, d) = conditioned.hyperparameters, X.shape
     # The spectrum of a Matern kernel is a multivariate t with 2 nu degrees of freedom.
@@ -119,9 +120,14 @@ def draw_paths(conditioned: Conditioned, X: Array, count: int, rng: np.random.Ge
 def maxima(paths: Paths, known: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return the largest value of each path over the unit cube, shape ``(s,)``, and where it is, ``(s, d)``.
 
-    Candidates are uniform, near ``known`` points (best first) and at corners. They are divided into several lots, and
-    the best of each lot is climbed from. Beyond two dimensions there are more lots, only the highest climb all the way,
-    and in the end coordinates are moved to their bounds one by one, as long as that pays.
+    Candidates are uniform, near ``known`` points (best first) and at corners. They are divided into several groups, and
+    each path is climbed from the best of each group. Beyond two dimensions there are more groups, only the highest
+    climbs are completed, and in the end single coordinates are moved to their bounds while that increases the value.
+
+    Args:
+        paths: the paths.
+        known: points ``(n, d)``, best first.
+        rng: the source of the candidates.
     """
     d = paths.X.shape[1]
     candidates = _candidates(known, d, rng)
@@ -144,18 +150,18 @@ def _candidates(known: Array, d: int, rng: np.random.Generator) -> Array:
 
 
 def _starts(candidates: Array, values: Array, many: int) -> Array:
-    """Return the best candidates of many lots for each path, shape ``(s, many, d)``: they are far apart, yet good."""
-    return np.stack([candidates[lot::many][values[lot::many].argmax(axis=0)] for lot in range(many)], axis=1)
+    """Return the best candidate of each of many groups for each path, shape ``(s, many, d)``: they are spread out."""
+    return np.stack([candidates[group::many][values[group::many].argmax(axis=0)] for group in range(many)], axis=1)
 
 
 def _highest(paths: Paths, points: Array) -> Array:
-    """Return the few highest of each path's points ``(s, q, d)``."""
+    """Return each path's few points of largest value, of ``(s, q, d)``."""
     order = np.argsort(-paths.own(points), axis=1)[:, :_STARTS]
     return np.take_along_axis(points, order[..., None], axis=1)
 
 
 def _climb(paths: Paths, starts: Array, steps: int) -> Array:
-    """Return the points ``(s, q, d)`` that climbs of so many iterations reach, each path in units of its sigma."""
+    """Return the points ``(s, q, d)`` that climbs of this many steps reach; each path is in units of its sigma."""
     units, d = paths.scales[:, None], starts.shape[-1]
 
     def sloped(points: Array) -> tuple[Array, Array]:
@@ -166,7 +172,7 @@ def _climb(paths: Paths, starts: Array, steps: int) -> Array:
 
 
 def _polish(paths: Paths, tops: Array, where: Array) -> tuple[Array, Array]:
-    """Move one coordinate at a time to a bound, the best one first."""
+    """Move one coordinate of each path's maximum at a time to a bound, the best move first."""
     s, d = where.shape
     for _ in range(d):
         moved = moves_to_bounds(where, np.zeros(d), np.ones(d))

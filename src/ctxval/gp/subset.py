@@ -1,4 +1,4 @@
-"""Few rows of many data that stand for all of them, where exact regression on all would take too long."""
+"""Subsets of data that represent all of them, if exact regression on all would take too long."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from ctxval._util.boxes import farthest_rows
 from ctxval.gp.kernels import Kernel
 
 LONG = 1000
-"""Points from which on a history is too long: below, all of it is kept."""
+"""Length of a history from which on only a subset is kept."""
 
 
 def kept_rows(points: Array, values: Array, count: int) -> Rows:
-    """Return the rows that stand for a history of points ``(n, d)`` and values ``(n,)``, in their order.
+    """Return the rows that represent a history of points ``(n, d)`` and values ``(n,)``, in their order.
 
-    Below 1,000 points these are all. Beyond, a quarter of ``count`` are the largest values, a quarter the latest
-    points, pending and failed ones too, and the others are far from those and from each other: where the history was,
-    the surrogate must not believe that nobody has looked.
+    Below 1,000 points these are all rows. From then on, a quarter of ``count`` rows have the largest values, a quarter
+    are the latest, including pending and failed ones, and the others are far from those and from each other. So the
+    surrogate keeps its knowledge of all regions that the history has explored.
     """
     if len(values) < LONG:
         return np.arange(len(values))
@@ -32,13 +32,13 @@ def kept_rows(points: Array, values: Array, count: int) -> Rows:
 
 
 def pivoted_rows(kernel: Kernel, theta: Array, X: Array, count: int, least: float) -> Rows:
-    """Return the rows of pivoted Cholesky: each is the point of which those before it leave the largest variance.
+    """Return rows by pivoted Cholesky: each has the largest variance given the rows before it.
 
     Args:
         kernel, theta: the covariance and the logarithms of its hyperparameters.
         X: points ``(n, d)``.
-        count: how many rows there may be.
-        least: the choice ends where no point has a larger variance left.
+        count: largest number of rows.
+        least: the choice ends if no remaining variance is larger than this.
     """
     left = kernel.diagonal(theta, X)
     columns = np.zeros((min(count, len(X)), len(X)))

@@ -14,13 +14,13 @@ from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
 from ctxval.gp.regression import NOISE, GaussianProcess, Mean, condition, fit, zero_mean
 
 _KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())
-"""Of :class:`Learned`."""
+"""The kernel of :class:`Learned`."""
 _LENGTH_SCALE = 0.4
 """Prior median of the length-scales, divided by the square root of the dimension."""
 _COMMON_DEVIATION = 0.5
-"""Prior standard deviation of the mean of the length-scales' logarithms: few values tell how smooth a function is."""
+"""Prior standard deviation of the mean of the length-scales' logarithms; few values suffice to learn this mean."""
 _ARD_DEVIATION = 0.3
-"""Prior standard deviation of each logarithm from that mean: many values are needed to tell which dimensions matter."""
+"""Prior standard deviation of each logarithm around that mean; it is small, as many values are needed to learn them."""
 _VARIANCE = 1.0
 """Prior median of the variance of the Matern kernel."""
 _LINEAR = 0.3
@@ -30,9 +30,9 @@ _VARIANCE_DEVIATION = 1.5
 _OFFSET = 0.1
 """The c of ``log(d + c)``, in means of the values, as in the prior of the certificates."""
 _CLEARLY = 0.25
-"""By how much, for each value, the log density of the logarithms must be larger for them to be preferred."""
+"""Least advantage in log density, per value, for which the logarithms of the values are preferred."""
 _LEARNED_FROM = 300
-"""The most values that the hyperparameters are learned from."""
+"""Largest number of values from which the hyperparameters are learned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Surrogate:
 
     Attributes:
         process: the process of the standardised distance ``(d - shift) / scale``.
-        shift, scale: the standardisation.
+        shift, scale: constants of the standardisation, in the distance's units.
     """
 
     process: GaussianProcess
@@ -65,13 +65,20 @@ def fit_surrogate(
     noise: tuple[float, float] = (NOISE, NOISE),
     prior_mean: Mean | None = None,
 ) -> Surrogate:
-    """Return the GP of most likely hyperparameters, given values ``(n,)`` at unit-cube points ``(n, d)``.
+    """Return the GP with the most likely hyperparameters, given values ``(n,)`` at unit-cube points ``(n, d)``.
 
-    Points whose value is NaN, pending or failed, are taken to have the value that the others predict: that lowers
-    the uncertainty around them and moves nothing.
+    Pending and failed points have the value NaN. They are assigned the value that the others predict, which lowers the
+    uncertainty around them and leaves the mean unchanged.
+
+    Args:
+        points: points of the unit cube ``(n, d)``.
+        values: values ``(n,)``; NaN if pending or failed.
+        kernel: the covariance; Matern 3/2 with one length-scale if None.
+        noise: bounds of the noise variance relative to that of the values; equal bounds fix it.
+        prior_mean: prior mean of the values as a function of points; their average if None.
 
     Raises:
-        InputError: fewer than two values are known, or the prior mean is not finite at a known point.
+        InputError: if fewer than two values are known, or the prior mean is not finite at a known point.
     """
     known = np.isfinite(values)
     if known.sum() < 2:
@@ -84,7 +91,7 @@ def fit_surrogate(
     scale = _scale(y - shift - prior)
     mean = zero_mean if prior_mean is None else _Scaled(prior_mean, scale)
     process = fit(Matern(1.5) if kernel is None else kernel, X, (y - shift) / scale, noise=noise, mean=mean)
-    return Surrogate(_with_believed(process, points[~known]), shift, scale)
+    return Surrogate(_with_imputed(process, points[~known]), shift, scale)
 
 
 def _scale(residual: Array) -> float:
@@ -95,6 +102,8 @@ def _scale(residual: Array) -> float:
 
 @dataclass(frozen=True)
 class _Scaled:
+    """A prior mean in units of the standardised values."""
+
     mean: Mean
     scale: float
 
@@ -102,26 +111,26 @@ class _Scaled:
         return np.asarray(self.mean(X), dtype=np.float64) / self.scale
 
 
-def _with_believed(process: GaussianProcess, points: Array) -> GaussianProcess:
+def _with_imputed(process: GaussianProcess, points: Array) -> GaussianProcess:
     if not len(points):
         return process
-    believed, _ = process.predict(points)
-    X, y = np.concatenate([process.X, points]), np.concatenate([process.y, believed])
+    imputed, _ = process.predict(points)
+    X, y = np.concatenate([process.X, points]), np.concatenate([process.y, imputed])
     return condition(process.kernel, process.theta, X, y, noise=process.noise, mean=process.mean)
 
 
-# For a search in many dimensions
+# For searches in many dimensions
 
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """Hyperparameters learned from some values, with which a process is conditioned on these and on later ones.
+    """Learned hyperparameters, with which a process can be conditioned on the same values and on later ones.
 
     Attributes:
         theta: logarithms of the hyperparameters of a Matern 3/2 kernel, a length-scale for each dimension, and a
             linear kernel.
         warp: the scale on which the values are a Gaussian process.
-        shift, scale: the standardisation on that scale.
+        shift, scale: constants of the standardisation on that scale.
     """
 
     theta: Array
@@ -134,10 +143,13 @@ class Learned:
         return np.asarray((self.warp.forward(values) - self.shift) / self.scale)
 
     def condition(self, points: Array, values: Array) -> GaussianProcess:
-        """Return the process given values ``(n,)``, NaN where pending or failed: its own predictions stand in there."""
+        """Return the process given values ``(n,)`` at points ``(n, d)``.
+
+        Pending and failed points have the value NaN, and are assigned the value that the others predict.
+        """
         known = np.isfinite(values)
         process = condition(_KERNEL, self.theta, points[known], self.standardised(values[known]))
-        return _with_believed(process, points[~known])
+        return _with_imputed(process, points[~known])
 
     def __repr__(self) -> str:
         return record(self)
@@ -146,12 +158,12 @@ class Learned:
 def learn(points: Array, values: Array) -> Learned:
     """Return the most likely hyperparameters given known values ``(n,)`` at unit-cube points ``(n, d)``.
 
-    Length-scales have a log-normal prior that grows with the root of the dimension (Hvarfner, Hellsten and Nardi
-    2024). The process is one of the values or, if none is negative and that predicts each value clearly better
-    from all others, of their logarithms.
+    Length-scales have a log-normal prior whose median grows with the root of the dimension (Hvarfner, Hellsten and
+    Nardi 2024). The process models the logarithms of the values if no value is negative and if that predicts each
+    value clearly better from all others; else it models the values.
     """
     if len(values) > _LEARNED_FROM:
-        rows = _telling(values)
+        rows = _informative_rows(values)
         points, values = points[rows], values[rows]
     score, learned = _learn_on(points, values, Warp())
     if values.min() >= 0 and values.max() > 0:
@@ -161,7 +173,7 @@ def learn(points: Array, values: Array) -> Learned:
     return learned
 
 
-def _telling(values: Array) -> Rows:
+def _informative_rows(values: Array) -> Rows:
     """Return the rows of the largest values and of others evenly spread over the history."""
     order = np.argsort(-values, kind="stable")
     largest, others = order[: _LEARNED_FROM // 2], np.sort(order[_LEARNED_FROM // 2 :])
@@ -170,7 +182,7 @@ def _telling(values: Array) -> Rows:
 
 
 def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, Learned]:
-    """Return the log density of each value given all others, on one scale, and what was learned there."""
+    """Return the summed log density of each value given all others, on one scale, and the learned hyperparameters."""
     warped = warp.forward(values)
     shift = float(warped.mean())
     scale = _scale(warped - shift)
@@ -182,13 +194,13 @@ def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, Learned]
 
 
 def _centre(dimension: int) -> Array:
-    """Return the medians' logarithms, of theta and of the noise, which is fixed."""
+    """Return the logarithms of the prior medians of theta, and of the noise, which is fixed."""
     scales = [_LENGTH_SCALE * np.sqrt(dimension)] * dimension
     return np.asarray(np.log([_VARIANCE, *scales, _LINEAR, 12 * _LINEAR / dimension, NOISE]))
 
 
 def _starts(dimension: int) -> Array:
-    """Return starts of the climbs: the prior's mode, and something rougher."""
+    """Return two starts of the climbs: the prior's mode, and one with shorter length-scales."""
     rougher = np.zeros(dimension + 4)
     rougher[1 : dimension + 1] = -1.0
     return np.asarray(_centre(dimension) + np.array([np.zeros(dimension + 4), rougher]))
@@ -196,10 +208,10 @@ def _starts(dimension: int) -> Array:
 
 @dataclass(frozen=True)
 class _LogPrior:
-    """Independent normal densities of the hyperparameters' logarithms; length-scales have a mean in common.
+    """Independent normal densities of the hyperparameters' logarithms; length-scales share an uncertain mean.
 
     Attributes:
-        dimension: of the points.
+        dimension: the dimension of the points.
     """
 
     dimension: int

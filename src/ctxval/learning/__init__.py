@@ -1,4 +1,4 @@
-"""What executions teach about the system: its residual dynamics, and the distances that these predict."""
+"""Learning from executions: residual dynamics of the system, and predictions of the distance from them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Residual dynamics learned from executions.
 
-An execution shows a whole trajectory of transitions (x, u, x'). From them ``r(x, u) = x' - M(x, u)`` is learned, and
-``M_hat = M + r`` is a model again.
+An execution records a trajectory of transitions (x, u, x'). The residual ``r(x, u) = x' - M(x, u)`` is learned from
+them, and ``M_hat = M + r`` is a corrected model.
 """
 
 from __future__ import annotations
@@ -24,23 +24,24 @@ from ctxval.gp.subset import pivoted_rows
 from ctxval.models.scaling import standard_deviations, standardised_pairs
 
 _CENTRES = 450
-"""The most transitions that the residual is conditioned on."""
+"""Largest number of transitions that the residual is conditioned on."""
 _LEARNED_FROM = 120
-"""The most transitions that its hyperparameters are learned from."""
+"""Largest number of transitions from which its hyperparameters are learned."""
 _START = 3.0
-"""Length-scale, in standard deviations of the inputs, from which the hyperparameters are sought."""
+"""Length-scale, in standard deviations of the inputs, at which the search for the hyperparameters starts."""
 _MUCH_BETTER = 0.7
-"""What is learned without M is preferred if its error is below this share of the error with M."""
+"""Dynamics learned without M are preferred if their error is below this share of the error with M."""
 _NEGLIGIBLE = 1e-7
 """A residual below this share of the state's typical change is rounding."""
 _ABSURD = 1e100
-"""Larger numbers have diverged, and their squares would not be finite."""
+"""Transitions with larger numbers have diverged and are left out; the squares of such numbers would not be finite."""
 _REACH = 5.0
-"""Predicted residuals are bounded by this many times the largest one recorded."""
-_LOOKS = 12
-"""Steps of a predicted trajectory from which its unfamiliarity is computed."""
+"""Predicted residuals are limited to this many times the largest one recorded."""
+_STEPS_SAMPLED = 12
+"""Number of steps of a predicted trajectory from which its unfamiliarity is computed."""
 _NOISE = (1e-9, 0.1)
-"""Bounds of the noise variance, as a share of the residual's mean square; the least keeps the Cholesky factor safe."""
+"""Bounds of the noise variance, as a share of the residual's mean square; the lower one keeps the covariance matrix
+positive definite."""
 _PIVOT = 0.1
 """Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
 _KERNEL = kernels.Sum(
@@ -51,20 +52,21 @@ _KERNEL = kernels.Sum(
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """The posterior mean of a Gaussian process for each state's ``r(x, u)``; they share a covariance.
+    """The residual ``r(x, u)`` as posterior means of Gaussian processes, one for each state; they share a covariance.
 
     Attributes:
-        theta: logarithms of the hyperparameters of a Matern 5/2 kernel, a length-scale for each column, and a linear
-            kernel.
+        theta: logarithms of the hyperparameters of a Matern 5/2 kernel with a length-scale for each column, and of a
+            linear kernel.
         noise: variance of the outputs' noise.
         centres: standardised state-input pairs that it is conditioned on, shape ``(M, n + m)``.
-        outputs: standardised residuals there, shape ``(M, n)``.
-        sources: the execution of each pair; -1 for data that the model came with, shape ``(M,)``.
-        shift_in, scale_in: of the state-input pair, shapes ``(n + m,)``.
-        scale_out: of the residual, shape ``(n,)``.
-        limit: the largest standardised residual believed, shape ``(n,)``.
-        unit: a standardised residual of 1 as a share of a typical step of the system.
-        spare: more pairs, outputs and sources, which replace those of executions that are left out; None after that.
+        outputs: standardised residuals at the centres, shape ``(M, n)``.
+        sources: the execution of each pair; -1 for data that the model was made from, shape ``(M,)``.
+        shift_in, scale_in: constants that standardise a state-input pair, shapes ``(n + m,)``.
+        scale_out: unit of the standardised residual, shape ``(n,)``; 0 if the residual of a state is negligible.
+        limit: the largest standardised residual that is returned, in magnitude, shape ``(n,)``.
+        unit: a standardised residual of 1, as a share of a typical step of the system.
+        spare: further pairs, outputs and sources, which replace those of executions that are left out; None if they
+            are in use already.
     """
 
     theta: Array
@@ -82,12 +84,12 @@ class Residual:
     @functools.cached_property
     def process(self) -> MultiOutputProcess:
         """The Gaussian processes of the standardised residuals."""
-        # Centres may be too much alike for so little noise.
+        # If centres are too similar for this noise, more noise keeps the covariance matrix positive definite.
         return MultiOutputProcess(_KERNEL, self.theta, self.centres, self.outputs, tuple(tenfold(self.noise)))
 
     @functools.cached_property
     def _scaled(self) -> tuple[Array, Array, Array]:
-        """What every evaluation needs: centres over length-scales, weights of the Matern and of the linear part."""
+        """Constants of every evaluation: centres over length-scales, weights of the Matern and of the linear part."""
         variance, scales, constant, slope = _parts(self.theta)
         weights = self.process.weights
         linear = np.vstack([constant * weights.sum(axis=0), slope * (self.centres.T @ weights)])
@@ -111,14 +113,14 @@ class Residual:
         """Return the posterior variance of the standardised residual, ``(...)``."""
         z = self.inputs(x, u)
         rows = z.reshape(-1, z.shape[-1])
-        # For many rows a product with the inverse factor is several times as fast as substitution.
+        # For many rows, a product with the inverse factor is several times as fast as substitution.
         half = self.process.factor.inverse_factor @ _KERNEL(self.theta, self.centres, rows)
         variance = _KERNEL.diagonal(self.theta, rows) - np.einsum("ij,ij->j", half, half)
         return np.asarray(np.maximum(variance, 0.0).reshape(z.shape[:-1]))
 
     def unfamiliarity(self, trajectory: Trajectory) -> Array:
         """Return the standard deviation of r along trajectories, as a share of a typical step, ``(...)``."""
-        at = np.linspace(0, trajectory.horizon - 1, min(_LOOKS, trajectory.horizon)).astype(int)
+        at = np.linspace(0, trajectory.horizon - 1, min(_STEPS_SAMPLED, trajectory.horizon)).astype(int)
         variance = self.variance(trajectory.states[..., at, :], trajectory.inputs[..., at, :])
         return np.asarray(self.unit * np.sqrt(variance.mean(axis=-1)))
 
@@ -128,7 +130,7 @@ class Residual:
         return self.unit * float(np.median(np.sqrt((errors**2).mean(axis=1))))
 
     def without(self, sources: Collection[int]) -> Residual:
-        """Return the residual conditioned without some executions; its hyperparameters stay."""
+        """Return the residual conditioned without some executions; its hyperparameters do not change."""
         spare = () if self.spare is None else (self.spare,)
         parts = zip((self.centres, self.outputs, self.sources), *spare, strict=True)
         centres, outputs, of = (np.concatenate(part) for part in parts)
@@ -146,7 +148,7 @@ def _parts(theta: Array) -> tuple[float, Array, float, float]:
 
 
 def _matern(r: Array) -> Array:
-    """Return the Matern 5/2 covariance of distances, which are overwritten."""
+    """Return the Matern 5/2 covariance of distances; the argument is overwritten."""
     r *= np.sqrt(5.0)
     decay = np.exp(-r)
     decay *= 1 + r * (1 + r / 3)
@@ -159,10 +161,10 @@ def learn_residual(model: Model, transitions: Transitions, sources: Rows, centre
     Returns None if fewer than two transitions are usable, or if M explains all of them.
 
     Args:
-        model: M.
-        transitions: of the system, N of them.
-        sources: the execution of each transition; -1 for data that the model came with, shape ``(N,)``.
-        centres: the most transitions that it is conditioned on.
+        model: the model M.
+        transitions: N transitions of the system.
+        sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
+        centres: largest number of transitions that the residual is conditioned on.
     """
     with np.errstate(all="ignore"):
         residuals = transitions.x_next - model.step(transitions.x, transitions.u)
@@ -206,7 +208,7 @@ def _most_likely(Z: Array, Y: Array) -> tuple[Array, float]:
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
     """Return ``sum_o log p(Y[:, o] | Z, theta)`` up to a constant, and its gradient (Rasmussen and Williams, 5.9).
 
-    The last of theta is the logarithm of the noise variance.
+    The last entry of theta is the logarithm of the noise variance.
     """
     noise = float(np.exp(theta[-1]))
     value, W = log_likelihood_of_outputs(_KERNEL(theta[:-1], Z, Z), noise, Y)
@@ -214,7 +216,7 @@ def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
 
 
 class Identity:
-    """The model ``x_next = x``, whose residual is the system's own steps."""
+    """The model ``x_next = x``; its residual is the step of the system."""
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the state itself."""
@@ -225,8 +227,8 @@ class CorrectedModel:
     """The model ``M_hat(x, u) = M(x, u) + r(x, u)``.
 
     Args:
-        model: M.
-        residual: r.
+        model: the model M.
+        residual: the residual r.
     """
 
     def __init__(self, model: Model, residual: Residual) -> None:
@@ -242,10 +244,18 @@ class CorrectedModel:
 
 
 def learn_corrected(model: Model, transitions: Transitions, sources: Rows, centres: int) -> CorrectedModel | None:
-    """Return the corrected model: M plus its residual or, if that predicts much better, the system's steps without M.
+    """Return M plus its residual or, if this predicts much better, a model of the system's steps without M.
 
-    Around a model that is rougher than the system, such as a small network, all its kinks would have to be learned.
-    Returns None if there is no residual to be learned.
+    If M is rougher than the system, such as a small network, then its residual has all of its kinks and is harder to
+    learn than the steps.
+
+    Returns None if no residual can be learned (see :func:`learn_residual`).
+
+    Args:
+        model: the model M.
+        transitions: N transitions of the system.
+        sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
+        centres: largest number of transitions that a residual is conditioned on.
     """
     of_model = learn_residual(model, transitions, sources, centres)
     if of_model is None:

@@ -1,7 +1,7 @@
-"""Predictions of the distance from the dynamics that executions have shown.
+"""Predictions of the distance from dynamics that are learned from executions.
 
-The corrected model ``M_hat = M + r`` can stand in for the system. So the distance predicted at p is the ordinary
-validation of M against M_hat, with the controller designed at p: jumps of the design are predicted too.
+The corrected model ``M_hat = M + r`` replaces the system. The distance predicted at p is the ordinary validation of M
+against M_hat, with the controller designed at p. So the prediction includes jumps of the design.
 """
 
 from __future__ import annotations
@@ -26,33 +26,34 @@ from ctxval.models.scaling import standard_deviations
 from ctxval.searches import Prediction
 
 _CENTRES = (100, 450)
-"""The fewest and the most transitions that the residual is conditioned on."""
+"""Least and largest number of transitions that the residual is conditioned on."""
 _WORK = 30_000
-"""Their number times the horizon is about this, which bounds the time of a closed loop."""
+"""Number of these transitions times the horizon; it bounds the time of a closed loop."""
 _POOL = 3000
-"""The most transitions of executions that these are chosen from."""
+"""Largest number of transitions that these are chosen from."""
 _DATA = 600
-"""The most transitions of the model's own data among them: those nearest to the tasks."""
+"""Largest number of transitions of the model's own data in this pool: those nearest to the tasks."""
 _LOOPS = 64
-"""Closed loops on M that show which transitions the tasks need."""
+"""Number of closed loops on M that show which transitions the tasks need."""
 _SLOW_LOOPS = 3
-"""Tasks that are tried one by one, if loops cannot be computed in a batch."""
+"""Number of tasks that are tried one by one, if loops cannot be computed in a batch."""
 _DESIGNS = 2000
-"""Designs for one suggestion, if the synthesizer takes batches."""
+"""Number of designs for one suggestion, if the synthesizer takes batches."""
 _SLOW_DESIGNS = 150
-"""Designs for one suggestion, if it takes one task at a time."""
+"""Number of designs for one suggestion, if the synthesizer takes one task at a time."""
 _SLOW = 0.02
-"""Seconds of a single closed loop on M from which on closed loops are distributed over the cores."""
+"""Seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores."""
 
 
 def predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
-    """Return a prediction of d at other points from the executions so far and the data that the model came with.
+    """Return a prediction of d at other points, from the executions so far and the data that the model was made from.
 
     Returns None if there are no recorded transitions, if M already explains them, or if no task can be planned.
 
-    If the distance is composed of a short vector, such as the error of the final state, the prediction offers another
-    one to turn to (``otherwise``), which models the vectors as functions of p: what no function of state and input
-    explains may still be a function of p.
+    If the distance is composed of a short vector, such as the error of the final state, a second prediction models the
+    vector as a function of p, because an error that is no function of state and input may still be a function of p.
+    The first prediction offers the second one as ``otherwise``. If there is no first prediction, the second one is
+    returned instead.
 
     Args:
         validation: the map p -> d(p).
@@ -65,13 +66,16 @@ def predict_distance(validation: Validation, executed: Sequence[tuple[Array, Tra
 
 
 def _predict_vectors(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
-    """Return the prediction from the vectors that distances are composed of; None if they are not, or cannot be had."""
+    """Return the prediction from the vectors of which distances are composed.
+
+    Returns None if the distance is not composed of a vector, or if the vectors are not known for two executions.
+    """
     distance = validation.distance
     if not isinstance(distance, ComposedDistance) or len(executed) < 2:
         return None
     try:
         errors = np.array([_vector(validation, distance, *pair) for pair in executed])
-    except Exception:  # the user's own parts; they work where S was executed, but a distance may still object
+    except Exception:  # the user's own parts: a distance may reject even tasks that were executed
         return None
     if errors.ndim != 2 or not np.isfinite(errors).all():
         return None
@@ -124,7 +128,7 @@ def _closed_loops_on_model(validation: Validation) -> Trajectory | None:
         try:
             task = validation.task(space.parameters(rows))
             loops = rollout(validation.model.step, validation.synthesizer.design(task, validation.model), task)
-        except Exception:  # the user's own parts, on tasks that nobody may ever ask for
+        except Exception:  # the user's own parts, on tasks that may never be executed
             continue
         if loops.batch_shape == rows.shape[:-1]:
             return loops
@@ -132,7 +136,7 @@ def _closed_loops_on_model(validation: Validation) -> Trajectory | None:
 
 
 def _nearest(data: Transitions, loops: Trajectory) -> Transitions:
-    """Return the transitions that are nearest to where the tasks lead."""
+    """Return the transitions that are nearest to the closed loops of the tasks."""
     if len(data) <= _DATA:
         return data
     needed = loops.transitions()
@@ -148,13 +152,13 @@ def _nearest(data: Transitions, loops: Trajectory) -> Transitions:
 
 @dataclass(frozen=True, eq=False)
 class _PredictedDistance:
-    """The validation of M against M_hat, in the unit cube.
+    """The validation of M against M_hat, as a function of points of the unit cube.
 
     Attributes:
-        validation: of M against S.
-        corrected: M_hat.
+        validation: the validation of M against S.
+        corrected: the corrected model M_hat.
         batched: whether controllers are designed in batches.
-        executed: points with the trajectories that M_hat was learned from.
+        executed: executed points, with the trajectories from which M_hat was learned.
         in_parallel: whether closed loops are distributed over the cores; their results are the same.
     """
 
@@ -183,11 +187,11 @@ class _PredictedDistance:
         return CorrectedModel(self.corrected.model, self.corrected.residual.without(there))
 
     def _looped(self, points: Array, corrected: CorrectedModel) -> tuple[Array, Array]:
-        """Return distances and doubts; a batch that fails is halved, so that one bad task, NaN, spares the others."""
+        """Return distances and doubts ``(m,)``; NaN for a task that fails. A batch that fails is halved and retried."""
         if self.batched or len(points) == 1:
             try:
                 return self._closed_loops(points, corrected)
-            except Exception:  # a task, a synthesizer or a distance of the user's, on points that nobody may ever run
+            except Exception:  # the user's task, synthesizer or distance, on points that may never be executed
                 if len(points) == 1:
                     return np.array([np.nan]), np.array([np.nan])
         half = len(points) // 2

@@ -1,7 +1,7 @@
 """Predictions of values that are composed of a short vector, such as a norm of the error of the final state.
 
-A norm has kinks and folds where the vector has none, and each evaluation shows the whole vector. So the vector is
-modelled as a Gaussian process whose entries share a covariance, and values are composed of predicted vectors.
+A norm has kinks where the vector is smooth, and each evaluation shows the whole vector. So the vector is modelled by
+Gaussian processes that share a covariance, one for each entry, and values are composed of predicted vectors.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Compose = Callable[[Array], Array]
 
 _KERNEL = Sum(Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3)), Linear(variance=(1e-6, 1e3)))
 _NOISE = 1e-8
-"""Variance relative to the vectors' mean square: it keeps the Cholesky factor safe."""
+"""Noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite."""
 _START = (0.1, 0.5, 0.1, 1.0)
 """Prior medians of the Matern variance, of the length-scale over the root of the dimension, and of the constant and the
 slope variance of the linear kernel; the search for the most likely hyperparameters starts there."""
@@ -32,21 +32,21 @@ _LENGTH_SCALE_DEVIATION = 1.0
 _VARIANCE_DEVIATION = 3.0
 """Prior standard deviation of a variance's logarithm."""
 _LEARNED_FROM = 200
-"""The most vectors, the last ones, that the hyperparameters are learned from."""
+"""Largest number of vectors, the latest ones, from which the hyperparameters are learned."""
 _BUDGET = 6000
-"""Points that may be asked about for one suggestion: no controller is designed for them."""
+"""Number of points that may be predicted for one suggestion; it is large because no controller is designed for them."""
 _DRAWS = 32
-"""Draws of the vector from which the doubt is computed."""
+"""Number of draws of the vector from which the doubt is computed."""
 
 
 @dataclass(frozen=True, eq=False)
 class _ComposedPosterior:
-    """The posterior of the vectors, and what is composed of it.
+    """The posterior of the vectors, and the values composed of it.
 
     Attributes:
-        vectors: the posterior of the vectors over ``scale``.
-        scale: their root mean square.
-        compose: vectors to values.
+        vectors: the posterior of the vectors, divided by ``scale``.
+        scale: root mean square of the vectors.
+        compose: the function from vectors to values.
     """
 
     vectors: MultiOutputProcess
@@ -54,18 +54,18 @@ class _ComposedPosterior:
     compose: Compose
 
     def expected(self, points: Array) -> tuple[Array, Array]:
-        """Return the values composed of the expected vectors ``(m,)``, and how much draws of them vary, relatively."""
+        """Return the values composed of the expected vectors ``(m,)``, and the relative deviation of draws ``(m,)``."""
         with single_threaded():
             mean, variance = self.vectors.predict(points)
         expected = np.asarray(self.compose(self.scale * mean))
-        # The same draws for all points and always, so that this is a plain function.
+        # The draws are the same at all points and in all calls, so that the result is a function of the point.
         draws = np.random.default_rng(0).normal(size=(_DRAWS, 1, mean.shape[1]))
         drawn = self.compose(self.scale * (mean + np.sqrt(variance)[:, None] * draws))
         deviation = np.sqrt(((drawn - expected) ** 2).mean(axis=0))
         return expected, deviation / np.maximum(np.abs(expected), 1e-12 * self.scale)
 
     def left_out(self, rows: Rows) -> Array:
-        """Return the values composed of the vectors that all others predict, ``(len(rows),)``."""
+        """Return the values composed of vectors that are predicted from all others, ``(len(rows),)``."""
         return np.asarray(self.compose(self.scale * self.vectors.left_out()[rows]))
 
 
@@ -75,15 +75,15 @@ def predict_composed(points: Array, vectors: Array, compose: Compose) -> Predict
     Returns None if fewer than two vectors are known, or if all of them are zero.
 
     Args:
-        points: of the unit cube, ``(n, d)``.
-        vectors: there, ``(n, k)``.
+        points: known points of the unit cube, ``(n, d)``.
+        vectors: the vectors at these points, ``(n, k)``.
         compose: vectors ``(..., k)`` -> values ``(...)``.
 
     Raises:
-        ShapeError: points and vectors do not fit together.
+        ShapeError: if the shapes of points and vectors do not fit together.
     """
     if points.ndim != 2 or vectors.ndim != 2 or len(points) != len(vectors):
-        raise ShapeError(f"points (n, d) and vectors (n, k) must fit together, got {points.shape}, {vectors.shape}.")
+        raise ShapeError(f"points must be (n, d) and vectors (n, k), got {points.shape}, {vectors.shape}.")
     scale = float(np.sqrt((vectors**2).mean())) if len(vectors) else 0.0
     if len(vectors) < 2 or scale == 0:
         return None
@@ -94,7 +94,7 @@ def predict_composed(points: Array, vectors: Array, compose: Compose) -> Predict
 
 
 def _noises() -> tuple[float, ...]:
-    """Return noise variances to be tried in this order: points may be too much alike for the first."""
+    """Return noise variances in the order in which they are tried: points may be too similar for the first."""
     return (_NOISE, *(_NOISE + more for more in tenfold(_NOISE)))
 
 

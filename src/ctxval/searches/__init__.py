@@ -1,4 +1,4 @@
-"""Searches: ask and tell over the unit cube."""
+"""Searches for the largest value over the unit cube, with an ask-and-tell interface."""
 
 from __future__ import annotations
 
@@ -52,20 +52,20 @@ NAMES: dict[str, type[Any]] = {name: REGISTRY.find(name) for name in sorted((*RE
 """The searches of this package, by name; ``climbs`` and ``scalar`` are older names."""
 
 DEFAULT = "auto"
-"""The search of a new campaign that names none, in Python, in experiment files and on the command line."""
+"""The default search of a campaign, in Python, in experiment files and on the command line."""
 
 
 def by_name(name: str, *, repeats: int = 1, **options: Any) -> Search:
     """Return a new search from its name and its options.
 
     Args:
-        name: of :data:`REGISTRY`, such as ``"auto"``.
-        repeats: how often each point is evaluated; more than once if the function is noisy.
-        options: of the search.
+        name: a name of :data:`REGISTRY`, such as ``"auto"``.
+        repeats: number of evaluations of each point; more than one if the function is noisy.
+        options: options of the search.
 
     Raises:
-        UnknownNameError: there is no such search; the message has the nearest name.
-        InputError: the search does not take these options, or belongs to an installed package and cannot be loaded.
+        UnknownNameError: if no search has this name; the message suggests the nearest name.
+        InputError: if the search does not take these options, or if its package cannot be loaded.
     """
     build = REGISTRY.find(name)
     try:

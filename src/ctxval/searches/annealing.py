@@ -10,26 +10,27 @@ from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch
 
 _SMALLEST_MOVE = 0.1
-"""Moves shrink with the temperature, down to this share of the first ones."""
+"""Smallest size of the moves, which shrink with the temperature, as a share of their first size."""
 
 
 @part("annealing")
 class Annealing(SequentialSearch):
     """A Metropolis walk through the unit cube, at a temperature that falls geometrically.
 
-    Each point is a Gaussian move from the walk's place, reflected at the faces of the cube, or now and then a uniform
-    draw. The walk goes there if the value is larger, or else with probability ``exp(-loss / T_k)``, where T_k at
-    trial k is ``temperature * cooling ** k`` times the range of the values before it. It never goes to a failed point.
+    Each point is a Gaussian move from the current point of the walk, reflected at the faces of the cube, or sometimes a
+    uniform draw. If its value is larger, the walk moves there; if not, it moves there with probability
+    ``exp(-loss / T_k)``. At trial k, T_k is ``temperature * cooling ** k`` times the range of the values before it. The
+    walk never moves to a failed point.
 
     Args:
-        temperature: at the start, as a share of the range of the values.
+        temperature: temperature at the start, as a share of the range of the values.
         cooling: factor of the temperature from one trial to the next.
         move: standard deviation of the first moves on each axis, in widths of the cube; it shrinks with the square
             root of the temperature.
-        restart: probability of a uniform draw in place of a move.
+        restart: probability of a uniform draw instead of a move.
 
     Raises:
-        InputError: temperature or move is not positive, cooling not in (0, 1], or restart not in [0, 1].
+        InputError: if temperature or move is not positive, cooling is not in (0, 1], or restart is not in [0, 1].
     """
 
     def __init__(
@@ -45,7 +46,7 @@ class Annealing(SequentialSearch):
         self.restart = restart
 
     def propose(self, rng: np.random.Generator) -> Array:
-        """Return a uniform draw, or a move from where the walk is."""
+        """Return a uniform draw, or a move from the current point of the walk."""
         points, values = self.points, self.values
         uniform = rng.random() < self.restart
         if uniform or not np.isfinite(values).any():
@@ -55,12 +56,13 @@ class Annealing(SequentialSearch):
         return reflected(place + self.move * shrunk * rng.normal(size=self.dimension))
 
     def _walk(self, values: Array) -> int:
-        """Return the number of the trial at which the walk is, after all of them."""
+        """Return the number of the trial at which the walk is after all trials."""
         known = np.flatnonzero(np.isfinite(values))
         heights = values[known]
         ranges = np.maximum.accumulate(heights) - np.minimum.accumulate(heights)
-        # One stream for all decisions: a longer history has the same first draws. The third word keeps it apart from
-        # the stream [seed, k] of trial k. A loss below T times an exponential variate has the Metropolis probability.
+        # All decisions use one stream, so a longer history has the same first draws. The third number of the seed
+        # separates it from the stream [seed, k] of trial k. A loss is below T times an exponential variate with the
+        # Metropolis probability.
         stream = np.random.default_rng(np.random.SeedSequence([self._seed, 0, 1]))
         tolerated = self.temperature * self.cooling**known * stream.standard_exponential(len(values))[known]
         place = 0
@@ -71,6 +73,6 @@ class Annealing(SequentialSearch):
 
 
 def reflected(points: Array) -> Array:
-    """Return points folded back into the unit cube at its faces."""
+    """Return points reflected at the faces of the unit cube until they are inside."""
     remainder = np.mod(points, 2.0)
     return np.minimum(remainder, 2.0 - remainder)

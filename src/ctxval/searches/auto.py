@@ -1,4 +1,4 @@
-"""The richest search that the trials allow."""
+"""The default search: it uses the trajectories of the trials if they are recorded, and else only their values."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ class Auto(TrustRegion):
     """Trust-region search on the distance that executed trajectories predict; Bayesian optimisation without them.
 
     Args:
-        designs: the most controllers that may be designed for one suggestion; by default 2,000 if they are designed in
-            batches, and 150 if one after the other.
-        optimism, misses: as for :class:`TrustRegion`.
+        designs: largest number of controllers that are designed for one suggestion; by default 2,000 if they are
+            designed in batches, and 150 if they are designed one after the other.
+        optimism, misses: see :class:`TrustRegion`.
 
     Raises:
-        InputError: a value cannot be used.
+        InputError: if designs or misses is below 1, or the optimism is negative or infinite.
     """
 
     def __init__(self, designs: int | None = None, optimism: float = 2.0, misses: int = 3) -> None:
         super().__init__(optimism, misses)
         if designs is not None and designs < 1:
-            raise InputError(f"a choice must be allowed at least one design, got {designs}.")
+            raise InputError(f"designs must be at least 1, got {designs}.")
         self.designs = designs
 
     def use_prediction(self, prediction: Prediction | None) -> None:
-        """Take the prediction for the next question; None if there is none."""
+        """Take the prediction for the point that is asked for next; None if there is none."""
         super().use_prediction(prediction if prediction is None else self._afforded(prediction))
 
     def _afforded(self, prediction: Prediction) -> Prediction:

@@ -1,4 +1,4 @@
-"""What every search offers, and the bookkeeping that most of them share."""
+"""The interface of all searches, and the base classes that the ready-made ones share."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ from ctxval.errors import InputError, ShapeError
 from ctxval.gp.surrogate import Surrogate
 
 Note = dict[str, Any]
-"""What a search thought when it chose a point, plain enough for JSON."""
+"""What a search records about the choice of a point, in types that JSON has."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What is expected of values before they are known, as a plain function of points of the unit cube.
+    """A prediction of values at points of the unit cube that have not been evaluated.
 
     Attributes:
-        expected: points ``(m, d)`` -> the values expected ``(m,)``, and the doubt in what leads to each, ``(m,)``: 0
-            if all of it was seen before, about 1 if nothing was. Both are NaN if nothing can be predicted.
-        left_out: rows ``(k,)`` of the points with a known value, in the order of asking -> what would be expected
-            there, ``(k,)``, had each not been evaluated.
-        budget: how many points may be asked about in choosing one, the known ones not counted; each may cost a
-            controller's design.
-        otherwise: returns what may be used instead if leaving points out shows that this one is no good.
+        expected: points ``(m, d)`` -> the expected values ``(m,)`` and their doubt ``(m,)``. The doubt is 0 if all
+            that leads to a value was seen before, and about 1 if nothing was. Both are NaN if a value cannot be
+            predicted.
+        left_out: rows ``(k,)`` -> leave-one-out predictions ``(k,)``. Rows count the points with a known value, in the
+            order of asking; each is predicted as if it had not been evaluated.
+        budget: number of points that may be predicted to choose one, known points not counted; each prediction may
+            cost the design of a controller.
+        otherwise: returns another prediction to use if leave-one-out errors show that this one is not good; None if
+            there is no other.
     """
 
     expected: Callable[[Array], tuple[Array, Array]]
@@ -43,14 +45,15 @@ class Prediction:
 
 @runtime_checkable
 class Search(Protocol):
-    """Chooses the next points of the unit cube to evaluate, seeking the largest value.
+    """A search for the largest value over the unit cube: it chooses the next points to evaluate.
 
     The state of a search is a function of the seed and of the history of points and values, in their order: a new
-    search that is reset with the same seed and told the same history asks for the same points. So a campaign
-    resumes by telling, and saves no search.
+    search that is reset with the same seed and told the same history asks for the same points. So a campaign saves no
+    search, and resumes by telling the history.
 
-    These three methods are all that a search needs. One that has more to tell a campaign, such as independent draws or
-    notes, inherits :class:`BaseSearch`; attributes and methods of other classes are their own, whatever their names.
+    These three methods are all that a search needs. A search that offers more, such as independent draws or notes,
+    inherits :class:`BaseSearch`. A campaign ignores other attributes and methods of other classes, whatever their
+    names.
     """
 
     def reset(self, dimension: int, seed: int) -> None:
@@ -64,14 +67,14 @@ class Search(Protocol):
 
 
 class BaseSearch(ABC):
-    """Base class of searches that tell a campaign more than their next points; all ready-made ones inherit it.
+    """Base class of searches with more than the three methods of :class:`Search`; all ready-made ones inherit it.
 
-    A subclass has the three methods of :class:`Search`. Everything else has a default, which does nothing.
+    A subclass implements these three methods. All others have a default, which does nothing.
 
     Attributes:
         iid: whether every point is an independent uniform draw.
-        initial: how many first points are an initial design.
-        discard: how many of the largest values its estimate of the maximum leaves out.
+        initial: number of points at the start that are an initial design.
+        discard: number of the largest values that the estimate of the maximum leaves out.
     """
 
     iid: bool = False
@@ -80,7 +83,7 @@ class BaseSearch(ABC):
 
     @staticmethod
     def of(search: Search) -> BaseSearch:
-        """Return a search of this class as it is, and any other one with the defaults of this class."""
+        """Return the search itself if it is of this class; else wrap it with the defaults of this class."""
         return search if isinstance(search, BaseSearch) else _WithDefaults(search)
 
     @abstractmethod
@@ -97,46 +100,45 @@ class BaseSearch(ABC):
 
     @property
     def uses_prediction(self) -> bool:
-        """Whether a prediction is made before each question: it is costly, and only who takes it needs it.
+        """Whether a campaign computes a prediction before it asks for points, which is costly.
 
-        By default, whether the subclass has its own :meth:`use_prediction`.
+        By default it does if the subclass has its own :meth:`use_prediction`.
         """
         return type(self).use_prediction is not BaseSearch.use_prediction
 
     def use_prediction(self, prediction: Prediction | None) -> None:  # noqa: B027
-        """Take what is expected of values before the next question; None if nothing is."""
+        """Take the prediction for the points that are asked for next; None if there is none."""
 
     def note(self) -> Note | None:
-        """Return what it thought when it chose the point asked for last, plain enough for JSON; None if nothing."""
+        """Return the note on the point that was asked for last, in types that JSON has; None if there is none."""
         return None
 
     def remember(self, notes: Sequence[Note | None]) -> None:  # noqa: B027
-        """Take back the note of each point of a history that was told, in their order."""
+        """Take the notes on a history that was told: one for each point, in the order of the points."""
 
     def estimate(self, points: Array, values: Array) -> float | None:
-        """Return the estimate of the maximum from known values, without the ``discard`` largest ones.
+        """Return the estimate of the maximum: the largest known value after the ``discard`` largest are left out.
+
+        Returns None if there are too few values.
 
         Args:
-            points: of the unit cube, shape ``(n, d)``.
-            values: shape ``(n,)``, finite.
-
-        Returns:
-            None if there are too few values.
+            points: points of the unit cube, shape ``(n, d)``.
+            values: their values, shape ``(n,)``, finite.
         """
         ordered = np.sort(values)[::-1]
         return float(ordered[self.discard]) if len(ordered) > self.discard else None
 
     def surrogate(self) -> Surrogate | None:
-        """Return the Gaussian process of the values that it searches by; None if it has none of its own.
+        """Return the Gaussian process of the values that the search uses; None if it uses none.
 
         Raises:
-            InputError: too few values are known.
+            InputError: if too few values are known.
         """
         return None
 
 
 class _WithDefaults(BaseSearch):
-    """A search of another class, of which only the three methods of the protocol are used."""
+    """A search of another class, of which a campaign uses only the three methods of the protocol."""
 
     def __init__(self, search: Search) -> None:
         self._search = search
@@ -152,7 +154,7 @@ class _WithDefaults(BaseSearch):
 
 
 class SequentialSearch(BaseSearch):
-    """A search that proposes one point at a time from the history of all points."""
+    """Base class of searches that propose one point at a time from the history of all points."""
 
     def reset(self, dimension: int, seed: int) -> None:
         """Forget everything and start on the unit cube of this dimension."""
@@ -163,7 +165,7 @@ class SequentialSearch(BaseSearch):
         self._values: list[float] = []
         self._notes: list[Note | None] = []
         self._slots: dict[bytes, list[int]] = {}
-        self._thought: Note | None = None
+        self._last_note: Note | None = None
 
     def ask(self, n: int = 1) -> Array:
         """Return the next points, shape ``(n, d)``; they are pending until told."""
@@ -173,17 +175,17 @@ class SequentialSearch(BaseSearch):
         proposals = []
         for _ in range(n):
             rng = np.random.default_rng(np.random.SeedSequence([self._seed, len(self._points)]))
-            self._thought = None
+            self._last_note = None
             proposals.append(self.propose(rng))
-            self._append(proposals[-1], np.nan, self._thought)
+            self._append(proposals[-1], np.nan, self._last_note)
         return np.array(proposals)
 
     def tell(self, points: ArrayLike, values: ArrayLike) -> None:
         """Learn the values ``(n,)`` at points ``(n, d)``; NaN for an evaluation that is pending or has failed.
 
         Raises:
-            ShapeError: points and values do not fit together or the dimension.
-            InputError: a point is outside the unit cube, or the search was never reset.
+            ShapeError: if points and values do not fit together, or do not have the dimension of the cube.
+            InputError: if a point is outside the unit cube, or the search was never reset.
         """
         self._require_reset()
         rows, scalars = as_floats("points", points), as_floats("values", values)
@@ -192,7 +194,7 @@ class SequentialSearch(BaseSearch):
                 f"tell needs points (n, {self._dimension}) and values (n,), got {rows.shape} and {scalars.shape}."
             )
         if not ((rows >= 0) & (rows <= 1)).all():
-            raise InputError(f"a search is told points of the unit cube, got {rows.tolist()}.")
+            raise InputError(f"points must be in the unit cube, got {rows.tolist()}.")
         for point, value in zip(rows, scalars.tolist(), strict=True):
             slot = self._waiting_slot(point)
             if slot is None:
@@ -201,15 +203,15 @@ class SequentialSearch(BaseSearch):
                 self._values[slot] = value
 
     def note(self) -> Note | None:
-        """Return what it thought when it chose the point asked for last; None if nothing worth keeping."""
+        """Return the note on the point that was asked for last; None if there is none."""
         self._require_reset()
-        return self._thought
+        return self._last_note
 
     def remember(self, notes: Sequence[Note | None]) -> None:
-        """Take back the note of each point told so far, in their order.
+        """Take the notes on the points told so far: one for each point, in the order of the points.
 
         Raises:
-            ShapeError: there are not as many notes as points.
+            ShapeError: if the number of notes differs from the number of points.
         """
         self._require_reset()
         if len(notes) != len(self._points):
@@ -231,7 +233,7 @@ class SequentialSearch(BaseSearch):
 
     @abstractmethod
     def propose(self, rng: np.random.Generator) -> Array:
-        """Return the next point ``(d,)``, given ``self.points``, ``self.values`` and this point's own randomness."""
+        """Return the next point ``(d,)``, given ``self.points``, ``self.values`` and a generator for this point."""
 
     @property
     def dimension(self) -> int:
@@ -245,12 +247,12 @@ class SequentialSearch(BaseSearch):
 
     @property
     def values(self) -> Array:
-        """Their values, shape ``(n,)``; NaN where pending or failed."""
+        """The values of all points, shape ``(n,)``; NaN if pending or failed."""
         return np.array(self._values)
 
     @property
     def notes(self) -> tuple[Note | None, ...]:
-        """What was thought when each was chosen; None if nothing was, or if the point was told by hand."""
+        """The note on each point; None if there is none, or if the point was told by hand."""
         return tuple(self._notes)
 
     def __repr__(self) -> str:
@@ -267,5 +269,5 @@ def best_first(points: Array, values: Array) -> Array:
 
 
 def _key(point: Array) -> bytes:
-    """Return what equal points have in common."""
+    """Return a key that is the same for equal points."""
     return (point + 0.0).tobytes()  # minus zero is zero

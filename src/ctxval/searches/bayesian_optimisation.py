@@ -1,4 +1,4 @@
-"""Bayesian optimisation from values alone: two acquisition functions, and branches that lead out of basins.
+"""Bayesian optimisation from values alone: two acquisition functions, and branches that lead out of local maxima.
 
 The surrogate is that of :func:`ctxval.gp.surrogate.learn`. Its expected improvement or, every third time, its upper
 confidence bound is maximised over the cube.
@@ -6,7 +6,7 @@ confidence bound is maximised over the cube.
 After several executions without improvement the search branches: it restricts itself to one half of the cube. Of the
 halves that do not contain the best point it takes the one with the fewest executions. A branch starts where the upper
 confidence bound is largest. From then on it improves on the largest value found in the branch, not on the largest of
-all, because the way out of a wide basin leads through lower values.
+all, because the path away from a wide maximum leads through lower values.
 """
 
 from __future__ import annotations
@@ -26,38 +26,39 @@ from ctxval.gp.surrogate import Learned, learn
 from ctxval.searches.base import Note, SequentialSearch, best_first
 
 _WORTH = 0.005
-"""The least improvement worth an execution, as a share of what the best value is above the median."""
-_PATIENCE = 8
-"""Executions without improvement after which the search branches."""
-_BRANCH_PATIENCE = 6
-"""Executions without improvement after which it leaves a branch for another."""
+"""Least improvement worth an execution, as a share of the difference between the best value and the median."""
+_MISSES = 8
+"""Number of executions without improvement after which the search branches."""
+_BRANCH_MISSES = 6
+"""Number of executions without improvement after which the search leaves a branch for another one."""
 _EVERYWHERE = 4
-"""One of so many executions is chosen from the whole cube, also in a branch; in few dimensions it fills the space."""
+"""Period of executions that are chosen from the whole cube, also in a branch; in few dimensions they fill the space."""
 _BOUND = 3
-"""One of so many executions maximises the upper confidence bound."""
+"""Period of executions that maximise the upper confidence bound."""
 _BOLD = 100.0
-"""The confidence parameter of the bound at the start of a branch."""
+"""Confidence parameter of the bound at the start of a branch."""
 _FEW = 2
-"""Dimensions up to which some of the executions fill the space."""
+"""Largest dimension in which some of the executions fill the space."""
 _FILLERS = 512
-"""Candidates for each of these."""
+"""Number of candidates for an execution that fills the space."""
 _EACH = 20
-"""Up to so many values, hyperparameters are learned at each new one; up to twice as many, at each second one; ..."""
+"""Hyperparameters are learned at each new value below twice this number of values, at every second value below four
+times this number, and so on."""
 _KEPT = 1000
-"""Points of a long history that the surrogate is conditioned on."""
+"""Largest number of points that the surrogate is conditioned on."""
 _ENGINE = "scalar"
-"""The name of this search in notes. Stores have it, so it stays although the class has another name."""
+"""The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Branch:
-    """Half of the cube.
+    """A restriction of the search to half of the cube.
 
     Attributes:
         coordinate: the axis that is halved.
-        upper: which half.
-        best: the largest value that it has found; minus infinity at first.
-        misses: executions without improvement in it, one after the other.
+        upper: whether it is the upper half.
+        best: the largest value found in this half since the branch began; minus infinity at first.
+        misses: number of successive executions in the branch without improvement.
     """
 
     coordinate: int
@@ -66,11 +67,11 @@ class _Branch:
     misses: int = 0
 
     def has(self, point: Array) -> bool:
-        """Return whether a point ``(d,)`` is in it."""
+        """Return whether a point ``(d,)`` is in this half."""
         return bool(point[self.coordinate] >= 0.5) is self.upper
 
     def box(self, dimension: int) -> Box:
-        """Return its bounds."""
+        """Return the bounds of this half."""
         low, high = np.zeros(dimension), np.ones(dimension)
         (low if self.upper else high)[self.coordinate] = 0.5
         return low, high
@@ -80,15 +81,15 @@ class _Branch:
 class BayesianOptimisation(SequentialSearch):
     """Bayesian optimisation from values alone: expected improvement and upper confidence bounds, with branches.
 
-    From 1,000 points on the surrogate is conditioned on 1,000 of them: the largest values, the latest, and well-spread
+    From 1,000 points on, the surrogate is conditioned on 1,000 of them: the largest values, the latest, and well-spread
     ones.
 
     Args:
-        initial: how many random points come first; in one and two dimensions they are far from each other.
-        beta: the confidence parameter of the upper bounds.
+        initial: number of random points at the start; in one and two dimensions they are far from each other.
+        beta: confidence parameter of the upper confidence bounds.
 
     Raises:
-        InputError: beta is negative or there is no initial point.
+        InputError: if beta is negative or infinite, or there is no initial point.
     """
 
     def __init__(self, initial: int = 3, beta: float = 4.0) -> None:
@@ -105,16 +106,16 @@ class BayesianOptimisation(SequentialSearch):
         self._memo: tuple[bytes, Learned] | None = None
 
     def propose(self, rng: np.random.Generator) -> Array:
-        """Return the point worth most."""
-        point, self._thought = self.choose(self.points, self.values, rng)
+        """Return the next point ``(d,)``."""
+        point, self._last_note = self.choose(self.points, self.values, rng)
         return point
 
     def choose(self, points: Array, values: Array, rng: np.random.Generator) -> tuple[Array, Note]:
-        """Return the point ``(d,)`` worth most after this history, whoever chose its points, and a note on the choice.
+        """Return the next point ``(d,)`` after a history, which any search may have made, and a note on the choice.
 
         Args:
-            points, values: ``(n, d)`` and ``(n,)``, NaN where pending or failed.
-            rng: of the candidates.
+            points, values: the history, ``(n, d)`` and ``(n,)``; values are NaN if pending or failed.
+            rng: the source of the candidates.
         """
         few = self.dimension <= _FEW
         if len(values) < self.initial or np.isfinite(values).sum() < 2:
@@ -147,18 +148,18 @@ class BayesianOptimisation(SequentialSearch):
         self, learned: Learned, process: GaussianProcess, values: Array, branch: _Branch | None, believed: float
     ) -> Acquisition:
         if branch is not None and not np.isfinite(branch.best):
-            # Far from the flank of the basin that was left: there the branch would only lead back to it.
+            # Start far from the maximum that was left: near it, the branch would only lead back to it.
             return UpperConfidenceBound(process, _BOLD)
         if len(values) % _BOUND == _BOUND - 1:
             return UpperConfidenceBound(process, self.beta)
         if branch is not None:
             return LogExpectedImprovement(process, _worthwhile(learned, values, branch.best))
-        # What is believed of pending points counts: questions of one batch do not all improve on the same value.
+        # Predicted values of pending points count, so that the points of one batch do not all improve on one value.
         best = _worthwhile(learned, values, float(np.nanmax(values)))
         return LogExpectedImprovement(process, max(best, believed))
 
     def _learned(self, points: Array, values: Array) -> Learned:
-        """Return the hyperparameters, which are a function of the first so many values by a fixed schedule."""
+        """Return hyperparameters learned from the first values; a fixed schedule says how many of them are used."""
         count = _scheduled(len(values))
         key = points[:count].tobytes() + values[:count].tobytes()
         if self._memo is None or self._memo[0] != key:
@@ -181,7 +182,7 @@ def _worthwhile(learned: Learned, values: Array, best: float) -> float:
 
 
 def _filling(points: Array, rng: np.random.Generator) -> Array:
-    """Return a point ``(d,)`` far from all others."""
+    """Return the candidate ``(d,)`` that is farthest from all points."""
     candidates = rng.random((_FILLERS, points.shape[1]))
     gaps = np.linalg.norm(candidates[:, None, :] - points[None, :, :], axis=2).min(axis=1)
     return np.asarray(candidates[np.argmax(gaps)])
@@ -204,20 +205,20 @@ def _branch(points: Array, values: Array) -> _Branch | None:
             misses += 1
         elif branch.has(point):
             branch = _after(branch, value, margin)
-        exhausted = misses >= _PATIENCE if branch is None else branch.misses >= _BRANCH_PATIENCE
+        exhausted = misses >= _MISSES if branch is None else branch.misses >= _BRANCH_MISSES
         if exhausted:
             branch, misses = _across(place, points[:count]), 0
     return branch
 
 
 def _after(branch: _Branch, value: float, margin: float) -> _Branch:
-    """Return a branch after one of its values."""
+    """Return a branch after one more value in it."""
     misses = 0 if value > branch.best + margin else branch.misses + 1
     return _Branch(branch.coordinate, branch.upper, max(branch.best, value), misses)
 
 
 def _across(place: Array, points: Array) -> _Branch:
-    """Return the half of the cube, away from a place ``(d,)``, that fewest points are in."""
+    """Return the half of the cube with the fewest points, of those halves that do not contain a place ``(d,)``."""
     upper = place < 0.5
     visited = ((points >= 0.5) == upper).sum(axis=0)
     coordinate = int(visited.argmin())

@@ -17,22 +17,23 @@ if TYPE_CHECKING:
 _SMALLEST_POPULATION = 4
 """The fewest points in a generation."""
 _POINT = 1e-4
-"""A run has converged if a generation spans less than this share of the cube on every axis."""
+"""Width of a generation, as a share of the cube on every axis, below which a run has converged."""
 
 
 @part("cma-es")
 class CMAES(SequentialSearch):
     """Covariance matrix adaptation inside the unit cube, one point of a generation after the other.
 
-    It starts at the centre of the cube. A run that has converged is followed by one from a random place with twice
-    the population (IPOP; Auger and Hansen 2005). Every point told counts in its generation, also one chosen by hand.
+    It starts at the centre of the cube. If a run has converged, another one starts from a random point with twice the
+    population (IPOP; Auger and Hansen 2005). Every point that is told counts in its generation, even if another search
+    or a person chose it.
 
     Args:
         sigma: standard deviation of the first generation on each axis, in widths of the cube.
-        population: points in a generation; ``4 + floor(3 ln d)`` by default.
+        population: number of points in a generation; ``4 + floor(3 ln d)`` by default.
 
     Raises:
-        InputError: sigma is not positive, the population is below 4, or ``cmaes`` is not installed.
+        InputError: if sigma is not positive, the population is below 4, or ``cmaes`` is not installed.
     """
 
     def __init__(self, sigma: float = 0.3, population: int | None = None) -> None:
@@ -62,7 +63,7 @@ class CMAES(SequentialSearch):
 
     def _learn_generations(self, points: Array, values: Array) -> None:
         if not np.array_equal(values[: len(self._learned)], self._learned, equal_nan=True):
-            self._begin()  # a value has come in late, for a generation that was learned without it
+            self._begin()  # a late value belongs to a generation that was learned without it
         while (last := (first := len(self._learned)) + self._distribution.population_size) <= len(points):
             _learn(self._distribution, points[first:last], values[first:last])
             if self._distribution.should_stop() or (np.ptp(points[first:last], axis=0) < _POINT).all():
@@ -74,13 +75,13 @@ class CMAES(SequentialSearch):
         return _cma_class()(mean=mean, sigma=self.sigma, bounds=bounds, population_size=population)
 
     def _restarted(self, population: int, number: int) -> CMA:
-        # Trial k draws from [seed, k]; the third word keeps the restart's place apart from it.
+        # Trial k draws from [seed, k]; the third number of the seed separates the restart from it.
         rng = np.random.default_rng(np.random.SeedSequence([self._seed, number, 1]))
         return self._started(rng.random(self.dimension), population)
 
 
 def _learn(distribution: CMA, points: Array, values: Array) -> None:
-    """Tell one generation; failures rank behind its worst value, and a generation of failures is left out."""
+    """Tell one generation to CMA-ES; failures rank last, and a generation of failures alone is left out."""
     known = np.isfinite(values)
     if not known.any():
         return

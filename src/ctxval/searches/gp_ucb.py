@@ -15,28 +15,28 @@ from ctxval.gp.surrogate import Surrogate, fit_surrogate
 from ctxval.searches.base import SequentialSearch, best_first
 
 _NEGLIGIBLE = 1e-3
-"""The least promised improvement worth an execution, in standard deviations of the values."""
+"""Least predicted improvement worth an execution, in standard deviations of the values."""
 _KEPT = 500
-"""Points of a long history that the surrogate is fitted to: its hyperparameters are learned anew each time."""
+"""Largest number of points that the surrogate is fitted to; its hyperparameters are learned again each time."""
 
 
 @part("gp-ucb")
 class GPUCB(SequentialSearch):
     """Bayesian optimisation with the GP upper confidence bound (Algorithm 1, eqs. 10 and 11).
 
-    From 1,000 points on the surrogate is fitted to 500 of them: the largest values, the latest, and well-spread ones.
+    From 1,000 points on, the surrogate is fitted to 500 of them: the largest values, the latest, and well-spread ones.
 
     Args:
-        beta: the confidence parameter of eq. 11.
-        initial: how many random points come first.
+        beta: confidence parameter of eq. 11.
+        initial: number of random points at the start.
         kernel: covariance of the surrogate; Matern 3/2 with one length-scale by default.
         noise: bounds of the noise variance relative to that of the values; equal bounds fix it. Widen them for a
             stochastic system.
-        prior_mean: known distance as a function of unit-cube points ``(n, d) -> (n,)``; see
+        prior_mean: prior mean of the distance as a function of unit-cube points ``(n, d) -> (n,)``; see
             :meth:`ctxval.TaskSpace.unit_function`. The mean of the values by default.
 
     Raises:
-        InputError: beta is negative or there is no initial point.
+        InputError: if beta is negative or infinite, or there is no initial point.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class GPUCB(SequentialSearch):
             bound = UpperConfidenceBound(process, self.beta)
             point = maximise(bound, self.dimension, known, rng)
             if bound(point[None])[0] - process.y.max() <= _NEGLIGIBLE:
-                # Converged: the bound promises nothing more, so the rest of the budget explores.
+                # The search has converged: the bound predicts no improvement, so the rest of the budget explores.
                 point = maximise(Uncertainty(process), self.dimension, known, rng)
             return point
 

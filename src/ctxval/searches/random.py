@@ -12,7 +12,7 @@ from ctxval.searches.base import SequentialSearch
 
 @part("random")
 class Random(SequentialSearch):
-    """Independent uniform points: scenario optimisation, SC. Its estimate of d* is the largest distance."""
+    """Independent uniform points: scenario optimisation, SC. The estimate of d* is the largest distance."""
 
     iid = True
 
@@ -23,13 +23,13 @@ class Random(SequentialSearch):
 
 @part("sampling-discarding")
 class SamplingDiscarding(Random):
-    """Independent uniform points of which the largest are left out: sampling and discarding, SD.
+    """Independent uniform points; the estimate of d* leaves out the largest distances: sampling and discarding, SD.
 
     Args:
-        discard: how many of the largest distances the estimate of d* leaves out, the paper's k.
+        discard: number of the largest distances that the estimate of d* leaves out, the paper's k.
 
     Raises:
-        InputError: it is negative.
+        InputError: if discard is negative.
     """
 
     def __init__(self, discard: int = 5) -> None:

@@ -1,4 +1,4 @@
-"""Noisy systems: every task is executed some times, and what is searched is the mean distance."""
+"""Search on a noisy system: every task is executed several times, and the mean distance is maximised."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ctxval.searches.base import BaseSearch, Note, Prediction, Search, Sequentia
 
 @dataclass(frozen=True, eq=False)
 class _Means:
-    """The points of a history, each once, in the order of their first evaluation.
+    """The distinct points of a history, in the order of their first evaluation.
 
     Attributes:
-        points: shape ``(k, d)``.
-        values: mean of the known values of each, ``(k,)``; NaN if there are none.
-        counts: how many evaluations each has, pending and failed ones too, ``(k,)``.
-        first: row of the first evaluation in the history, ``(k,)``.
-        evaluated: row of the first known value among all known ones, ``(k,)``; meaningless if there are none.
-        last: which of them was evaluated last.
+        points: the distinct points, shape ``(k, d)``.
+        values: mean of the known values of each point, ``(k,)``; NaN if there are none.
+        counts: number of evaluations of each point, including pending and failed ones, ``(k,)``.
+        first: row of the first evaluation of each point in the history, ``(k,)``.
+        evaluated: row of the first known value of each point among all known values, ``(k,)``; -1 if there is none.
+        last: index of the point that was evaluated last.
     """
 
     points: Array
@@ -34,6 +34,7 @@ class _Means:
 
     @classmethod
     def of(cls, points: Array, values: Array, slots: Iterable[list[int]]) -> _Means:
+        """Return the means of a history ``(n, d)``, ``(n,)``; ``slots`` are the rows of each distinct point."""
         groups = [np.array(group) for group in slots]
         known = np.isfinite(values)
         order = np.cumsum(known) - 1
@@ -49,16 +50,16 @@ class _Means:
 
 
 class Repeated(SequentialSearch):
-    """A search for the largest mean value of a noisy function: each point that it asks for is evaluated some times.
+    """A search for the largest mean value of a noisy function: it asks for each point several times.
 
-    A point that somebody else chose is repeated as well, if it was evaluated last.
+    It repeats a point that was told by hand as well, if that is the last point of the history.
 
     Args:
-        search: chooses the points; it is told the mean of what is known at each.
-        times: how often each is evaluated.
+        search: the search that chooses the points; it is told the mean of the known values at each point.
+        times: number of evaluations of each point.
 
     Raises:
-        InputError: the search is none, or the number is not positive.
+        InputError: if ``search`` lacks a method of a search, or ``times`` is not positive.
     """
 
     def __init__(self, search: Search, times: int = 3) -> None:
@@ -83,11 +84,11 @@ class Repeated(SequentialSearch):
         return self._inner.uses_prediction
 
     def use_prediction(self, prediction: Prediction | None) -> None:
-        """Take what is expected before the next question, for the search that chooses the points."""
+        """Take the prediction for the search that chooses the points."""
         self._prediction = prediction
 
     def propose(self, rng: np.random.Generator) -> Array:
-        """Return the last point as long as it was not evaluated often enough, then another."""
+        """Return the last point again if it needs more evaluations; else a new point."""
         points = self.points
         means = _Means.of(points, self.values, self._slots.values()) if len(points) else None
         if means is not None and means.counts[means.last] < self.times:
@@ -96,7 +97,7 @@ class Repeated(SequentialSearch):
         if means is not None:
             self._tell(means)
         point = np.asarray(self._inner.ask(1)[0])
-        self._thought = self._inner.note()
+        self._last_note = self._inner.note()
         return point
 
     def _tell(self, means: _Means) -> None:
@@ -107,11 +108,13 @@ class Repeated(SequentialSearch):
         self._inner.use_prediction(None if self._prediction is None else _by_point(self._prediction, known))
 
     def estimate(self, points: Array, values: Array) -> float | None:
-        """Return the estimate of the largest mean from points that were evaluated often enough; None if there are none.
+        """Return the estimate of the largest mean, from the points with at least ``times`` known values.
+
+        Returns None if there are too few such points.
 
         Args:
-            points: of the unit cube, shape ``(n, d)``.
-            values: shape ``(n,)``, finite.
+            points: points of the unit cube, shape ``(n, d)``.
+            values: their values, shape ``(n,)``, finite.
         """
         groups: dict[bytes, list[int]] = {}
         for row, point in enumerate(points):
@@ -122,11 +125,11 @@ class Repeated(SequentialSearch):
 
 
 def _by_point(prediction: Prediction, evaluated: Rows) -> Prediction:
-    """Return a prediction whose rows are those of points, each with one of its evaluations."""
+    """Return a prediction whose rows count distinct points; ``evaluated`` has the row of one evaluation of each."""
     otherwise = prediction.otherwise
 
-    def turn_to() -> Prediction | None:
+    def alternative() -> Prediction | None:
         found = None if otherwise is None else otherwise()
         return None if found is None else _by_point(found, evaluated)
 
-    return replace(prediction, left_out=lambda rows: prediction.left_out(evaluated[rows]), otherwise=turn_to)
+    return replace(prediction, left_out=lambda rows: prediction.left_out(evaluated[rows]), otherwise=alternative)

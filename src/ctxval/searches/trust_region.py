@@ -1,10 +1,11 @@
-"""Trust-region search on a prediction: it executes where large values are predicted, or may be hidden by its errors.
+"""Trust-region search on a prediction: it executes points where the prediction is large, or uncertain.
 
 It maximises the optimistic value ``d_hat(p) exp(g(p)) (1 + kappa w(p))``: the prediction d_hat, corrected by a Gaussian
 process g of its logarithmic discrepancy at known points, and raised in proportion to its doubt w. The prediction is
-trusted inside a box around the best point. The box grows if the prediction was right, and shrinks if it was wrong. If a
-region promises nothing larger, or has missed several times, the next one starts where neither points nor dynamics are
-known.
+trusted inside a box around the best point. The box grows if an execution improves on the best value. It shrinks if an
+execution does not and the prediction was wrong. If no improvement is predicted in a region, or if several executions
+have not improved, a new region starts at the point of the whole cube with the largest optimistic value for a larger
+kappa. A larger kappa favours points where neither values nor dynamics are known.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 _LOG_OFFSET = 1e-3
 """The c of ``log(d + c)`` in the discrepancy, in medians of the known values."""
 _ERROR_OFFSET = 0.1
-"""The same in errors of predictions: small values count little."""
+"""The c of ``log(d + c)`` in errors of predictions, in medians of the known values: small values count little."""
 _LENGTH_SCALE = 0.15
-"""Of the discrepancy's kernel, times the square root of the dimension."""
+"""Length-scale of the discrepancy's kernel, divided by the square root of the dimension."""
 _NOISE = 1e-4
 """Noise variance of the discrepancy, as a share of its variance."""
 _CALIBRATED = 3
-"""Executions from which on the optimism is what they showed."""
+"""Number of executions from which on the optimism is estimated from their errors."""
 _ENGINE = "climb"
-"""The name of this search in notes. Stores have it, so it stays although the class has another name."""
+"""The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
 
 
 @dataclass(frozen=True)
@@ -44,22 +45,22 @@ class TrustRegionSettings:
     """Settings of :class:`TrustRegion` that its studies vary (``benchmarks/study_ablations.py``).
 
     Attributes:
-        correct_discrepancy: whether predictions are corrected by what they got wrong at known points.
+        correct_discrepancy: whether predictions are corrected by their errors at known points.
         compare_with_surrogate: whether a prediction is used only if leave-one-out errors show that it is good.
         restrict: whether there are trust regions; if not, the whole cube is searched each time.
-        accurate: a prediction within this share of the value counts as right.
-        points: the most points looked at for one suggestion, for each dimension.
+        accurate: largest relative error of a prediction that counts as right.
+        points: largest number of points that are predicted for one suggestion, for each dimension.
         first_radius: half the width of a new region.
-        least_radius: a region that is smaller is left.
-        improvement: the least promised improvement worth an execution, as a share of the largest value.
-        patience: how much more optimistic the search is of where a region leads in the end than of its next point.
-        boldness: by how much the optimism grows with each restart that has found nothing larger.
-        most_optimism: the largest optimism that errors of predictions may lead to.
-        compared_from: known values from which on the prediction must be better than the surrogate.
-        compared_on: the most known values, the last ones, on which the two are compared.
-        good_enough: a prediction whose mean error is at most this share needs no comparison.
-        distinct: how far a suggestion is from each known point, in one coordinate at least.
-        apart: how far it is from pending and failed points, as a share of the cube's diagonal.
+        least_radius: half the width below which a region is left.
+        improvement: least predicted improvement worth an execution, as a share of the largest value.
+        patience: factor of the optimism in the test whether a region may still lead to a value larger than all others.
+        boldness: factor by which the optimism grows with each new region that has found nothing larger.
+        most_optimism: upper limit of the optimism that is estimated from errors of predictions.
+        compared_from: number of known values from which on the prediction must be better than the surrogate.
+        compared_on: largest number of known values, the latest ones, on which the two are compared.
+        good_enough: mean error of the logarithm up to which a prediction needs no comparison.
+        distinct: least distance of a suggestion from each known point, in at least one coordinate.
+        apart: least distance of a suggestion from pending and failed points, as a share of the cube's diagonal.
     """
 
     correct_discrepancy: bool = True
@@ -82,14 +83,14 @@ class TrustRegionSettings:
 
 @dataclass(frozen=True, eq=False)
 class _Region:
-    """The state of a trust region, as its notes and values tell it.
+    """The state of a trust region, computed from notes and values.
 
     Attributes:
-        number: from 0.
+        number: the number of the region, from 0.
         radius: half its width; 1 for the whole cube.
-        best, point: its largest value and where that is; minus infinity and None before there is one.
-        misses: executions without improvement, one after the other.
-        stale: regions without improvement of the largest value of all, one after the other.
+        best, point: its largest value and the point with this value; minus infinity and None before there is one.
+        misses: number of successive executions without improvement.
+        stale: number of successive regions that have not improved the largest value of all.
     """
 
     number: int = 0
@@ -100,7 +101,7 @@ class _Region:
     stale: int = 0
 
     def box(self, dimension: int) -> Box:
-        """Return its bounds within the unit cube."""
+        """Return the bounds of the region within the unit cube."""
         centre = np.full(dimension, 0.5) if self.point is None else self.point
         return np.clip(centre - self.radius, 0, 1), np.clip(centre + self.radius, 0, 1)
 
@@ -110,13 +111,13 @@ class TrustRegion(SequentialSearch):
     """Trust-region search with restarts on a prediction of the values; Bayesian optimisation if no prediction is good.
 
     Args:
-        optimism: kappa; by how much a value may exceed its prediction, as a share of it, if the doubt is 1. After
-            three executions it is what they showed, but never less.
-        misses: executions without improvement after which a region is left.
-        settings: what else the search does by default, for studies.
+        optimism: kappa, the relative excess of a value over its prediction that is assumed if the doubt is 1. After
+            three executions it is estimated from their errors, with this value as the lower limit.
+        misses: number of executions without improvement after which a region is left.
+        settings: further settings, for studies; the defaults if None.
 
     Raises:
-        InputError: the optimism is negative, or no miss is allowed.
+        InputError: if the optimism is negative or infinite, or no miss is allowed.
     """
 
     initial = 1
@@ -131,7 +132,7 @@ class TrustRegion(SequentialSearch):
         self._settings = TrustRegionSettings() if settings is None else settings
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this search in a store: its options, and the settings if they are not the usual."""
+        """Return the options that identify this search in a store, and the settings if they are not the defaults."""
         options = {name: value for name, value in vars(self).items() if not name.startswith("_")}
         usual = self._settings == TrustRegionSettings()
         return options if usual else {**options, "settings": asdict(self._settings)}
@@ -144,11 +145,11 @@ class TrustRegion(SequentialSearch):
         self._fallback.reset(dimension, seed)
 
     def use_prediction(self, prediction: Prediction | None) -> None:
-        """Take the prediction for the next question; None if there is none."""
+        """Take the prediction for the point that is asked for next; None if there is none."""
         self._prediction = prediction
 
     def propose(self, rng: np.random.Generator) -> Array:
-        """Return the point that promises most."""
+        """Return the next point: by the first good prediction or, if there is none, by Bayesian optimisation."""
         prediction, why = self._prediction, "there is no prediction"
         while prediction is not None:
             with single_threaded():
@@ -161,8 +162,8 @@ class TrustRegion(SequentialSearch):
         return self._without_prediction(rng, why)
 
     def _without_prediction(self, rng: np.random.Generator, why: str) -> Array:
-        point, thought = self._fallback.choose(self.points, self.values, rng)
-        self._thought = {**thought, "why": why}
+        point, note = self._fallback.choose(self.points, self.values, rng)
+        self._last_note = {**note, "why": why}
         return point
 
     # How good the prediction is
@@ -185,7 +186,7 @@ class TrustRegion(SequentialSearch):
     # Where to execute next
 
     def _promising(self, prediction: Prediction, rng: np.random.Generator) -> Array | None:
-        """Return the next point of the last region, or of a new one; None if nothing is predicted anywhere."""
+        """Return the next point of the last region or of a new one; None if no point can be predicted."""
         settings, optimism = self._settings, self._calibrated()
         value = _OptimisticValue(prediction, self._discrepancy(prediction), optimism)
         if not settings.restrict:
@@ -195,26 +196,26 @@ class TrustRegion(SequentialSearch):
             point = self._best(value, region, rng)
             if point is not None and self._is_worth(value, point, region.best):
                 return self._noted(prediction, point, region)
-        # Ever more weight on what is not known, for as long as nothing larger is found.
+        # The optimism grows with every region that finds nothing larger, so the search explores more.
         bold = replace(value, optimism=optimism * settings.boldness ** (1 + region.stale))
         new = _Region(region.number + 1, settings.first_radius)
         return self._noted(prediction, self._best(bold, _Region(), rng), new)
 
     def _is_worth(self, value: _OptimisticValue, point: Array, best: float) -> bool:
-        """Return whether an execution at ``(d,)`` promises more than a region's best value, and may lead to the top.
+        """Return whether the value at ``(d,)`` may exceed a region's best value and, with more optimism, all values.
 
-        A region elsewhere may lead through lower values, unless that surely leads to nothing larger.
+        A region may be climbed through values below the largest one, unless even this optimism predicts nothing larger.
         """
         patient = replace(value, optimism=self._settings.patience * value.optimism)
         largest = float(np.nanmax(self.values, initial=0.0))
         return self._exceeds(value, point, best) and self._exceeds(patient, point, largest)
 
     def _exceeds(self, value: _OptimisticValue, point: Array, other: float) -> bool:
-        """Return whether an execution at ``(d,)`` promises enough more than another value."""
+        """Return whether the optimistic value at ``(d,)`` is larger than another value by the least improvement."""
         return bool(value(point[None])[0] > other * (1 + self._settings.improvement))
 
     def _discrepancy(self, prediction: Prediction) -> GaussianProcess | None:
-        """Return the GP of ``log(d + c) - log(d_hat + c)`` over the points; None if it is known nowhere."""
+        """Return the GP of ``log(d + c) - log(d_hat + c)`` over the points; None if no point has both values."""
         known = np.isfinite(self.values)
         if not self._settings.correct_discrepancy or not known.any():
             return None
@@ -230,7 +231,7 @@ class TrustRegion(SequentialSearch):
         return condition(Matern(2.5), theta, points[usable], ratio[usable], noise=_NOISE * size)
 
     def _calibrated(self) -> float:
-        """Return kappa: by how much values differed from their predictions, for each unit of doubt."""
+        """Return kappa, estimated as the median difference of log values from log predictions per unit of doubt."""
         errors = [
             abs(np.log(value / note["expected"])) / note["doubt"]
             for value, note in zip(self.values.tolist(), self.notes, strict=True)
@@ -241,7 +242,7 @@ class TrustRegion(SequentialSearch):
         return float(np.clip(np.median(errors), self.optimism, self._settings.most_optimism))
 
     def _best(self, value: _OptimisticValue, region: _Region, rng: np.random.Generator) -> Array | None:
-        """Return the most promising new point in a region; None if nothing is predicted there."""
+        """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
         budget = min(value.prediction.budget, self._settings.points * self.dimension)
         ascent = Ascent(value, *region.box(self.dimension), budget)
         points, promised = ascent.run(best_first(self.points, self.values)[:8], rng)
@@ -249,11 +250,11 @@ class TrustRegion(SequentialSearch):
         return np.asarray(points[np.argmax(new)]) if new.any() else None
 
     def _noted(self, prediction: Prediction, point: Array | None, region: _Region) -> Array | None:
-        """Return the next point of a region, if any, and note what is expected there."""
+        """Return the next point of a region unchanged, and record the prediction for it in the note."""
         if point is None:
             return None
         expected, doubt = prediction.expected(point[None])
-        self._thought = {
+        self._last_note = {
             "engine": _ENGINE,
             "climb": region.number,
             "radius": region.radius,
@@ -302,12 +303,12 @@ class TrustRegion(SequentialSearch):
 
 @dataclass(frozen=True, eq=False)
 class _OptimisticValue:
-    """The value at points that is expected, corrected and raised by its doubt.
+    """The optimistic value of points: the prediction, corrected and raised in proportion to its doubt.
 
     Attributes:
-        prediction: d_hat and w.
-        discrepancy: g; None if it is not used.
-        optimism: kappa.
+        prediction: the prediction d_hat and its doubt w.
+        discrepancy: the correction g; None if it is not used.
+        optimism: the factor kappa of the doubt.
     """
 
     prediction: Prediction
@@ -318,7 +319,7 @@ class _OptimisticValue:
         expected, doubt = self.prediction.expected(points)
         if self.discrepancy is not None:
             mean, variance = self.discrepancy.predict(points)
-            # Where the value is known there is no doubt, whatever may be unknown of what leads to it.
+            # At a point with a known value there is no doubt, even if the dynamics on its trajectory are uncertain.
             expected = expected * np.exp(mean)
             doubt = doubt * np.sqrt(variance / self.discrepancy.kernel.diagonal(self.discrepancy.theta, points))
         return np.asarray(expected * (1 + self.optimism * doubt))
@@ -333,6 +334,6 @@ def _log_error(expected: Array, values: Array) -> float:
 
 
 def _left_out(points: Array, values: Array) -> Array:
-    """Return what the surrogate of the values predicts at each point from all others."""
+    """Return leave-one-out predictions ``(n,)`` by the surrogate of the values."""
     surrogate = fit_surrogate(points, values)
     return np.asarray(surrogate.shift + surrogate.scale * surrogate.process.left_out()[0])
