@@ -1,8 +1,8 @@
-"""Pictures of a campaign. Reads what is known and never executes anything.
+"""Figures of a campaign. The functions only read results and never execute anything.
 
-A function that draws one picture takes ``ax`` and returns the matplotlib axes that it drew into. By default these are
-new axes of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show them. A function that draws several
-panels returns a figure.
+A function that draws one plot has the argument ``ax`` and returns the matplotlib axes. By default, these are new axes
+of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show them. A function that draws several panels
+returns a figure.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _NORMAL_95 = 1.96
 
 
 class Results(Protocol):
-    """What a picture reads: a :class:`ctxval.Campaign`, or anything else that has the same results."""
+    """The results that a figure reads: a :class:`ctxval.Campaign`, or another object with the same results."""
 
     @property
     def validation(self) -> Validation:
-        """The map p -> d(p), of which only the tasks are read."""
+        """The map p -> d(p); only its tasks are read."""
 
     @property
     def trials(self) -> Sequence[Trial]:
@@ -52,7 +52,7 @@ class Results(Protocol):
         """The completed trial with the largest distance."""
 
     def surrogate(self) -> Surrogate:
-        """Return the GP of the distance."""
+        """Return the Gaussian process of the distance."""
 
     def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
         """Return the trajectories of the model and of the system in a trial."""
@@ -70,17 +70,17 @@ class Curve:
 
 
 def overview(campaign: Results, *, units: str = "", ax: Axes | None = None) -> Axes:
-    """Draw what says most about a campaign in one picture.
+    """Draw the most informative single plot of a campaign.
 
-    That is the surrogate if there is one task parameter and two distances are known, and :func:`convergence` otherwise.
+    It is the surrogate if there is one task parameter and two distances are known, and :func:`convergence` otherwise.
 
     Args:
-        campaign: with at least one distance.
-        units: the distance's.
-        ax: drawn into; new ones by default.
+        campaign: a campaign with at least one distance.
+        units: the units of the distance.
+        ax: the axes to draw into; new ones by default.
 
     Raises:
-        InputError: no distance is known.
+        InputError: if no distance is known.
     """
     if campaign.validation.space.dimension == 1 and len(campaign.completed) >= 2:
         return surrogate_slice(campaign, units=units, ax=ax)
@@ -88,15 +88,15 @@ def overview(campaign: Results, *, units: str = "", ax: Axes | None = None) -> A
 
 
 def convergence(campaign: Results, *, units: str = "", ax: Axes | None = None) -> Axes:
-    """Draw the distance of each trial, the largest one so far, and which trials have none.
+    """Draw the distance of each trial and the largest distance so far, and mark the trials without a distance.
 
     Args:
-        campaign: with at least one distance.
-        units: the distance's.
-        ax: drawn into; new ones by default.
+        campaign: a campaign with at least one distance.
+        units: the units of the distance.
+        ax: the axes to draw into; new ones by default.
 
     Raises:
-        InputError: no distance is known.
+        InputError: if no distance is known.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -121,17 +121,17 @@ def convergence(campaign: Results, *, units: str = "", ax: Axes | None = None) -
 def surrogate_slice(
     campaign: Results, axis: int = 0, *, truth: Curve | None = None, units: str = "", ax: Axes | None = None
 ) -> Axes:
-    """Draw the GP along one task parameter, through the worst task executed, with its 95 % band.
+    """Draw the Gaussian process along one task parameter, through the worst executed task, with its 95 % band.
 
     Args:
-        campaign: with at least two distances.
-        axis: which scalar parameter, counted from 0.
-        truth: the true distance, drawn under the GP of a one-dimensional task space.
-        units: the distance's.
-        ax: drawn into; new ones by default.
+        campaign: a campaign with at least two distances.
+        axis: index of the scalar task parameter, from 0.
+        truth: the true distance, which is drawn if the task space has one dimension.
+        units: the units of the distance.
+        ax: the axes to draw into; new ones by default.
 
     Raises:
-        InputError: fewer than two distances are known, or there is no such parameter.
+        InputError: if fewer than two distances are known, or there is no such parameter.
     """
     space = campaign.validation.space
     if not 0 <= axis < space.dimension:
@@ -145,17 +145,18 @@ def surrogate_slice(
 
 
 def surrogate(campaign: Results, *, truth: Curve | None = None, units: str = "") -> Figure:
-    """Draw the GP over the task space with its 95 % band, the samples and the maximum (the paper's converged GP).
+    """Draw the Gaussian process over the task space with its 95 % band, the samples and the maximum.
 
-    One dimension: the whole function. More: a slice along each axis through the worst task.
+    For one task parameter, the figure shows the complete function. For several, it shows a slice along each axis
+    through the worst task. This is the converged Gaussian process in the paper's figures.
 
     Args:
-        campaign: with at least two distances.
-        truth: the true distance, drawn under the GP of a one-dimensional task space.
-        units: the distance's.
+        campaign: a campaign with at least two distances.
+        truth: the true distance, which is drawn if the task space has one dimension.
+        units: the units of the distance.
 
     Raises:
-        InputError: fewer than two distances are known.
+        InputError: if fewer than two distances are known.
     """
     fitted = campaign.surrogate()
     worst = _worst(campaign)
@@ -193,7 +194,7 @@ def _draw_slice(axes: Axes, campaign: Results, fitted: Surrogate, worst: Trial, 
 
 
 def _draw_samples(axes: Axes, campaign: Results, place: Callable[[Trial], float]) -> None:
-    """Draw the known distances at the places of their trials, with a marker for each reason of a trial."""
+    """Draw the known distances of the trials, with a different marker for each origin."""
     styles = (
         ("initial samples", ("iid", "initial", "manual"), "white"),
         ("covering samples", ("covering",), _GREY),
@@ -207,14 +208,14 @@ def _draw_samples(axes: Axes, campaign: Results, place: Callable[[Trial], float]
 
 
 def worst_trajectories(campaign: Results, *, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Figure:
-    """Draw the trajectories of M and of S at the worst task executed.
+    """Draw the trajectories of M and of S for the worst executed task.
 
     Args:
-        campaign: with at least one distance.
+        campaign: a campaign with at least one distance.
         states, inputs: axis labels, with units.
 
     Raises:
-        InputError: no distance is known.
+        InputError: if no distance is known.
     """
     worst = _worst(campaign)
     model, system = campaign.trajectories(worst)
@@ -239,8 +240,8 @@ def trajectories(
     """Draw two trajectories over time, one panel for each state and input.
 
     Args:
-        model, system: of one task.
-        reference: states to follow, ``(H + 1, n)``; a state whose reference is all zero has none drawn.
+        model, system: the two trajectories of one task.
+        reference: the reference of the states, ``(H + 1, n)``; it is drawn for a state if it is not zero everywhere.
         states, inputs: axis labels, with units.
     """
     n, m = model.states.shape[-1], model.inputs.shape[-1]
@@ -266,15 +267,15 @@ def trajectories(
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Write a figure as PNG or SVG, by the ending of the path.
+    """Write a figure as PNG or SVG; the suffix of the path decides.
 
     Raises:
-        InputError: the file cannot be written, or the ending is unknown.
+        InputError: if the file cannot be written, or the suffix is unknown.
     """
     try:
         figure.savefig(path, dpi=150)
     except (OSError, ValueError) as error:
-        raise InputError(f"the picture {path} cannot be written: {error}.") from error
+        raise InputError(f"the figure {path} cannot be written: {error}.") from error
     return Path(path)
 
 
@@ -285,7 +286,7 @@ def _figure(width: float, height: float) -> Figure:
 
 
 def _axes(ax: Axes | None) -> Axes:
-    """Return the axes to draw into: new ones of pyplot if none are given."""
+    """Return the given axes, or new ones of pyplot."""
     if ax is not None:
         return ax
     from matplotlib import pyplot

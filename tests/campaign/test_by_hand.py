@@ -147,7 +147,7 @@ def test_a_folder_that_cannot_be_written_leaves_the_trial_open_and_says_how_to_g
     new(invoke)
     Path("file").write_text("")
     sentence = refused(invoke("ask", "a.sqlite", "--out", "file/inside"))
-    assert "the trial is open, and `ctxval ask STORE --trial 1 --out FOLDER` writes them elsewhere" in sentence
+    assert "The trial is open: `ctxval ask STORE --trial 1 --out FOLDER` writes them to another folder" in sentence
     assert asked(invoke, "a.sqlite", "--trial", "1")["trial"] == 1
 
 
@@ -177,10 +177,10 @@ def test_asking_by_command_chooses_what_a_campaign_chooses(invoke: Any) -> None:
         (["a.sqlite", "--set", "goal"], "as name=value, got 'goal'"),
         (["a.sqlite", "--set", "goal=1", "--set", "goal=2"], "given once"),
         (["a.sqlite", "--set", "goal=one"], "goal must be a number, got 'one'"),
-        (["a.sqlite", "--set", "goal=1", "--draw"], "only one can be given"),
+        (["a.sqlite", "--set", "goal=1", "--draw"], "--set, --draw, --again and --trial cannot be combined"),
         (["a.sqlite", "--trial", "9"], "there is no trial 9"),
-        (["a.sqlite", "--seed", "3"], "is a store, which knows its search and its seed"),
-        (["none.sqlite"], "there is no store at none.sqlite; `ctxval ask FILE.toml --store none.sqlite` makes one"),
+        (["a.sqlite", "--seed", "3"], "is a store and keeps its own settings"),
+        (["none.sqlite"], "there is no store at none.sqlite; `ctxval ask FILE.toml --store none.sqlite` creates one"),
         (["none"], "no case is called 'none'"),
     ],
 )
@@ -192,7 +192,7 @@ def test_what_cannot_be_asked_opens_no_trial(invoke: Any, arguments: list[str], 
 
 def test_a_manual_system_is_not_run(invoke: Any) -> None:
     sentence = refused(invoke("run", "my_rig:experiment", "--store", "a.sqlite"))
-    assert "this system is executed by people, not by run or audit: take tasks with ask" in sentence
+    assert "this system is executed by people, not by run or audit: get tasks with `ctxval ask`" in sentence
     new(invoke)
     assert "executed by people" in refused(invoke("certify", "a.sqlite", "--audit", "3"))
     assert len(Store("a.sqlite").trials()) == 1
@@ -222,8 +222,8 @@ def test_parameters_are_taken_in_every_form_in_which_they_are_printed(texts: lis
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("goal[0]=1.5", "goal must be given whole, goal[1] is missing"),
-        ("goal[0]=1, goal[1]=1, goal=1,1", "goal is given once, whole or by its components"),
+        ("goal[0]=1.5", "goal must be given completely: goal[1] is missing"),
+        ("goal[0]=1, goal[1]=1, goal=1,1", "goal must be given once, either completely or by its components"),
         ("goal[2]=1", "did you mean"),
         ("load[0]=1", "did you mean 'load'"),
         ("load=0.2 rad", "load must be in m/s^2, got '0.2 rad'"),
@@ -323,7 +323,7 @@ def test_why_a_failed_task_is_executed_again_is_kept_and_certified(invoke: Any) 
     assert any("you state why: 'fuse replaced'" in sentence for sentence in report["assumptions"])
     refused = invoke("ask", "a.sqlite", "--because", "oil")
     assert refused.exit_code == 2
-    assert "say --again TRIAL too" in refused.stderr.replace("\n", " ")
+    assert "--because needs --again TRIAL" in refused.stderr.replace("\n", " ")
 
 
 def edit(change: Any) -> None:
@@ -382,6 +382,26 @@ def test_a_start_that_is_elsewhere_can_be_allowed(invoke: Any) -> None:
     assert invoke("tell", "a.sqlite", "0", *given).exit_code == 0
 
 
+def test_a_start_is_held_to_the_tolerance_of_the_experiment(invoke: Any) -> None:
+    Path("my_rig.py").write_text(
+        MODULE.replace("distances.FinalState(),", "distances.FinalState(), start_tolerance=1,")
+    )
+    record(new(invoke)["folder"])
+    edit(with_cell(2, 1, "0.3"))
+    strict = ("run.csv", "--start-tolerance", "0.01")
+    assert "starts elsewhere" in refused(invoke("tell", "a.sqlite", "0", "--trajectory", *strict))
+    assert invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv").exit_code == 0
+    assert "starts elsewhere" in refused(invoke("import", "a.sqlite", *strict, "--set", "goal=1"))
+    assert invoke("import", "a.sqlite", "run.csv", "--set", "goal=1").exit_code == 0
+
+
+def test_options_of_the_experiment_are_set_for_a_new_store(invoke: Any) -> None:
+    Path("my_rig.py").write_text(MODULE.replace("seed):", "seed, steps=20):").replace("horizon=20", "horizon=steps"))
+    folder = asked(invoke, "my_rig:experiment", "--store", "a.sqlite", "--option", "steps=7")["folder"]
+    assert read_task(Path(folder) / "task.json").horizon == 7
+    assert "remove --store, --search, --seed and --option" in refused(invoke("ask", "a.sqlite", "--option", "steps=7"))
+
+
 def test_a_recording_at_other_times_is_resampled_on_request(invoke: Any) -> None:
     report = new(invoke)
     record(report["folder"], substeps=5)
@@ -411,8 +431,8 @@ def test_a_recording_at_other_times_is_resampled_on_request(invoke: Any) -> None
         (["0", "--trajectory", "."], ". cannot be read: it is a folder"),
         (["0", "--trajectory", "no_inputs.csv"], "no_inputs.csv must have the columns of the inputs, force"),
         (["0", "--failed", " "], "--failed needs a reason"),
-        (["0", "--distance", "1", "--resample"], "--resample and --start-tolerance are for a recording"),
-        (["0", "--failed", "x", "--start-tolerance", "0.1"], "are for a recording, and there is none"),
+        (["0", "--distance", "1", "--resample"], "--resample and --start-tolerance need a recording"),
+        (["0", "--failed", "x", "--start-tolerance", "0.1"], "need a recording: give --trajectory or --npz"),
         (["0", "--trajectory", "no_inputs.csv", "--start-tolerance", "nan"], "a finite number >= 0, got nan"),
         (["0", "--trajectory", "no_inputs.csv", "--start-tolerance", "-1"], "a finite number >= 0, got -1.0"),
         (["0", "--npz", "my_rig.py"], "my_rig.py cannot be read as a trajectory"),
@@ -459,7 +479,7 @@ def test_known_runs_come_in_once_with_their_origin(invoke: Any) -> None:
     assert store.trajectory(1, "system") is not None
     assert store.trajectory(2, "system") is None
     one = invoke("import", "a.sqlite", "run.csv", "--set", "goal=0.75")
-    assert "0 imported, 1 were there already" in one.stdout
+    assert "0 runs imported, 1 already in the store" in one.stdout
 
 
 @pytest.mark.parametrize(
@@ -475,7 +495,10 @@ def test_known_runs_come_in_once_with_their_origin(invoke: Any) -> None:
         ),
         ("goal,trajectory\n1,none.csv\n", "line 2: there is no file none.csv"),
         ("goal,distance\n", "runs.csv has no run below its header"),
-        ("goal,distance,goal\n1,2,3\n", "runs.csv must have columns of different names, got goal, distance, goal"),
+        (
+            "goal,distance,goal\n1,2,3\n",
+            "runs.csv must not have two columns of the same name, got goal, distance, goal",
+        ),
         ("", "it has none"),
         ("\x00\x01", "runs.csv"),
     ],

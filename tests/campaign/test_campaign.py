@@ -15,6 +15,7 @@ from ctxval._util.arrays import Array
 from ctxval.certificates import RESOLUTION, farthest_task
 from ctxval.core.trial import Trial
 from ctxval.errors import (
+    CertificateError,
     CtxvalError,
     DistanceError,
     InputError,
@@ -331,6 +332,17 @@ def test_an_audit_adds_independent_draws_until_there_are_so_many(validation: Val
     points = np.array([trial.unit_point for trial in campaign.trials if trial.origin == "iid"])
     assert ((points >= 0) & (points < 1)).all()
     assert len(np.unique(points)) == 6
+
+
+def test_an_audit_refuses_trials_that_people_are_executing(validation: Validation, tmp_path: Path) -> None:
+    campaign, other = (Campaign(validation, store=tmp_path / "a.sqlite") for _ in range(2))
+    opened = [other.ask(), other.ask()]
+    with pytest.raises(CertificateError, match=r"trials are open: 0, 1\. Record their results with `ctxval tell`"):
+        campaign.audit(2)
+    assert len(campaign.trials) == 2
+    for trial in opened:
+        other.tell(trial, failed="stopped")
+    assert origins(campaign.audit(2))[2:] == ["iid"] * 2
 
 
 def test_the_draws_of_a_random_search_are_an_audit_already(validation: Validation) -> None:

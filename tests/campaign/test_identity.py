@@ -159,7 +159,7 @@ def test_a_distance_that_raises_now_changes_nothing(store: Path) -> None:
         raise ZeroDivisionError("no")
 
     before = Store(store).trials()
-    with pytest.raises(DistanceError, match="trial 0 cannot be measured anew, and nothing is changed"):
+    with pytest.raises(DistanceError, match="the distance of trial 0 cannot be computed again, and nothing is changed"):
         campaign(store, make_validation(distance=broken), remeasure=True)
     with pytest.raises(DistanceError, match="nothing is changed"):
         campaign(store).remeasure(broken)

@@ -84,7 +84,7 @@ def test_a_distance_changed_after_ten_executions_is_decided_without_an_eleventh(
     assert refused.exit_code == 2
     assert "ctxval remeasure STORE --experiment" in refused.stderr
     assert answer(invoke("remeasure", "a.sqlite", "--json"))["changed"] == []
-    assert "name it with --experiment" in invoke("remeasure", "a.sqlite").stdout
+    assert "name the file with --experiment" in invoke("remeasure", "a.sqlite").stdout
     report = answer(invoke("remeasure", "a.sqlite", "--experiment", "rig.toml", "--json"))
     assert (report["measured"], report["changed"], report["unmeasured"]) == (10, list(range(10)), [])
     after = Store("a.sqlite").trials()

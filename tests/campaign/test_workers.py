@@ -245,7 +245,7 @@ def test_a_controller_that_cannot_be_sent_is_said_so(tmp_path: Path) -> None:
         ({"executor": 3}, "executor must be one of concurrent.futures, got int"),
         ({"retries": -1}, "retries must be an integer >= 0"),
         ({"retry_failures": True}, "retry_failures must be an integer >= 0"),
-        ({"retry_failures": 1}, "retry_failures is for workers"),
+        ({"retry_failures": 1}, "retry_failures needs workers"),
     ],
 )
 def test_bad_options_are_named(options: dict[str, Any], sentence: str) -> None:

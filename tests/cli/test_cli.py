@@ -9,11 +9,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 from typer.testing import CliRunner, Result
 
 from conftest import make_validation
 from ctxval import Campaign, Store, TaskSpace, Validation, searches
 from ctxval.cli import app
+from ctxval.cli.screen import PANELS
 from ctxval.searches import CMAES
 
 EXPERIMENT = """
@@ -154,8 +156,8 @@ def test_an_experiment_file_runs_and_the_command_line_wins(invoke) -> None:  # t
         (["run", "rig:experiment", "--dim", "3"], "callable with a seed and its options"),
         (["run", "pendulum", "--dim", "3"], "no option of the case 'pendulum' is called 'dim'"),
         (["run", "rig:crashing"], "rig:crashing failed: KeyError"),
-        (["run", "none.toml"], "there is no experiment file none.toml; `ctxval init none.toml` writes one"),
-        (["run", "rig:validation", "--truth"], "truth of 'validation' is not known"),
+        (["run", "none.toml"], "there is no experiment file none.toml; `ctxval init none.toml` writes an example"),
+        (["run", "rig:validation", "--truth"], "the true maximum of 'validation' is not known"),
         (["run", "rig:experiment", "--store", "/proc/none/x.sqlite"], "cannot be used as a store"),
         (["run", "rig:experiment", "--store", "rig.py"], "cannot be read as a store"),
         (["status", "none.sqlite"], "there is no store"),
@@ -205,7 +207,7 @@ def test_a_campaign_that_cannot_go_on_exits_with_3(invoke) -> None:  # type: ign
 def test_an_interrupt_says_how_to_go_on(invoke) -> None:  # type: ignore[no-untyped-def]
     result = invoke("run", "rig:slow")
     assert result.exit_code == 130
-    assert "run the same command to go on" in result.stderr
+    assert "run the same command to resume" in result.stderr
 
 
 def test_a_confidence_that_no_bound_can_have_does_not_lose_the_report(invoke) -> None:  # type: ignore[no-untyped-def]
@@ -296,7 +298,7 @@ def test_every_kind_speaks_to_people(invoke, campaigns: dict[str, Path], kind: s
     assert "It assumes that - the " in text
     assert "verdict" not in text
     assert "version 0.1.0" in text
-    assert "1 other store of this experiment beside this one" in text
+    assert "the folder contains 1 other store of this experiment" in text
 
 
 def test_what_was_executed_falsifies_without_any_certificate(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
@@ -383,8 +385,11 @@ def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: 
             ["--volume", "0.1", "--threshold", "9"],
             "volume is for certificates of the kind anytime or audit or sampling-discarding or scenario",
         ),
-        (["--kind", "audit", "--volume", "0.1"], "may exceed a threshold; say --threshold too"),
-        (["--kind", "convergence", "--constant", "1", "--theorem", "1,2,3,4,5"], "only one can be given"),
+        (["--kind", "audit", "--volume", "0.1"], "--volume needs --threshold"),
+        (
+            ["--kind", "convergence", "--constant", "1", "--theorem", "1,2,3,4,5"],
+            "--constant and --theorem cannot be given together",
+        ),
         (["--confidence", "1e-300"], "the confidence must be strictly between 0 and 1"),
         (["--confidence", "0.1"], "wrong more often than right"),
         (["--audit", "5", "--confidence", "0.1"], "wrong more often than right"),
@@ -443,7 +448,7 @@ def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -
     assert "It rests on the distance being as smooth between the trials as at them" in text
     assert "other store" not in text
     again = invoke(*arguments, "--seed", "1")
-    assert "1 other store of this experiment beside this one: runs/short-gp-ucb-seed0.sqlite" in again.stdout
+    assert "the folder contains 1 other store of this experiment: runs/short-gp-ucb-seed0.sqlite" in again.stdout
     report = json.loads(invoke(*arguments, "--seed", "1", "--json").stdout)
     assert report["other_stores"] == ["runs/short-gp-ucb-seed0.sqlite"]
     assert report["rests_on"].startswith("It rests on")
@@ -483,7 +488,7 @@ def test_an_audit_waits_for_what_people_are_executing(invoke, campaigns: dict[st
     assert invoke("ask", "a.sqlite").exit_code == 0
     result = invoke("certify", "a.sqlite", "--audit", "3")
     assert result.exit_code == 2
-    assert "trials are open: 12; tell how they ended before auditing" in result.stderr.replace("\n", " ")
+    assert "trials are open: 12. Record their results with `ctxval tell`" in result.stderr.replace("\n", " ")
     assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 12
 
 
@@ -504,7 +509,7 @@ def test_a_store_that_no_command_made_cannot_be_audited_but_certified(invoke) ->
     Campaign(make_validation(), store="own.sqlite").run(6)
     result = invoke("certify", "own.sqlite", "--audit", "3")
     assert result.exit_code == 2
-    assert "does not say what was run into it" in result.stderr.replace("\n", " ")
+    assert "the store does not name its experiment" in result.stderr.replace("\n", " ")
     assert invoke("certify", "own.sqlite").exit_code == 0
     assert "there is no store" in invoke("certify", "none.sqlite").stderr
 
@@ -549,7 +554,7 @@ def test_what_is_no_store_is_not_exported(invoke) -> None:  # type: ignore[no-un
     Path("e.toml").write_text('experiment = "pendulum"')
     result = invoke("export", "e.toml")
     assert result.exit_code == 2
-    assert "nothing can be read in e.toml" in result.stderr
+    assert "nothing can be read from e.toml" in result.stderr
     assert not Path("e.export").exists()
 
 
@@ -591,3 +596,21 @@ def test_a_picture_that_cannot_be_written_does_not_hide_the_verdict(invoke) -> N
     report = json.loads(result.stdout)
     assert (report["verdict"], report["pictures"]) == ("falsified", [])
     assert "no pictures" in result.stderr
+
+
+def test_the_help_lists_every_command_in_a_group_and_names_the_glossary(invoke) -> None:  # type: ignore[no-untyped-def]
+    text = invoke("--help").stdout
+    grouped = [name for names in PANELS.values() for name in names]
+    assert sorted(grouped) == sorted(typer.main.get_group(app).commands)
+    places = [text.index(f"─ {panel} ─") for panel in PANELS]
+    assert places == sorted(places)
+    assert "docs/glossary.md" in text
+
+
+def test_every_help_text_is_a_sentence() -> None:
+    for name, command in typer.main.get_group(app).commands.items():
+        texts = [command.help, *(parameter.help for parameter in command.params if parameter.name != "help")]
+        for text in texts:
+            assert text, name
+            assert text[0].isupper(), text
+            assert text.endswith("."), text

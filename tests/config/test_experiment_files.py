@@ -85,7 +85,7 @@ def test_the_file_of_init_passes_its_check(invoke: Any) -> None:
 
 def test_init_overwrites_nothing(invoke: Any) -> None:
     before = Path("experiment.toml").read_bytes()
-    assert "experiment.toml exists already" in sentence(invoke("init"))
+    assert "experiment.toml already exists" in sentence(invoke("init"))
     assert "must" not in invoke("init", "other.toml").stderr
     assert "next: ctxval check 'my rig.toml'" in invoke("init", "my rig.toml").stdout
     assert "ends in .toml" in sentence(invoke("init", "other.ini"))
@@ -98,7 +98,7 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         'type = "Simulated"\nstep = { ref = "experiment_system:step" }',
         'type = "Manual"\nstates = { position = "m", speed = "m/s" }\ninputs = { force = "N" }\ndt = 0.05',
     )
-    target = changed(manual, ("dt = 0.05               # seconds in a step\n", "\n"))
+    target = changed(manual, ("dt = 0.05               # time step in seconds\n", "\n"))
     asked = json.loads(invoke("ask", target, "--store", "a.sqlite", "--json").stdout)
     assert asked["trial"] == 0
     assert invoke("tell", "a.sqlite", "0", "--distance", "0.1").exit_code == 0
@@ -120,7 +120,7 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         ('goal = ["goal", 0.0]', "goal = 3", "goal of [task] must be a list"),
         ('goal = ["goal", 0.0]', "goal = [1.0]", "goal must have 2 components"),
         ('goal = ["goal", 0.0]', 'goal = ["goal[1]", 0.0]', "[task] cannot be used"),
-        ("horizon = 60            # steps", "", "[task] needs horizon"),
+        ("horizon = 60            # number of time steps", "", "[task] needs horizon"),
         ("horizon = 60", "horizonn = 60", "did you mean 'horizon'"),
         ("horizon = 60", "horizon = -1", "horizon must be a positive integer"),
         ("goal = [0.5, 3.0", "goal = [3.0, 0.5", "low < high"),
@@ -326,11 +326,11 @@ def test_dimensions_names_and_units_are_held_against_each_other() -> None:
     validation = make_validation(system=systems.Manual(states={"a": "m"}, inputs={"u": "N"}, dt=0.01))
     found = findings(validation, states=("angle",), inputs=("torque",))
     assert (
-        "its time step is 0.01 s, the task's 0.02 s" in [t for _, t in found.values()][2]
+        "the time step of the system is 0.01 s, that of the task is 0.02 s" in [t for _, t in found.values()][2]
         or found["system"][0] == "failed"
     )
     assert found["system"][0] == "failed"
-    assert found["names"] == ("failed", "there are 2 states, but names for 1: angle")
+    assert found["names"] == ("failed", "there are 2 states, but the number of names is 1: angle")
     assert findings(make_validation())["names"][0] == "noted"
 
 

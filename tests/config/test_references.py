@@ -163,9 +163,9 @@ def test_what_a_function_makes_must_be_a_part_too() -> None:
 def test_pythons_own_library_has_no_parts(name: str) -> None:
     for kind in ("system", "model", "synthesizer", "distance"):
         for given in (name, {"type": name, "args": "id > PWNED", "shell": True}):
-            with pytest.raises(InputError, match="is of Python's standard library"):
+            with pytest.raises(InputError, match="is in Python's standard library"):
                 part(kind, given)
-    with pytest.raises(InputError, match="is of Python's standard library"):
+    with pytest.raises(InputError, match="is in Python's standard library"):
         argument({"ref": name})
 
 
@@ -289,7 +289,7 @@ def test_a_command_from_another_folder_finds_what_the_file_names(here: Path) -> 
 def test_modules_of_one_name_from_two_folders_are_not_mixed_up(here: Path) -> None:
     one, two = described(here / "one", "1.0"), described(here / "two", "2.0")
     assert step_of(load(one)) == 1.0
-    with pytest.raises(InputError, match=r"a module named 'step_here' is in use already, .*one.step_here\.py, and"):
+    with pytest.raises(InputError, match=r"a module named 'step_here' is already in use, .*one.step_here\.py, and"):
         load(two)
     assert step_of(load(one)) == 1.0
     (here / "two" / "step_here.py").unlink()
@@ -309,7 +309,7 @@ def test_modules_that_modules_import_are_not_mixed_up_either(here: Path) -> None
         (here / folder / "helper_here.py").write_text(f"value = {folder!r}\n")
         (here / folder / f"{name}.py").write_text("from helper_here import value\n")
     assert reference("step_here:value", here / "one") == "one"
-    with pytest.raises(InputError, match="a module named 'helper_here' is in use already"):
+    with pytest.raises(InputError, match="a module named 'helper_here' is already in use"):
         reference("parts_here:value", here / "two")
     (here / "three").mkdir()
     (here / "three" / "parts_here.py").write_text("value = 'three'\n")
@@ -333,7 +333,7 @@ def test_a_module_called_like_one_of_python_is_found_where_it_is_meant(here: Pat
     assert reference("this:value", here) == 3
     sys.modules.pop("this")
     (here / "json.py").write_text("value = 3\n")
-    with pytest.raises(InputError, match="a module named 'json' is in use already"):
+    with pytest.raises(InputError, match="a module named 'json' is already in use"):
         reference("json:value", here)
 
 
@@ -373,6 +373,6 @@ def test_where_to_seek_is_no_setting_of_a_file(here: Path) -> None:
 
 def test_a_missing_file_says_how_to_begin(here: Path) -> None:
     with pytest.raises(
-        InputError, match=r"there is no experiment file a b\.toml; `ctxval init 'a b\.toml'` writes one"
+        InputError, match=r"there is no experiment file a b\.toml; `ctxval init 'a b\.toml'` writes an example"
     ):
         read_settings("a b.toml", {})

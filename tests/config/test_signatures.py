@@ -245,10 +245,10 @@ def test_a_store_of_another_user_is_asked_about_once(
     rig_store(folder)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("other")))
     said = refusal("ask", "a.sqlite")
-    assert f"experiment = 'my_rig:experiment', sought in '{folder}'" in said
+    assert f"experiment = 'my_rig:experiment', from the folder '{folder}'" in said
     assert not Path("imported.txt").exists()
-    assert "a.sqlite is signed for you now" in done("ask", "a.sqlite", "--trust").stderr
-    assert "signed" not in done("ask", "a.sqlite").stderr
+    assert "a.sqlite now carries your signature" in done("ask", "a.sqlite", "--trust").stderr
+    assert "signature" not in done("ask", "a.sqlite").stderr
     # and its first user is not asked either
     monkeypatch.setenv("XDG_STATE_HOME", str(state_folder))
     done("tell", "a.sqlite", "0", "--distance", "0.1")
@@ -308,7 +308,7 @@ def test_where_code_is_sought_is_known_of_settings_from_python_too(folder: Path)
 def test_a_store_without_code_is_anybodys(folder: Path) -> None:
     store_with({**PLAIN, SIGNATURES: ["0" * 64, 3, None, "é"]})
     done("tell", "a.sqlite", "0", "--distance", "0.1")
-    assert "--experiment and --trust are for a store" in refusal("ask", "pendulum", "--trust")
+    assert "--experiment and --trust need a store as the first argument" in refusal("ask", "pendulum", "--trust")
     settings = read_settings("linear", {"search": "random", "threshold": 99.0})
     settings.campaign(settings.load(), Path("p.sqlite")).run(budget=2)
     kept = Store("p.sqlite").settings()
@@ -335,7 +335,7 @@ def test_an_experiment_that_was_moved_is_named_where_it_is_now(folder: Path) -> 
     os.chdir("new")
     said = refusal("ask", "a.sqlite")
     assert f"no module named 'my_rig' is in {folder / 'old'}" in said
-    assert "which is no folder any more: name the experiment where it is now, --experiment FILE.toml" in said
+    assert "which does not exist any more: name the experiment at its present place with --experiment FILE.toml" in said
     Path("my_rig.py").write_text(MODULE.format(sentinel="imported.txt"))
     done("ask", "a.sqlite", "--experiment", "my_rig:experiment")
     done("ask", "a.sqlite")
@@ -380,7 +380,7 @@ def test_what_the_user_names_may_be_of_an_installed_package(site: Path) -> None:
     Store("a.sqlite").keep_settings(trust.unsigned(Store("a.sqlite").settings()))
     said = refusal("ask", "a.sqlite")  # it is not any more
     assert "distance = 'Speed'; search = {'name': 'corners', 'repeats': 1}" in said
-    assert "is signed for you now" in done("ask", "a.sqlite", "--trust").stderr
+    assert "now carries your signature" in done("ask", "a.sqlite", "--trust").stderr
     done("ask", "a.sqlite")
 
 
@@ -404,8 +404,8 @@ def test_naming_the_experiment_replaces_what_the_store_names(folder: Path) -> No
     rig_store(folder)
     Store("a.sqlite").keep_settings({**Store("a.sqlite").settings(), "experiment": "evil:experiment"})
     named = ("--experiment", "my_rig:experiment")
-    assert "only one can be given" in refusal("ask", "a.sqlite", *named, "--trust")
-    assert "is signed for you now" in done("tell", "a.sqlite", "0", "--distance", "0.1", *named).stderr
+    assert "--trust and --experiment cannot be given together" in refusal("ask", "a.sqlite", *named, "--trust")
+    assert "now carries your signature" in done("tell", "a.sqlite", "0", "--distance", "0.1", *named).stderr
     assert Store("a.sqlite").settings()["experiment"] == "my_rig:experiment"
     done("ask", "a.sqlite")
     assert not Path("PWNED").exists()
@@ -451,12 +451,12 @@ def _toml(value: Any) -> str:
 def test_only_an_audit_builds_anything(folder: Path) -> None:
     store_with(HOSTILE)
     for option in (("--trust",), ("--experiment", "pendulum")):
-        assert "are for an --audit" in refusal("certify", "a.sqlite", *option)
+        assert "--trust and --experiment need --audit" in refusal("certify", "a.sqlite", *option)
 
 
 def test_what_is_trusted_must_still_be_a_part(folder: Path) -> None:
     store_with(HOSTILE)
-    assert "is of Python's standard library" in refusal("tell", "a.sqlite", "0", "--distance", "0.1", "--trust")
+    assert "is in Python's standard library" in refusal("tell", "a.sqlite", "0", "--distance", "0.1", "--trust")
     assert not Path("PWNED").exists()
 
 
@@ -536,7 +536,7 @@ def test_without_a_place_for_the_key_stores_are_unsigned(folder: Path, state_fol
     assert SIGNATURES not in Store("a.sqlite").settings()
     refusal("ask", "a.sqlite")
     said = done("ask", "a.sqlite", "--trust").stderr
-    assert "cannot be signed for you, and you will be asked again: the key in" in said
+    assert "cannot carry your signature, and the question will be asked again: the key in" in said
 
 
 def test_a_user_without_a_home_has_no_key(monkeypatch: pytest.MonkeyPatch) -> None:

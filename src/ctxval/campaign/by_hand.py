@@ -1,4 +1,4 @@
-"""Trials that people execute: the files that they take with them, and the recordings that they bring back."""
+"""Trials that people execute: the files of the task and controller, and the recordings of the results."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from ctxval.errors import InputError
 _RESULTS = ("trajectory", "distance", "failed")
 
 _MOST_TABLE = 16 * 2**20
-"""Bytes that a table of runs may have."""
+"""Largest size of a table of runs in bytes."""
 
 
 def write_files(folder: Path, experiment: Experiment, opened: OpenTrial) -> list[str]:
-    """Write a trial's task, its controller and what the model expects into a folder; all of them or none.
+    """Write the task, the controller and the model's trajectory of a trial into a folder, either all files or none.
 
-    A controller that is no affine feedback has no file.
+    Only a controller that is affine feedback is written. Returns the names of the files.
 
     Raises:
-        InputError: the folder cannot be written, or there are other files in it.
+        InputError: if the folder cannot be written.
     """
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -51,8 +51,8 @@ def write_files(folder: Path, experiment: Experiment, opened: OpenTrial) -> list
             shutil.rmtree(fresh, ignore_errors=True)
     except OSError as error:
         raise InputError(
-            f"the files of trial {opened.number} cannot be written to {folder}: {error.strerror}; the trial is open, "
-            f"and `ctxval ask STORE --trial {opened.number} --out FOLDER` writes them elsewhere."
+            f"the files of trial {opened.number} cannot be written to {folder}: {error.strerror}. The trial is open: "
+            f"`ctxval ask STORE --trial {opened.number} --out FOLDER` writes them to another folder."
         ) from error
     return names
 
@@ -77,17 +77,17 @@ def _names(experiment: Experiment, plan: Plan) -> tuple[dict[str, str], dict[str
 def read_recording(
     path: Path, experiment: Experiment, plan: Plan, *, npz: bool | None = None, resample: bool = False
 ) -> Trajectory:
-    """Read what happened from a CSV file with named columns, or from an NPZ file.
+    """Read a recorded trajectory from a CSV file with named columns, or from an NPZ file.
 
     Args:
         path: the file.
-        experiment: names the columns.
-        plan: of the trial that it should be of.
-        npz: which kind of file it is; its suffix says so by default.
-        resample: bring it to the task's times.
+        experiment: gives the names of the columns.
+        plan: the plan of the trial.
+        npz: whether it is an NPZ file; by default, the suffix decides.
+        resample: interpolate the recording to the times of the task.
 
     Raises:
-        InputError: the file cannot be read or resampled; the message says what is missing.
+        InputError: if the file cannot be read or resampled; the message says what is missing.
     """
     _require_file(path)
     if path.suffix == ".npz" if npz is None else npz:
@@ -101,7 +101,7 @@ def read_recording(
 
 
 def _require_file(path: Path) -> None:
-    """Say what a reader of the content would say less clearly."""
+    """Refuse a path that is not a readable file, with a clearer message than that of a reader."""
     try:
         found, folder = path.is_file(), path.is_dir()
     except OSError as error:
@@ -112,12 +112,16 @@ def _require_file(path: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class KnownRun:
-    """An execution that was made before.
+    """An earlier execution, as a file describes it.
+
+    Exactly one of ``trajectory``, ``distance`` and ``failed`` is given.
 
     Attributes:
-        where: the file and line that it is from.
-        parameters: of its task.
-        trajectory, distance, failed: one of them: the file of what happened, the distance, why there is no result.
+        where: the file and the line of the description.
+        parameters: the task parameters.
+        trajectory: the file of the recorded trajectory.
+        distance: the distance d(p).
+        failed: the reason why there is no result.
     """
 
     where: str
@@ -127,12 +131,18 @@ class KnownRun:
     failed: str | None = None
 
     def checked(
-        self, validation: Validation, experiment: Experiment, resample: bool, tolerance: float
+        self, validation: Validation, experiment: Experiment, resample: bool, tolerance: float | None
     ) -> KnownExecution:
-        """Return the execution with its recording, if it has one, after a check that it can be taken in.
+        """Return the execution with its recording, if it has one, after all checks; nothing is stored.
+
+        Args:
+            validation: the map p -> d(p).
+            experiment: gives the names of the columns.
+            resample: interpolate the recording to the times of the task.
+            tolerance: the start tolerance; None for that of the validation.
 
         Raises:
-            InputError: it cannot.
+            ExecutionError, InputError: if it is not an execution of this task.
         """
         point = validation.space.point(self.parameters)
         recording = None
@@ -142,13 +152,14 @@ class KnownRun:
 
 
 def read_runs(files: Sequence[Path], parameters: Mapping[str, Any] | None, space: TaskSpace) -> list[KnownRun]:
-    """Read known runs from tables, or from one trajectory whose parameters are given.
+    """Read earlier runs from tables, or from one trajectory if its parameters are given.
 
     A table is a CSV file with a column for each task parameter (``name[0]``, ... for a vector), and the columns
-    trajectory (a file, seen from the table), distance or failed, of which one is filled in each row.
+    trajectory (a path relative to the folder of the table), distance or failed. Each row has a value in exactly one of
+    these three columns.
 
     Raises:
-        InputError: a file cannot be read, or is no such table; the message says what is missing.
+        InputError: if a file cannot be read or is not such a table; the message says what is missing.
     """
     if parameters is not None:
         if len(files) != 1:
@@ -170,10 +181,10 @@ def _table(path: Path, space: TaskSpace) -> list[KnownRun]:
     if missing or not any(name in header for name in _RESULTS):
         raise InputError(
             f"{path} must be a table with the columns {', '.join(space.names)} and one of {', '.join(_RESULTS)}; "
-            f"it has {', '.join(header) or 'none'}. For one trajectory say --set NAME=VALUE."
+            f"it has {', '.join(header) or 'none'}. For one trajectory, give --set NAME=VALUE."
         )
     if len(set(header)) != len(header):
-        raise InputError(f"{path} must have columns of different names, got {', '.join(header)}.")
+        raise InputError(f"{path} must not have two columns of the same name, got {', '.join(header)}.")
     if not rows:
         raise InputError(f"{path} has no run below its header.")
     return [_run(path, line, row, space) for line, row in rows]
@@ -206,24 +217,25 @@ _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)", re.D
 def parameters_from(settings: Sequence[str], space: TaskSpace) -> dict[str, Any]:
     """Return task parameters from texts, in every form in which the command line prints them.
 
-    ``goal=1.5``, ``goal = 1.5 rad``, ``goal=[1.5, 0.5]``, ``goal=1.5,0.5``, ``goal[0]=1.5`` with every other component,
-    and several in one text: ``goal = 1.5, load = 0.2``.
+    The forms are ``goal=1.5``, ``goal = 1.5 rad``, ``goal=[1.5, 0.5]``, ``goal=1.5,0.5``, ``goal[0]=1.5`` together with
+    every other component, and several parameters in one text: ``goal = 1.5, load = 0.2``.
 
     Raises:
-        UnknownNameError: there is no such parameter.
-        InputError: a text is no such thing, a unit is not the parameter's, a component is missing or given twice.
+        UnknownNameError: if there is no such parameter.
+        InputError: if a text has another form, if a unit is not that of the parameter, or if a component is missing or
+            given twice.
     """
     found: dict[str, Any] = {}
     for text in settings:
         for name, value in _assignments(text):
             if name in found:
-                raise InputError(f"a task parameter is given once, as name=value, got {text!r}.")
+                raise InputError(f"each task parameter must be given once, as name=value, got {text!r}.")
             found[name] = _value(name, value, space)
     return _whole(found, space)
 
 
 def _assignments(text: str) -> Iterator[tuple[str, str]]:
-    """Yield names and values; what follows a comma without a name is a further value."""
+    """Yield names and values; a text after a comma that has no name is a further value of the last name."""
     open_name, values = "", list[str]()
     for part in text.split(","):
         name, equals, value = part.partition("=")
@@ -234,12 +246,12 @@ def _assignments(text: str) -> Iterator[tuple[str, str]]:
         else:
             values.append(part)
         if not open_name:
-            raise InputError(f"a task parameter is given once, as name=value, got {text!r}.")
+            raise InputError(f"each task parameter must be given once, as name=value, got {text!r}.")
     yield open_name, ",".join(values)
 
 
 def _value(name: str, text: str, space: TaskSpace) -> float | list[float]:
-    """Return a number or several, with the parameter's unit or without."""
+    """Return the number or the list of numbers in a text, which may have the unit of the parameter."""
     base = name if name in space.units else name.partition("[")[0]
     listed = text.strip()
     if listed.startswith("["):
@@ -263,10 +275,10 @@ def _quantity(name: str, text: str, unit: str) -> float:
 
 
 def _whole(given: Mapping[str, Any], space: TaskSpace) -> dict[str, Any]:
-    """Return values by parameter, vectors of which single components were given put together.
+    """Return values by parameter, with the single components of a vector put together.
 
     Raises:
-        InputError: a component is missing, or its vector is given too.
+        InputError: if a component is missing, or if its vector is given too.
     """
     found = {name: value for name, value in given.items() if name in space.units or name not in space.names}
     for name in {name.partition("[")[0]: None for name in given if name not in found}:
@@ -274,8 +286,8 @@ def _whole(given: Mapping[str, Any], space: TaskSpace) -> dict[str, Any]:
         components = space.names[columns] if isinstance(columns, slice) else ()
         missing = [component for component in components if component not in given]
         if name in found:
-            raise InputError(f"--set: {name} is given once, whole or by its components.")
+            raise InputError(f"--set: {name} must be given once, either completely or by its components.")
         if missing:
-            raise InputError(f"--set: {name} must be given whole, {', '.join(missing)} is missing.")
+            raise InputError(f"--set: {name} must be given completely: {', '.join(missing)} is missing.")
         found[name] = [given[component] for component in components]
     return found

@@ -1,4 +1,4 @@
-"""The campaign: a search for the worst task, with budget, failures and storage."""
+"""The campaign: a search for the worst task with a budget, in which failures are data and all trials are stored."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ctxval._util.arrays import Array
 from ctxval.campaign import display, remeasuring
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.identity import description_of, identify, search_of
-from ctxval.campaign.known import KnownExecution, TrialResult, check_known, told_distance
+from ctxval.campaign.known import KnownExecution, TrialResult, check_known, measurement_of
 from ctxval.campaign.results import CampaignResults
 from ctxval.campaign.trials import Choice, OpenTrial, TrialRecorder
 from ctxval.campaign.workers import WorkerPool, worker_pool
@@ -24,7 +24,7 @@ from ctxval.core.distance import Distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
-from ctxval.errors import InputError
+from ctxval.errors import CertificateError, InputError
 from ctxval.searches import Search
 from ctxval.storage.store import Store
 
@@ -32,26 +32,25 @@ __all__ = ["Campaign", "OpenTrial"]
 
 
 class Campaign(CampaignResults):
-    """A search for the worst task, with everything stored before and after each execution.
+    """A search for the worst task, with every trial stored before and after its execution.
 
-    The budget is a total: running again resumes, and a resumed campaign makes the choices that it would have made
-    without the interruption.
+    The budget is a total: running again resumes the campaign. A resumed campaign makes the same choices as an
+    uninterrupted one.
 
     Args:
         validation: the map p -> d(p).
-        search: chooses the tasks. If it is not given, a new store has ``auto``, as on the command line, and an existing
-            one goes on with the search that it was made with.
-        store: file of the trials; in memory by default.
-        seed: of the search's randomness, not negative.
-        name: what the store calls the experiment.
-        accept_change: why a difference from the experiment that the store was made by does not matter, or what was
-            repaired on the system; it is kept in the store.
-        remeasure: measure the distance of all stored executions anew, if the store has those of another distance.
+        search: chooses the tasks. By default, it is ``auto`` for a new store and the stored search for an existing one.
+        store: the store of the trials, or the path of its file; in memory by default.
+        seed: the seed of the random numbers of the search, an integer >= 0.
+        name: the name of the experiment in the store.
+        accept_change: the reason why the experiment may differ from the one that made the store, for example a repair
+            of the system. The store keeps the reason.
+        remeasure: recompute the distances of all stored executions, because the distance function was changed.
 
     Raises:
-        InputError: a value cannot be used.
-        DistanceError: a stored execution cannot be measured anew; nothing is changed.
-        StoreError: the store cannot be used, was made by another experiment, or has a search that must be given.
+        InputError: if a value cannot be used.
+        DistanceError: if the distance of a stored execution cannot be recomputed; nothing is changed.
+        StoreError: if the store cannot be used, if another experiment made it, or if its search must be given.
     """
 
     def __init__(
@@ -92,17 +91,23 @@ class Campaign(CampaignResults):
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
     ) -> Verdict:
-        """Return whether M may be trusted up to a threshold tau, in the distance's units.
+        """Return whether the model can be trusted up to a threshold tau.
 
-        Falsified by an executed counterexample, validated by a certificate with this confidence, undecided otherwise;
-        then it says what is expected to decide.
+        The model is falsified if an executed distance exceeds the threshold, and validated if a certificate bounds d*
+        by the threshold. Otherwise the verdict is undecided, with a forecast of the executions that would decide.
 
         Args:
-            threshold: tau.
-            confidence: of a validation.
+            threshold: tau, in the units of the distance.
+            confidence: the confidence level of the certificate.
             stochastic: whether two executions of one task may differ.
-            resolution: how far from every trial a task may be, in diagonals of the task space, for a validation.
-            certificate: by which certificate, in place of the posterior bound with these options.
+            resolution: the largest distance between a task and its nearest trial that a validation permits, in
+                diagonals of the task space.
+            certificate: the kind and the options of the certificate, in place of the posterior bound with the three
+                options above.
+
+        Raises:
+            InputError: if the threshold is not a positive number, or the confidence is below 0.5.
+            CertificateError: if an option of the certificate is not valid.
         """
         chosen = certificate or CertificateOptions.posterior(confidence, stochastic=stochastic, resolution=resolution)
         known = Provenance.of(self.store.description(), self.store.history())
@@ -122,28 +127,30 @@ class Campaign(CampaignResults):
         retries: int = 2,
         retry_failures: int = 0,
     ) -> Campaign:
-        """Execute until ``budget`` executions have ended in all, earlier ones counted.
+        """Execute tasks until the total number of executions is ``budget``, including earlier ones.
 
-        A failed execution is a failed trial and counts; the campaign goes on. With many workers a new task is chosen
-        as soon as one is free, while the search knows which are being executed; what it chooses then depends on which
-        of them ended first. Ctrl-C ends after the running executions, a second one at once; both can be resumed.
+        A failed execution is a failed trial. It counts, and the campaign continues. With several workers, a new task is
+        chosen as soon as a worker is free. The search knows the tasks that are being executed, and its choice depends
+        on the order in which executions end. Ctrl-C stops the campaign after the running executions, and a second
+        Ctrl-C stops it at once; in both cases, the campaign can be resumed.
 
         Args:
             budget: total number of executions of S.
             on_trial: called with each trial that has ended.
-            until: asked before each execution; the campaign stops early once it answers yes.
-            workers: processes of this computer, each with its own copy of the system; or how many executions the
-                executor is given at a time.
-            executor: of ``concurrent.futures``, in place of own processes.
-            timeout: seconds after which an execution has failed; it then runs in a process of its own.
-            retries: how often the execution of a trial is repeated whose worker was lost.
-            retry_failures: how often it is repeated if the system itself failed.
+            until: called before each execution; the campaign stops early if it returns True.
+            workers: number of processes, each with its own copy of the system; with an executor, the number of
+                executions that it has at a time.
+            executor: an executor of ``concurrent.futures`` that replaces these processes.
+            timeout: time limit of an execution in seconds; a longer execution has failed. With a time limit, the
+                system is executed in a separate process.
+            retries: largest number of repetitions of an execution if its worker is lost.
+            retry_failures: largest number of repetitions of an execution if the system fails.
 
         Raises:
-            InputError: a value cannot be used, or the system cannot be sent to the workers.
-            ModelError, DesignError, DistanceError: the task, the model or the distance cannot be used. What was
-                executed is stored; running again goes on behind the trial that failed.
-            CampaignError: the workers are gone.
+            InputError: if a value cannot be used, or the system cannot be sent to the workers.
+            ModelError, DesignError, DistanceError: if the task, the model or the distance cannot be used. All
+                executions are stored, and running again continues after the trial that failed.
+            CampaignError: if there are no workers any more.
         """
         total = _count("budget must be a positive integer", budget)
         by_search = Choice(planned_draws=total if until is None else 0)
@@ -153,7 +160,7 @@ class Campaign(CampaignResults):
 
         pool, retry = self._pool(workers, executor, timeout), RetryPolicy(retries, retry_failures)
         if retry_failures and pool is None:
-            raise InputError("retry_failures is for workers, an executor or a timeout, and none is given.")
+            raise InputError("retry_failures needs workers, an executor or a timeout.")
         return self._execute(Schedule(self._recorder, rule, total), pool, on_trial, retry)
 
     def run_until_decided(
@@ -170,21 +177,22 @@ class Campaign(CampaignResults):
         executor: cf.Executor | None = None,
         timeout: float | None = None,
     ) -> Campaign:
-        """Execute until the verdict on a threshold is reached, or the budget is spent.
+        """Execute tasks until the model is validated or falsified for a threshold, or the budget is spent.
 
-        If the posterior bound keeps the threshold, and only tasks that nothing came near to stand in the way, those
-        are executed, as long as the budget suffices for all of them; otherwise the search chooses the next task.
+        If the posterior bound is at most the threshold but some tasks are too far from all trials, and if the budget
+        suffices for all of these tasks, then they are executed. Otherwise the search chooses the next task.
 
         Args:
-            threshold: tau, in the distance's units.
-            budget: total number of executions of S, at most.
+            threshold: tau, in the units of the distance.
+            budget: largest total number of executions of S, including earlier ones.
             on_trial: called with each trial that has ended.
-            confidence, stochastic, resolution, certificate: as in :meth:`verdict`; it must be the posterior bound.
+            confidence, stochastic, resolution, certificate: as in :meth:`verdict`; the certificate must be the
+                posterior bound.
             workers, executor, timeout: as in :meth:`run`.
 
         Raises:
-            InputError, ModelError, DesignError, DistanceError, CampaignError: as :meth:`run` does.
-            CertificateError: the confidence is not a probability.
+            InputError, ModelError, DesignError, DistanceError, CampaignError: as in :meth:`run`.
+            CertificateError: if an option of the certificate is not valid.
         """
         total = _count("budget must be a positive integer", budget)
         by = certificate or CertificateOptions.posterior(confidence, stochastic=stochastic, resolution=resolution)
@@ -194,7 +202,7 @@ class Campaign(CampaignResults):
             now = stopping.decide(self.trials, total - self.executions)
             if now.decided:
                 return None
-            # What is found decides how many draws there are, so their number is not planned.
+            # The results decide when the campaign ends, so the number of independent draws is not planned.
             return Choice(now.next_point, "covering", planned_draws=0)
 
         pool = self._pool(workers, executor, timeout)
@@ -209,16 +217,19 @@ class Campaign(CampaignResults):
         executor: cf.Executor | None = None,
         timeout: float | None = None,
     ) -> Campaign:
-        """Execute independent uniform draws of tasks, whatever the search, until there are so many among the trials.
+        """Execute independent uniform draws of tasks until the trials contain this number of them.
+
+        The search does not choose these tasks.
 
         Args:
-            draws: total number of independent draws.
+            draws: total number of independent draws, including earlier ones.
             on_trial: called with each trial that has ended.
             workers, executor, timeout: as in :meth:`run`.
 
         Raises:
-            InputError: the number is not a positive integer.
-            ModelError, DesignError, DistanceError: as :meth:`run` does.
+            InputError: if the number is not a positive integer.
+            CertificateError: if people are executing open trials.
+            ModelError, DesignError, DistanceError: as in :meth:`run`.
         """
         planned = _count("an audit needs a positive number of draws", draws)
 
@@ -226,14 +237,26 @@ class Campaign(CampaignResults):
             drawn = sum(trial.origin == "iid" for trial in self.trials)
             return None if drawn >= planned else Choice(self._recorder.draw(), "iid", planned_draws=planned)
 
-        return self._execute(Schedule(self._recorder, rule), self._pool(workers, executor, timeout), on_trial)
+        pool = self._pool(workers, executor, timeout)
+        self._require_no_open_trials()
+        return self._execute(Schedule(self._recorder, rule), pool, on_trial)
+
+    def _require_no_open_trials(self) -> None:
+        """Refuse open trials that people are executing; an audit itself executes interrupted trials again."""
+        self._recorder.refresh()
+        waiting = [str(trial.number) for trial in self.trials if trial.state == "open" and not trial.attempts]
+        if waiting:
+            raise CertificateError(
+                f"trials are open: {', '.join(waiting)}. Record their results with `ctxval tell` (tell in Python) "
+                "before an audit."
+            )
 
     def _pool(self, workers: int | None, executor: cf.Executor | None, timeout: float | None) -> WorkerPool | None:
         system = self.validation.system
         if getattr(system, "manual", False):
             raise InputError(
-                "this system is executed by people, not by run or audit: take tasks with ask and say what happened "
-                "with tell, in Python or as `ctxval ask` and `ctxval tell`."
+                "this system is executed by people, not by run or audit: get tasks with `ctxval ask` and record the "
+                "results with `ctxval tell` (ask and tell in Python)."
             )
         return worker_pool(system, workers=workers, executor=executor, timeout=timeout)
 
@@ -260,19 +283,19 @@ class Campaign(CampaignResults):
         """Open the next trial: the search's choice, the task with these parameters, or an independent uniform draw.
 
         Args:
-            parameters: of a task that you chose yourself.
-            draw: for an audit.
-            because: what was changed on the system since the task of these parameters was executed before.
-            wait: seconds to wait for another process that is asking.
+            parameters: the parameters of a task that you chose yourself.
+            draw: choose the task by an independent uniform draw, for an audit.
+            because: the change that was made to the system since the task with these parameters was executed before.
+            wait: seconds to wait while another process chooses a task.
 
         Raises:
-            InputError: the parameters are not of the task space.
-            StoreAccessError: another process is running the store.
-            ModelError, DesignError: no controller could be designed and run on the model; the trial is stored as
-                failed and costs no execution.
+            InputError: if the parameters are not in the task space.
+            StoreAccessError: if another process is running the store.
+            ModelError, DesignError: if no controller can be designed and run on the model. The trial is stored as
+                failed and does not count as an execution.
         """
         if because is not None and (parameters is None or not because.strip()):
-            raise InputError('a reason such as "fuse replaced" is given for a task that was executed before.')
+            raise InputError('because needs the parameters of an earlier task and a reason, such as "fuse replaced".')
         with self.store.sole_writer(wait):
             self._recorder.refresh()
             if parameters is not None:
@@ -283,7 +306,7 @@ class Campaign(CampaignResults):
         """Return an open trial again, with its task and controller.
 
         Raises:
-            InputError: there is no such trial, or it is not open.
+            InputError: if there is no such trial, or it is not open.
         """
         self._recorder.refresh()
         trial = self._recorder.open_trial(number)
@@ -298,29 +321,36 @@ class Campaign(CampaignResults):
         failed: str | None = None,
         start_tolerance: float | None = None,
     ) -> Trial:
-        """Record how an open trial, or the one of this number, ended: its trajectory, its distance, or why it failed.
+        """Record the result of an open trial: its trajectory, its distance, or the reason of its failure.
+
+        Args:
+            opened: the open trial, or its number.
+            trajectory: the recorded trajectory.
+            distance: the distance, if there is no recording.
+            failed: the reason why there is no result.
+            start_tolerance: replaces the start tolerance of the validation.
 
         Raises:
-            InputError: not exactly one of them is given, the trial is not open, or the trajectory is of another task.
-            ExecutionError: the trajectory is not a whole execution of the trial's task; the trial stays open.
-            DistanceError: the distance gave no usable number; the execution is stored.
+            InputError: if not exactly one result is given, if the trial is not open, or if the trajectory belongs to
+                another task.
+            ExecutionError: if the trajectory is not a complete execution of the task; the trial stays open.
+            DistanceError: if the distance function gives no usable number; the execution is stored.
         """
         recorder = self._recorder
         recorder.refresh()
         trial = recorder.open_trial(opened.number if isinstance(opened, OpenTrial) else int(opened))
         if isinstance(opened, OpenTrial) and not np.array_equal(opened.trial.unit_point, trial.unit_point):
-            raise InputError(f"this open trial {opened.number} is of another campaign.")
-        told = TrialResult(trajectory, distance, failed)
+            raise InputError(f"the open trial {opened.number} belongs to another campaign.")
+        result = TrialResult(trajectory, distance, failed)
         with recorder.not_executing(trial):
             trial = recorder.open_trial(trial.number)
-            if told.failed is not None:
-                return recorder.fail(trial, told.failed)
-            if told.distance is not None:
-                return recorder.complete(trial, told_distance(told.distance))
+            if result.failed is not None:
+                return recorder.fail(trial, result.failed)
+            if result.distance is not None:
+                return recorder.complete(trial, measurement_of(result.distance))
             plan = opened.plan if isinstance(opened, OpenTrial) else recorder.plan(trial)
-            return recorder.complete(
-                trial, self.validation.accept(plan, told.trajectory, start_tolerance), told.trajectory
-            )
+            measurement = self.validation.accept(plan, result.trajectory, start_tolerance)
+            return recorder.complete(trial, measurement, result.trajectory)
 
     def add(
         self,
@@ -332,20 +362,21 @@ class Campaign(CampaignResults):
         start_tolerance: float | None = None,
         wait: float = 0.0,
     ) -> Trial | None:
-        """Record an execution that was made before, with the origin manual; None if it is in the store already.
+        """Record an earlier execution as a trial with the origin manual. It counts as an execution.
 
-        It counts as an execution.
+        Returns:
+            the trial; None if the execution is already in the store.
 
         Raises:
-            InputError, ExecutionError: as :meth:`tell` does; nothing is stored then.
-            ModelError, DesignError: the task cannot be planned; nothing is stored.
+            InputError, ExecutionError: as in :meth:`tell`; nothing is stored.
+            ModelError, DesignError: if the task cannot be planned; nothing is stored.
         """
         point = self.validation.space.point(parameters)
-        told = TrialResult(trajectory, distance, failed)
-        return self.add_known(check_known(self.validation, point, told, start_tolerance), wait)
+        result = TrialResult(trajectory, distance, failed)
+        return self.add_known(check_known(self.validation, point, result, start_tolerance), wait)
 
     def add_known(self, known: KnownExecution, wait: float = 0.0) -> Trial | None:
-        """Record an execution that ``campaign.known.check_known`` has checked; None if it is in the store already."""
+        """Record an execution after ``campaign.known.check_known``; return None if it is already in the store."""
         return self._recorder.add(known, wait)
 
     def _unit_point(self, parameters: Mapping[str, Any]) -> Array:
@@ -354,17 +385,17 @@ class Campaign(CampaignResults):
     # Measuring again
 
     def remeasure(self, distance: Distance | None = None) -> list[Trial]:
-        """Measure the distance of every stored execution anew, without an execution; return the trials that changed.
+        """Recompute the distances of all stored executions, without an execution; return the trials that changed.
 
-        The values of before stay in the store's history. A distance that was told without a trajectory cannot be
-        measured anew: if the definition has changed, its trial has no distance from then on.
+        The history of the store keeps the earlier values. A distance without a trajectory cannot be recomputed: if the
+        distance function has changed, the trial becomes unmeasured.
 
         Args:
-            distance: the distance from now on; the one of the validation if it is not given.
+            distance: the new distance; by default, that of the validation.
 
         Raises:
-            DistanceError: the distance of a trial that had one cannot be measured any more; nothing is changed.
-            StoreAccessError: another process is running the store.
+            DistanceError: if the distance of a measured trial cannot be computed any more; nothing is changed.
+            StoreAccessError: if another process is running the store.
         """
         return remeasuring.remeasure(self._recorder, distance)
 

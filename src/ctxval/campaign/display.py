@@ -1,4 +1,4 @@
-"""What a person sees of a campaign: a few lines, a table in a notebook, a table of pandas."""
+"""Views of a campaign: as text, as an HTML table, and as a table of pandas."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BEFORE, _AFTER = ("number", "origin", "state"), ("distance", "seconds", "attemp
 
 
 def as_text(campaign: Campaign) -> str:
-    """Return a campaign in five lines: what is searched, by which search, how far it is, the worst task, the store."""
+    """Return a campaign in five lines: the task space, the search, the number of trials, the worst task, the store."""
     return lines(
         call(campaign, campaign.validation.space, name=campaign.name or None, seed=campaign.seed),
         f"search: {shown(campaign.search)}",
@@ -31,7 +31,7 @@ def as_text(campaign: Campaign) -> str:
 
 
 def as_html(campaign: Campaign) -> str:
-    """Return a campaign as an HTML table with the worst task, parameter by parameter."""
+    """Return a campaign as an HTML table, with one row for each parameter of the worst task."""
     worst, units = campaign.worst, campaign.validation.space.units
     parameters = {} if worst is None else worst.parameters
     return table(
@@ -65,11 +65,11 @@ def _worst(campaign: Campaign) -> str:
 def to_dataframe(trials: Sequence[Trial], space: TaskSpace) -> DataFrame:
     """Return one row for each trial: number, origin, state, the task parameters, distance, seconds, attempts, failure.
 
-    A vector parameter has one column for each component, ``name[0], name[1], ...``. A parameter that is called like
-    another column, such as ``distance``, is in the column ``parameters.distance``. What is not known is missing.
+    A vector parameter has one column for each component, ``name[0], name[1], ...``. If a parameter has the name of
+    another column, such as ``distance``, its column is ``parameters.distance``. Unknown values are missing values.
 
     Raises:
-        InputError: pandas is not installed.
+        InputError: if pandas is not installed.
     """
     try:
         from pandas import DataFrame

@@ -1,4 +1,4 @@
-"""The loop over executions: one after the other in this process, or many at a time on workers."""
+"""The loop over executions: one after the other in this process, or several at a time on workers."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ OnTrial = Callable[[Trial], None]
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """How often the execution of one trial is repeated.
+    """Limits on the repetitions of the execution of one trial.
 
     Attributes:
-        retries: if its worker was lost.
-        retry_failures: if the system failed.
+        retries: the largest number of repetitions if the worker is lost.
+        retry_failures: the largest number of repetitions if the system fails.
 
     Raises:
-        InputError: a number is not an integer >= 0.
+        InputError: if a number is not an integer >= 0.
     """
 
     retries: int = 2
@@ -43,13 +43,13 @@ class RetryPolicy:
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """What is executed next: first the trials that were interrupted, then what a rule chooses.
+    """The order of the executions: first the interrupted trials, then the choices of a rule.
 
     Attributes:
-        recorder: of the trials.
-        rule: returns the choice of a new trial; None if there is none as things stand. It is asked again once an
+        recorder: the recorder of the trials.
+        rule: returns the choice of a new trial, or None if there is none at present. It is called again after an
             execution has ended.
-        budget: how many executions there are to be in all; None if the rule alone ends them.
+        budget: the total number of executions; None if only the rule ends the campaign.
     """
 
     recorder: TrialRecorder
@@ -57,7 +57,7 @@ class Schedule:
     budget: int | None = None
 
     def next(self) -> Choice | Trial | None:
-        """Return the choice of a new trial, or a trial that was interrupted; None if nothing is to be executed now."""
+        """Return an interrupted trial, or the choice of a new one; None if there is nothing to execute at present."""
         recorder = self.recorder
         if self.budget is not None and recorder.executions + recorder.executing >= self.budget:
             return None
@@ -65,13 +65,13 @@ class Schedule:
 
 
 def execute_schedule(schedule: Schedule, pool: WorkerPool | None, on_trial: OnTrial | None, retry: RetryPolicy) -> None:
-    """Execute what a schedule says until there is nothing more, as the only process that runs the store.
+    """Execute a schedule to its end, as the only process that runs the store.
 
     Args:
-        schedule: what is executed.
-        pool: workers; None to execute one trial after the other in this process.
+        schedule: the trials to execute.
+        pool: the workers; None to execute one trial after the other in this process.
         on_trial: called with each trial that has ended.
-        retry: how often workers repeat an execution.
+        retry: the limits on repetitions by workers.
     """
     recorder = schedule.recorder
     with recorder.store.sole_writer(), Interrupts() as interrupts, exits_as_exceptions():
@@ -109,7 +109,7 @@ def _measured(validation: Validation, plan: Plan, result: ExecutionResult) -> Me
     """Return the distance of an execution.
 
     Raises:
-        ExecutionError: it failed.
+        ExecutionError: if the execution failed.
     """
     if result.failure is not None:
         raise ExecutionError(result.failure)
@@ -120,13 +120,13 @@ def _measured(validation: Validation, plan: Plan, result: ExecutionResult) -> Me
 
 
 class _ParallelExecution:
-    """Many executions at a time.
+    """Several executions at a time.
 
     Args:
-        schedule: what is executed.
-        pool: who executes it.
+        schedule: the trials to execute.
+        pool: the workers.
         on_trial: called with each trial that has ended.
-        retry: how often an execution is repeated.
+        retry: the limits on repetitions.
     """
 
     def __init__(self, schedule: Schedule, pool: WorkerPool, on_trial: OnTrial | None, retry: RetryPolicy) -> None:
@@ -138,7 +138,7 @@ class _ParallelExecution:
         self.stopped: BaseException | None = None
 
     def run(self, interrupts: Interrupts) -> None:
-        """Keep the workers busy; whatever stops that, first wait for the executions that are running."""
+        """Execute the schedule; if an error stops it, first wait for the running executions."""
         try:
             while True:
                 self._fill_pool(interrupts)
@@ -179,16 +179,16 @@ class _ParallelExecution:
             self.on_trial(ended)
 
     def _lost(self, opened: OpenTrial, reason: str) -> Trial | None:
-        """Repeat an execution whose worker was lost and return None; return its trial, failed, after too many."""
+        """Repeat an execution whose worker was lost and return None; after too many losses, return the failed trial."""
         self.losses[opened.number] += 1
         if self.losses[opened.number] <= self.retry.retries:
             self._repeat(opened)
             return None
-        said = f"the worker was lost {self.losses[opened.number]} times, at last: {reason}"
-        return self.recorder.fail(opened.trial, said)
+        failure = f"the worker was lost {self.losses[opened.number]} times, at last: {reason}"
+        return self.recorder.fail(opened.trial, failure)
 
     def _ended(self, opened: OpenTrial, result: ExecutionResult) -> Trial | None:
-        """Store how an execution ended and return its trial; None if it failed and is repeated."""
+        """Store the result of an execution and return its trial; return None if it failed and is repeated."""
         try:
             measurement = _measured(self.recorder.validation, opened.plan, result)
         except ExecutionError as error:

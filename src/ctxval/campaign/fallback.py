@@ -1,4 +1,4 @@
-"""Fallback files: how an execution ended is kept in a file if its store does not take it."""
+"""Fallback files: the result of an execution is written to a file if its store cannot record it."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from ctxval.errors import CtxvalError
 from ctxval.storage.disks import sync_folder
 
 _MOST_FILES = 1000
-"""Files of one trial that are kept in one folder."""
+"""Largest number of files of one trial in one folder."""
 
 
 def error_with_fallback(
     ended: Trial, trajectory: Trajectory | None, store: Path | None, error: CtxvalError
 ) -> CtxvalError:
-    """Write the fallback file of an execution; return the store's error with a sentence that names the file."""
+    """Write the fallback file of an execution; return the error of the store with a sentence that names the file."""
     if not ended.executed:
         return error
     path = write_fallback(ended, trajectory, store)
     if path is None:
-        return type(error)(f"{error} How trial {ended.number} ended could not be kept either.")
-    how = f"--npz {path}" if trajectory is not None else "--failed or --distance as it says"
+        return type(error)(f"{error} The result of trial {ended.number} could not be written to a file either.")
+    how = f"--npz {path}" if trajectory is not None else "--failed or --distance with the value in the file"
     return type(error)(
-        f"{error} How trial {ended.number} ended is kept in {path}: once the store can take it, "
-        f"say `ctxval tell STORE {ended.number} {how}` before anything else."
+        f"{error} The result of trial {ended.number} is kept in {path}: when the store can be written again, "
+        f"run `ctxval tell STORE {ended.number} {how}` before any other command."
     )
 
 
 def write_fallback(trial: Trial, trajectory: Trajectory | None, store: Path | None) -> Path | None:
-    """Write how a trial ended to a file beside its store, or in the temporary folder if there is no room.
+    """Write the result of a trial to a file next to its store, or to the temporary folder if this is not possible.
 
-    The file is the trajectory as NPZ; if there is none, the distance or the failure as JSON. Files of other attempts
-    stay.
+    The file is the trajectory as NPZ; if there is none, it is the distance or the failure as JSON. Files of other
+    attempts are not overwritten.
 
     Returns:
-        the path of the file; None if it can be written nowhere.
+        the path of the file; None if it cannot be written in either folder.
     """
     stem = "memory" if store is None else store.stem
     ended = {"trial": trial.number, "distance": trial.distance, "failure": trial.failure}

@@ -1,4 +1,4 @@
-"""What a search learns from stored trials: the history that it is told, and a prediction from the trajectories."""
+"""The input of a search from stored trials: its history, and a prediction from the trajectories."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from ctxval.storage.store import Store
 
 
 def history_of(trials: Sequence[Trial]) -> list[Trial]:
-    """Return the trials as a search keeps them: of a point that waits for its value there is one."""
-    told: list[Trial] = []
+    """Return the trials as a search keeps them: a point without a value occurs once, even if it has several trials."""
+    history: list[Trial] = []
     waiting: dict[bytes, int] = {}
     for trial in trials:
         key = trial.unit_point.tobytes()
         if key in waiting:
             slot = waiting[key]
-            told[slot] = replace(trial, note=told[slot].note)
+            history[slot] = replace(trial, note=history[slot].note)
         else:
-            slot = waiting[key] = len(told)
-            told.append(trial)
+            slot = waiting[key] = len(history)
+            history.append(trial)
         if trial.distance is not None:
             del waiting[key]
-    return told
+    return history
 
 
 def predict_from(validation: Validation, store: Store, trials: Sequence[Trial]) -> Prediction | None:
-    """Return the distance that the trajectories executed so far predict; None if they predict nothing.
+    """Return the distance predicted from the executed trajectories; None if no prediction is possible.
 
     Args:
         validation: the map p -> d(p).
-        store: of the trajectories.
-        trials: all of them.
+        store: the store of the trajectories.
+        trials: all trials.
     """
     executed = [
         (trial, trajectory)
@@ -49,19 +49,19 @@ def predict_from(validation: Validation, store: Store, trials: Sequence[Trial]) 
     known = [trial for trial in history_of(trials) if trial.distance is not None]
     if prediction is None or [trial.number for trial in known] == [trial.number for trial, _ in executed]:
         return prediction
-    # A distance that was told alone is a value that the search knows, but no trajectory.
+    # A distance without a recording is a value that the search knows, but there is no trajectory for it.
     row_of = {trial.number: row for row, (trial, _) in enumerate(executed)}
     rows = np.array([row_of.get(trial.number, -1) for trial in known], dtype=np.intp)
     return _by_known_value(prediction, np.array([trial.unit_point for trial in known]), rows)
 
 
 def _by_known_value(prediction: Prediction, points: Array, executed: Rows) -> Prediction:
-    """Return a prediction whose rows are those of the known values.
+    """Return a prediction with one row for each known value.
 
     Args:
-        prediction: its rows are those of the trajectories.
-        points: of the known values, shape ``(n, d)``.
-        executed: row of the trajectory of each, ``(n,)``; -1 if there is none.
+        prediction: a prediction with one row for each trajectory.
+        points: the points of the known values, shape ``(n, d)``.
+        executed: the row of the trajectory of each value, ``(n,)``; -1 if there is none.
     """
 
     def left_out(rows: Rows) -> Array:
@@ -70,7 +70,7 @@ def _by_known_value(prediction: Prediction, points: Array, executed: Rows) -> Pr
         if has_trajectory.any():
             found[has_trajectory] = prediction.left_out(executed[rows[has_trajectory]])
         if not has_trajectory.all():
-            # Nothing was learned from this point, so what is expected there is what would be without it.
+            # Nothing was learned from this point, so leaving it out does not change the prediction there.
             found[~has_trajectory] = prediction.expected(points[rows[~has_trajectory]])[0]
         return found
 

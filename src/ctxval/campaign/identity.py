@@ -1,4 +1,4 @@
-"""Whether a store is of this experiment: its description, and some of what is stored computed anew."""
+"""Checks that a store belongs to an experiment: by its description, and by recomputing some stored results."""
 
 from __future__ import annotations
 
@@ -19,46 +19,46 @@ from ctxval.searches import DEFAULT, NAMES, Repeated, Search, by_name
 from ctxval.storage.store import Store
 
 VERSION = 2
-"""Of descriptions; those of version 0.1.0 have none."""
+"""Version of descriptions; those of ctxval 0.1.0 have none."""
 
 _RECOMPUTED = 1e-4
-"""By how much a recomputed closed loop on the model may differ from the stored one, as a share of each range."""
+"""Largest difference between a recomputed and a stored closed loop on the model, as a fraction of each range."""
 
 _REMEASURED = 1e-6
-"""By how much a distance that is measured again may differ, relative to the larger."""
+"""Largest relative difference between a recomputed and a stored distance."""
 
 _QUESTION = ("name", "seed", "search", "validation.space")
-"""What no reason can make another campaign's trials this one's."""
+"""Parts of the description that must not differ, whatever reason the user gives."""
 
 _DISTANCE = "validation.distance"
 
 
 def description_of(validation: Validation, search: Search, seed: int, name: str) -> dict[str, Any]:
-    """Return what identifies an experiment in a store, as JSON gives it back."""
+    """Return the description that identifies an experiment in a store, in the form that JSON returns."""
     described = {"name": name, "seed": seed, "search": describe(search), "validation": validation.describe()}
     plain: dict[str, Any] = json.loads(json.dumps({**described, "version": VERSION}))
     return plain
 
 
 def search_of(store: Store) -> Search:
-    """Return the search that a store was made with, made again from its description; the default one for a new store.
+    """Return the search of a store, made from its description; the default search for a new store.
 
     Raises:
-        StoreMismatchError: it cannot be made from what the store says of it.
+        StoreMismatchError: if the search cannot be made from its description.
     """
     described = _with_present_names(store.description()).get("search")
     search = by_name(DEFAULT) if described is None else _search_described(described)
     if search is None:
         kind = described.get("type", "unknown") if isinstance(described, dict) else described
         raise StoreMismatchError(
-            f"{store.name} was made with the search {kind!r}, which cannot be made again from what the store says of "
-            "it; open it with that search (search= in Python)."
+            f"{store.name} was made with the search {kind!r}, which cannot be made from its description in the store: "
+            "open the store with that search (search= in Python)."
         )
     return search
 
 
 def _search_described(described: Any) -> Search | None:
-    """Return a ready-made search from its description; None if it is none or has options other than numbers."""
+    """Return a search of this package from its description; None if it is another one or an option is not a number."""
     if not isinstance(described, dict):
         return None
     if described.get("type") == Repeated.__name__:
@@ -66,12 +66,12 @@ def _search_described(described: Any) -> Search | None:
         search: Search | None = None if inner is None or not isinstance(times, int) else Repeated(inner, times)
     else:
         search = _ready_made(described)
-    # A user's own search of the same name, and options that are no numbers, do not come back as they were.
+    # A user's search may have the same name, and options that are not numbers cannot be restored.
     return search if search is not None and _plain(search) == described else None
 
 
 def _ready_made(described: Any) -> Search | None:
-    """Return the search of a description, with those options that are not the default ones."""
+    """Return the search of a description, with the options that differ from the default."""
     if not isinstance(described, dict):
         return None
     kind = next((kind for kind in NAMES.values() if kind.__name__ == described.get("type")), None)
@@ -93,34 +93,34 @@ def _is_numeric(value: Any) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """Return the description of an object as a store gives it back."""
+    """Return the description of an object in the form that a store returns."""
     return json.loads(json.dumps(describe(value)))
 
 
 def with_distance(description: dict[str, Any], distance: Distance) -> dict[str, Any]:
-    """Return a description with another distance; the rest stays as it was described."""
+    """Return a description with another distance and all other parts unchanged."""
     return {**description, "validation": {**description["validation"], "distance": _plain(distance)}}
 
 
 def identify(
     store: Store, validation: Validation, description: dict[str, Any], accept: str | None, remeasuring: bool
 ) -> None:
-    """Write which experiment the trials of a store are of, or check that it is this one.
+    """Describe the experiment in a new store, or check that an existing store belongs to it.
 
-    Besides the descriptions, some stored closed loops on the model and some distances are compared with what is
-    computed now: a model whose weights are private, for example, shows there alone.
+    Besides the descriptions, some stored closed loops on the model and some distances are compared with recomputed
+    ones. Only this detects, for example, that the private weights of a model have changed.
 
     Args:
-        store: of the trials.
-        validation: what is validated now.
-        description: of the experiment now, of :func:`description_of`.
-        accept: why a difference does not matter, or what was repaired; it is kept in the store.
-        remeasuring: whether all distances are about to be measured anew.
+        store: the store of the trials.
+        validation: the present validation.
+        description: the description of the present experiment, from :func:`description_of`.
+        accept: the reason why a difference does not matter, or the repair of the system; the store keeps it.
+        remeasuring: whether all distances will be recomputed next.
 
     Raises:
-        StoreMismatchError: the store was made by another experiment; the message names the first difference and what
-            may be done.
-        InputError: the reason is empty.
+        StoreMismatchError: if another experiment made the store; the message names the first difference and the
+            remedies.
+        InputError: if the reason is empty.
     """
     if accept is not None and not accept.strip():
         raise InputError('accepting a change needs a reason, such as "gripper replaced".')
@@ -148,20 +148,18 @@ def identify(
 
 
 def _with_distance(description: dict[str, Any], stored: dict[str, Any]) -> dict[str, Any]:
-    """Return a description with the distance that the stored values are of."""
+    """Return a description with the distance function of the stored values."""
     return {**description, "validation": {**description["validation"], "distance": stored["validation"]["distance"]}}
 
 
-_LOOP_CHANGED = (
-    "the model, the task or the controller design is another one than the executions were made with: use another store"
-)
+_LOOP_CHANGED = "the model, the task or the controller design has changed since the executions: use another store"
 _OTHER_CHANGED = (
-    "the closed loops on the model are as they were. If that does not matter, or if it is a repair of the system, "
-    'give the reason: --accept-change "WHY" (accept_change= in Python); otherwise use another store'
+    "the closed loops on the model have not changed. If the difference does not matter, or if it is a repair of the "
+    'system, give the reason: --accept-change "REASON" (accept_change= in Python); otherwise use another store'
 )
 _DISTANCE_CHANGED = (
-    "`ctxval remeasure STORE --experiment FILE.toml`, or whatever names the experiment (remeasure=True in Python), "
-    "computes it anew for what was executed, without an execution"
+    "`ctxval remeasure STORE --experiment FILE.toml` (remeasure=True in Python) recomputes the distances without an "
+    "execution; in place of FILE.toml, a case or module:attr can name the experiment"
 )
 
 
@@ -176,15 +174,15 @@ def _require_same_distance(
     if measured is not None:
         raise _mismatch(store, (described or [measured])[0], _DISTANCE_CHANGED)
     if described and accept is None:
-        advice = f'{_DISTANCE_CHANGED}; if it computes the same, --accept-change "WHY" says so'
+        advice = f'{_DISTANCE_CHANGED}; if the distance still computes the same, give --accept-change "REASON"'
         raise _mismatch(store, described[0], advice)
 
 
-# What is computed anew
+# Recomputed results
 
 
 def _samples(trials: Sequence[Trial]) -> list[Trial]:
-    """Return the trials that are looked at: the first, the worst and the last that has ended."""
+    """Return the trials to recompute: the first, the worst and the last that has ended."""
     ended = [trial for trial in trials if trial.executed or trial.state == "open"]
     worst = max((t for t in ended if t.distance is not None), key=lambda t: t.distance or 0.0, default=None)
     chosen = {t.number: t for t in (*ended[:1], *ended[-1:], *([] if worst is None else [worst]))}
@@ -192,7 +190,7 @@ def _samples(trials: Sequence[Trial]) -> list[Trial]:
 
 
 def _changed_loop(store: Store, validation: Validation, trials: Sequence[Trial]) -> str | None:
-    """Return which stored closed loop on the model is not what is computed now; None if all are."""
+    """Return a sentence about a stored closed loop on the model that has changed; None if none has."""
     for trial in _samples(trials):
         stored = store.trajectory(trial.number, "model")
         if stored is None:
@@ -201,7 +199,7 @@ def _changed_loop(store: Store, validation: Validation, trials: Sequence[Trial])
         try:
             now = _loop(validation, trial)
             gap = _gap(stored, now)
-            # What differs from one call to the next, such as a planner that draws, cannot be compared.
+            # Results that differ from one call to the next, such as those of a random planner, cannot be compared.
             if gap > _RECOMPUTED and _gap(now, _loop(validation, trial)) <= _RECOMPUTED:
                 return f"{what} differs from the stored one by {100 * min(gap, 1e6):.2g} % of its range"
         except CtxvalError as error:
@@ -214,7 +212,7 @@ def _loop(validation: Validation, trial: Trial) -> Trajectory:
 
 
 def _gap(one: Trajectory, other: Trajectory) -> float:
-    """Return the largest difference of a state or input, as a share of its range."""
+    """Return the largest difference of a state or input, as a fraction of its range."""
     if one.states.shape != other.states.shape or one.inputs.shape != other.inputs.shape:
         return np.inf
     return max(_relative(one.states, other.states), _relative(one.inputs, other.inputs))
@@ -229,7 +227,7 @@ def _relative(one: Array, other: Array) -> float:
 
 
 def _changed_distance(store: Store, validation: Validation, trials: Sequence[Trial]) -> str | None:
-    """Return which stored distance is not what is measured now; None if all are."""
+    """Return a sentence about a stored distance that has changed; None if none has."""
     for trial in _samples(trials):
         model, system = store.trajectory(trial.number, "model"), store.trajectory(trial.number, "system")
         if trial.distance is None or model is None or system is None:
@@ -239,7 +237,7 @@ def _changed_distance(store: Store, validation: Validation, trials: Sequence[Tri
             now = validation.remeasure(point, model, system)
             again = validation.remeasure(point, model, system)
         except DistanceError as error:
-            return f"the distance of trial {trial.number} cannot be measured any more ({error})"
+            return f"the distance of trial {trial.number} cannot be computed any more ({error})"
         if now == again and not np.isclose(now, trial.distance, rtol=_REMEASURED, atol=1e-12):
             return f"the distance of trial {trial.number} was {trial.distance:.6g} and is now {now:.6g}"
     return None
@@ -252,9 +250,9 @@ _RENAMED = {"Scalar": "BayesianOptimisation", "Climbs": "TrustRegion"}
 
 
 def _with_present_names(stored: dict[str, Any]) -> dict[str, Any]:
-    """Return a stored description in which classes of searches have their present names; the store keeps the old ones.
+    """Return a stored description with the present names of the classes of searches; the store keeps the old ones.
 
-    A search may stand inside another, such as ``Repeated``, or in what the code of a user's search uses.
+    A search may be inside another one, such as ``Repeated``, or in the code of a user's search.
     """
 
     def renamed(value: Any, key: str = "") -> Any:
@@ -272,9 +270,9 @@ def _with_present_names(stored: dict[str, Any]) -> dict[str, Any]:
 
 
 def _as_before(present: dict[str, Any], stored: dict[str, Any]) -> dict[str, Any]:
-    """Return a description so that one of version 0.1.0 can be compared with it; what code it named is not compared.
+    """Return a description that can be compared with one of version 0.1.0, without the descriptions of code.
 
-    That the code computes the same is seen in what is recomputed.
+    The recomputed results show whether the code still computes the same.
     """
     bounds = present["validation"]["space"].items()
     space = {name: bound[:2] if isinstance(bound, list) else bound for name, bound in bounds}
@@ -288,7 +286,7 @@ _CODE = ("function", "constants", "digest", "uses", "code")
 
 
 def _without_code(present: Any, stored: Any) -> Any:
-    """Return the present description with what the stored one says of code."""
+    """Return the present description with the descriptions of code from the stored one."""
     if isinstance(present, dict) and isinstance(stored, dict):
         own = {key: _without_code(value, stored.get(key)) for key, value in present.items() if key not in _CODE}
         return {**{key: value for key, value in stored.items() if key in _CODE}, **own}

@@ -1,4 +1,4 @@
-"""Independent draws of tasks, which a model does not share with the one that was learned after it."""
+"""Independent draws of tasks, which are different for each learned model."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from ctxval.errors import CtxvalError
 from ctxval.storage.store import Store
 
 _AUDIT = 0x6175
-"""Marks the randomness of an audit's draws; searches mark streams of theirs with small numbers."""
+"""Identifies the random stream of an audit; the streams of searches have small numbers."""
 
 
 class IndependentDraws:
-    """The randomness of the independent draws of one campaign.
+    """The random numbers of the independent draws of one campaign.
 
-    It depends on the seed, so that a study can be repeated, and on the model: one that was learned again from what an
-    audit showed would otherwise be audited by the very tasks that it has seen. The store keeps the model's part, so
-    that a campaign goes on the same on another machine.
+    They depend on the seed, so that a study can be repeated. They also depend on the model: otherwise, a model that was
+    learned again with the results of an audit would be audited by the same tasks. The store keeps the number that
+    depends on the model, so that a campaign continues with the same draws on another machine.
 
     Args:
-        store: of the campaign.
-        validation: has the model.
-        seed: of the campaign.
+        store: the store of the campaign.
+        validation: contains the model.
+        seed: the seed of the campaign.
     """
 
     def __init__(self, store: Store, validation: Validation, seed: int) -> None:
@@ -47,7 +47,7 @@ class IndependentDraws:
         return np.random.default_rng(np.random.SeedSequence(entropy)).random(self._validation.space.dimension)
 
     def _of_model(self, trials: Sequence[Trial]) -> list[int]:
-        """Return the model's part; none in stores of version 0.1.0 that have drawn without it."""
+        """Return the number of the model in a list; empty for stores of version 0.1.0 that have draws without it."""
         kept = self._store.draws()
         if kept is None and not any(trial.origin == "iid" for trial in trials):
             self._store.keep_draws(_digest_of_model(self._validation))
@@ -56,9 +56,9 @@ class IndependentDraws:
 
 
 def _digest_of_model(validation: Validation) -> int:
-    """Return a number that another model, one that was learned again for instance, does not share.
+    """Return a number that identifies a model; it changes if the model is learned again.
 
-    Independent draws of tasks depend on it, so that a model is never judged by tasks that the one before it was.
+    Independent draws of tasks depend on it, so that a model is never judged by the tasks of an earlier model.
     """
     space = validation.space
     loops: list[list[Any]] = []

@@ -1,4 +1,4 @@
-"""What people say of executions: how one ended, and executions that were made before the campaign."""
+"""Checks of results that users supply: of open trials, and of executions before the campaign."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ctxval.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class KnownExecution:
-    """An execution that was made before, checked and measured.
+    """An earlier execution, checked and measured.
 
     Attributes:
-        unit_point: of its task, in the unit cube, shape ``(d,)``.
-        plan: of its task.
-        trajectory: what happened; None if the distance or a failure alone is known.
-        measurement: its distance, or why there is none; None if it failed.
-        failed: why it failed; None if it did not.
+        unit_point: the point of the task in the unit cube, shape ``(d,)``.
+        plan: the plan of the task.
+        trajectory: the recorded trajectory; None if only the distance or the failure is known.
+        measurement: the distance, or the reason why there is none; None if the execution failed.
+        failed: the reason of the failure; None if the execution did not fail.
     """
 
     unit_point: Array
@@ -35,12 +35,12 @@ class KnownExecution:
 
     @property
     def distance(self) -> float | None:
-        """Its distance, None if there is none."""
+        """The distance; None if there is none."""
         return None if self.measurement is None else self.measurement.distance
 
     @property
     def failure(self) -> str | None:
-        """Why there is no distance, as a trial says it."""
+        """The reason why there is no distance, as the trial stores it; None if there is a distance."""
         if self.failed is not None:
             return text_of(self.failed)
         return None if self.measurement is None else self.measurement.unusable
@@ -48,15 +48,15 @@ class KnownExecution:
 
 @dataclass(frozen=True, eq=False)
 class TrialResult:
-    """What is told of an execution: exactly one of three things.
+    """The result of an execution, as a user supplies it. Exactly one of the three attributes is given.
 
     Attributes:
-        trajectory: what happened.
-        distance: d(p), if nothing was recorded.
-        failed: why there is no result.
+        trajectory: the recorded trajectory.
+        distance: d(p), if there is no recording.
+        failed: the reason why there is no result.
 
     Raises:
-        InputError: not exactly one of them is given.
+        InputError: if not exactly one of them is given.
     """
 
     trajectory: Trajectory | None = None
@@ -65,23 +65,23 @@ class TrialResult:
 
     def __post_init__(self) -> None:
         if sum(given is not None for given in (self.trajectory, self.distance, self.failed)) != 1:
-            raise InputError("tell needs one of a trajectory, a distance and the reason of a failure.")
+            raise InputError("exactly one of a trajectory, a distance and the reason of a failure must be given.")
 
 
 def check_known(
     validation: Validation, point: Array, result: TrialResult, start_tolerance: float | None = None
 ) -> KnownExecution:
-    """Check and measure an execution that was made before; nothing is stored.
+    """Check and measure an earlier execution; nothing is stored.
 
     Args:
         validation: the map p -> d(p).
-        point: parameters of its task, shape ``(d,)``.
-        result: how it ended.
-        start_tolerance: in place of the validation's own.
+        point: the parameters of the task, shape ``(d,)``.
+        result: the result of the execution.
+        start_tolerance: replaces the start tolerance of the validation.
 
     Raises:
-        ExecutionError, InputError: the result is not one of this task.
-        ModelError, DesignError: the task cannot be planned.
+        ExecutionError, InputError: if the result is not a result of this task.
+        ModelError, DesignError: if the task cannot be planned.
     """
     unit_point = validation.space.to_unit(point)
     plan = validation.plan(validation.space.from_unit(unit_point))
@@ -89,15 +89,15 @@ def check_known(
     if result.trajectory is not None:
         measurement = validation.accept(plan, result.trajectory, start_tolerance)
     elif result.distance is not None:
-        measurement = told_distance(result.distance)
+        measurement = measurement_of(result.distance)
     return KnownExecution(unit_point, plan, result.trajectory, measurement, result.failed)
 
 
-def told_distance(distance: float) -> Measurement:
-    """Return a distance that was told without a trajectory.
+def measurement_of(distance: float) -> Measurement:
+    """Return the measurement of a distance that is given without a trajectory.
 
     Raises:
-        InputError: it is no finite number >= 0.
+        InputError: if it is not a finite number >= 0.
     """
     valid = isinstance(distance, int | float | np.number) and not isinstance(distance, bool)
     if not valid or not (np.isfinite(distance) and distance >= 0):
@@ -106,11 +106,11 @@ def told_distance(distance: float) -> Measurement:
 
 
 def is_execution_of(trial: Trial, known: KnownExecution) -> bool:
-    """Return whether a stored trial is this very execution."""
+    """Return whether a stored trial and a known execution are the same execution."""
     if trial.distance is None or known.distance is None:
         same = trial.distance is known.distance
     else:
-        # A distance that another processor has computed differs in its last digits.
+        # A distance that another type of processor has computed differs in its last digits.
         same = bool(np.isclose(trial.distance, known.distance, rtol=1e-9, atol=0))
     ended = same and trial.failure == known.failure and trial.state != "open"
     return ended and np.array_equal(trial.unit_point, known.unit_point)

@@ -1,4 +1,4 @@
-"""The distances of stored executions computed anew, without an execution."""
+"""Recompute the distances of stored executions, without an execution."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from ctxval.storage.store import Store
 
 
 def remeasure(recorder: TrialRecorder, distance: Distance | None = None) -> list[Trial]:
-    """Measure the distance of every stored execution anew; return the trials that changed.
+    """Recompute the distance of every stored execution; return the trials that changed.
 
     Args:
-        recorder: of the trials.
-        distance: the distance from now on; the one of the validation if it is not given.
+        recorder: the recorder of the trials.
+        distance: the new distance; by default, that of the validation.
 
     Raises:
-        DistanceError: the distance of a trial that had one cannot be measured any more; nothing is changed.
-        StoreAccessError: another process is running the store.
+        DistanceError: if the distance of a measured trial cannot be computed any more; nothing is changed.
+        StoreAccessError: if another process is running the store.
     """
     validation, description = recorder.validation, recorder.description
     if distance is not None:
         validation, description = validation.with_distance(distance), with_distance(description, distance)
     with recorder.store.sole_writer():
-        # Somebody may tell of a trial while distances are computed; they are computed again then.
+        # Another process may record a result meanwhile; the distances are then computed again.
         while (changed := _remeasured(recorder.store, validation, description)) is None:
             pass
     recorder.redefine(validation, description)
@@ -39,7 +39,7 @@ def remeasure(recorder: TrialRecorder, distance: Distance | None = None) -> list
 
 
 def _remeasured(store: Store, validation: Validation, description: dict[str, Any]) -> list[Trial] | None:
-    """Store what is measured anew; return the trials that changed, None if the store has changed meanwhile."""
+    """Store the recomputed distances; return the trials that changed, or None if the store has changed meanwhile."""
     seen = store.signature()
     before = store.trials()
     differing = differences(store.description(), description)
@@ -55,33 +55,33 @@ def _remeasured(store: Store, validation: Validation, description: dict[str, Any
 
 
 def _outcome(trial: Trial) -> dict[str, Any]:
-    """Return what measuring again may change of a trial."""
+    """Return the fields of a trial that a new measurement can change."""
     return {"state": trial.state, "distance": trial.distance, "failure": trial.failure}
 
 
 def _measured_again(store: Store, validation: Validation, trial: Trial, redefined: bool) -> Trial:
-    """Return a trial as it ends once its distance is measured anew.
+    """Return a trial with its recomputed distance.
 
     Args:
-        store: has its trajectories.
-        validation: has the distance.
-        trial: as it is stored.
-        redefined: whether the distance is another one than the stored values are of.
+        store: contains the trajectories.
+        validation: contains the distance function.
+        trial: the stored trial.
+        redefined: whether the distance function differs from the one of the stored values.
 
     Raises:
-        DistanceError: the trial had a distance, which cannot be measured any more.
+        DistanceError: if the trial had a distance that cannot be computed any more.
     """
     if trial.state == "open" or not trial.executed:
         return trial
     model, system = store.trajectory(trial.number, "model"), store.trajectory(trial.number, "system")
     if model is None or system is None:
-        told = trial.distance is not None and redefined
-        return replace(trial, state="unmeasured", distance=None, failure=TOLD_ALONE) if told else trial
+        outdated = trial.distance is not None and redefined
+        return replace(trial, state="unmeasured", distance=None, failure=TOLD_ALONE) if outdated else trial
     try:
         distance = validation.remeasure(validation.space.from_unit(trial.unit_point), model, system)
     except DistanceError as error:
         if trial.distance is not None:
-            sentence = f"trial {trial.number} cannot be measured anew, and nothing is changed: {error}"
+            sentence = f"the distance of trial {trial.number} cannot be computed again, and nothing is changed: {error}"
             raise DistanceError(sentence) from error
         return replace(trial, state="unmeasured", failure=text_of(error))
     return replace(trial, state="completed", distance=distance, failure=None)

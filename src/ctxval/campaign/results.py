@@ -1,4 +1,4 @@
-"""What a campaign has found so far."""
+"""The results of a campaign so far."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 class CampaignResults:
-    """The trials of a campaign and what follows from them; reads alone.
+    """The trials of a campaign and the results that follow from them. Nothing here executes or stores anything.
 
     Args:
-        recorder: of the trials.
+        recorder: the recorder of the trials.
     """
 
     def __init__(self, recorder: TrialRecorder) -> None:
@@ -33,12 +33,12 @@ class CampaignResults:
 
     @property
     def validation(self) -> Validation:
-        """The map p -> d(p), with the distance that is measured now."""
+        """The map p -> d(p), with the present distance function."""
         return self._recorder.validation
 
     @property
     def store(self) -> Store:
-        """Where the trials are."""
+        """The store of the trials."""
         return self._recorder.store
 
     @property
@@ -63,11 +63,11 @@ class CampaignResults:
 
     @property
     def executions(self) -> int:
-        """How many executions of S have ended, well or badly."""
+        """The number of executions of S that have ended, with or without success."""
         return self._recorder.executions
 
     def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
-        """Return the trajectories of the model and of the system in a trial; None for one that is not stored."""
+        """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored."""
         return self.store.trajectory(trial.number, "model"), self.store.trajectory(trial.number, "system")
 
     @property
@@ -79,16 +79,16 @@ class CampaignResults:
     def estimate(self) -> float | None:
         """The search's estimate of d*: the largest distance, unless the search discards some (SD) or repeats its tasks.
 
-        If it repeats them, the estimate is the largest mean distance of a task that was executed that often. It is None
-        if there are too few distances.
+        If the search repeats its tasks, the estimate is the largest mean distance of a task with all its repetitions.
+        It is None if there are too few distances.
         """
         return self._recorder.search.estimate(*self._distances())
 
     def surrogate(self) -> Surrogate:
-        """Return the GP of the distance over the task space, whichever search chose the trials.
+        """Return the Gaussian process of the distance over the task space, for every search.
 
         Raises:
-            InputError: fewer than two distances are known.
+            InputError: if fewer than two distances are known.
         """
         own = self._recorder.search.surrogate()
         return fit_surrogate(*self._distances()) if own is None else own
@@ -97,11 +97,11 @@ class CampaignResults:
         """Return the trials as a table of pandas, one row for each.
 
         The columns are number, origin, state, one for each task parameter (``name[0], name[1], ...`` for a vector),
-        distance, seconds, attempts and failure. A parameter that is called like another column, such as ``distance``,
-        is in the column ``parameters.distance``. What is not known is missing.
+        distance, seconds, attempts and failure. If a parameter has the name of another column, such as ``distance``,
+        its column is ``parameters.distance``. Unknown values are missing values.
 
         Raises:
-            InputError: pandas is not installed.
+            InputError: if pandas is not installed.
         """
         return display.to_dataframe(self.trials, self.validation.space)
 
@@ -109,11 +109,11 @@ class CampaignResults:
         """Draw the surrogate over one task parameter, or else the distances in their order; return the axes.
 
         Args:
-            units: the distance's.
+            units: the units of the distance.
             ax: matplotlib axes to draw into; new ones of ``matplotlib.pyplot`` by default.
 
         Raises:
-            InputError: no distance is known.
+            InputError: if no distance is known.
         """
         return overview(self, units=units, ax=ax)
 

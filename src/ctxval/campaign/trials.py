@@ -1,4 +1,4 @@
-"""The trials of a campaign: opened before an execution, closed with what happened, always known to the search."""
+"""The trials of a campaign: opened before an execution, closed with its result, and passed on to the search."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from ctxval.storage.store import Store
 
 @dataclass(frozen=True, eq=False)
 class OpenTrial:
-    """A trial to be executed, with all that an operator needs for it.
+    """A trial to be executed, with everything that an operator needs for the execution.
 
     Attributes:
-        trial: what is stored.
-        plan: its task, its controller and the model's trajectory.
+        trial: the stored trial.
+        plan: its task, its controller and the trajectory of the model.
     """
 
     trial: Trial
@@ -41,7 +41,7 @@ class OpenTrial:
 
     @property
     def number(self) -> int:
-        """The trial's number."""
+        """The number of the trial."""
         return self.trial.number
 
     def __repr__(self) -> str:
@@ -54,11 +54,11 @@ class Choice:
     """The task of a new trial.
 
     Attributes:
-        unit_point: point of the unit cube, shape ``(d,)``; None if the search is to choose it.
-        origin: why this point was chosen; if the search chooses it, it says so itself.
-        because: what was changed on the system since the task was executed before.
-        planned_draws: how many independent draws there are to be in all, stored with each of them; 0 if what they show
-            ends them, None if it is not known.
+        unit_point: point of the unit cube, shape ``(d,)``; None if the search chooses it.
+        origin: the reason for this point; not used if the search chooses the point.
+        because: the change that was made to the system since the task was executed before.
+        planned_draws: the planned number of independent draws, which is stored with each draw; 0 if the results decide
+            the number, None if it is not known.
     """
 
     unit_point: Array | None = None
@@ -70,20 +70,19 @@ class Choice:
 class TrialRecorder:
     """Opens and closes the trials of one campaign.
 
-    It keeps three things in step: the store, the list of trials and the search, which is told each trial that the
-    store has and no other.
+    It keeps the store, the list of trials and the search consistent: the search knows exactly the trials in the store.
 
     Args:
         validation: the map p -> d(p).
         search: chooses points of the unit cube.
-        store: of the trials; it is known to be of this experiment.
-        seed: of the search.
-        description: of the experiment, as :func:`ctxval.campaign.identity.description_of` gives it.
+        store: the store of the trials, after a check that it belongs to this experiment.
+        seed: the seed of the search.
+        description: the description of the experiment from :func:`ctxval.campaign.identity.description_of`.
 
     Attributes:
         validation, store, description: as above; :meth:`redefine` replaces validation and description.
         search: with the optional methods of :class:`ctxval.searches.BaseSearch`.
-        draws: gives the points of an audit.
+        draws: chooses the points of an audit.
     """
 
     def __init__(
@@ -98,7 +97,7 @@ class TrialRecorder:
         self._executing: set[int] = set()
         self.replay()
 
-    # What is known
+    # Present state
 
     @property
     def trials(self) -> tuple[Trial, ...]:
@@ -107,17 +106,17 @@ class TrialRecorder:
 
     @property
     def executions(self) -> int:
-        """How many executions of S have ended, well or badly."""
+        """The number of executions of S that have ended, with or without success."""
         return sum(trial.executed for trial in self._trials)
 
     @property
     def executing(self) -> int:
-        """How many trials this process is executing."""
+        """The number of trials that this process is executing."""
         return len(self._executing)
 
     @property
     def interrupted(self) -> Trial | None:
-        """The first trial whose execution was started and never ended; None if there is none."""
+        """The first trial whose execution was interrupted; None if there is none."""
         begun = (trial for trial in self._trials if trial.state == "open" and trial.attempts)
         return next((trial for trial in begun if trial.number not in self._executing), None)
 
@@ -125,7 +124,7 @@ class TrialRecorder:
         """Return the open trial of this number.
 
         Raises:
-            InputError: there is no such trial, or it is not open.
+            InputError: if there is no such trial, or it is not open.
         """
         if not 0 <= number < len(self._trials):
             raise InputError(f"there is no trial {number}; the campaign has {len(self._trials)}.")
@@ -141,25 +140,25 @@ class TrialRecorder:
         """Return the next independent draw of an audit, a point of the unit cube ``(d,)``."""
         return self.draws.point(self._trials)
 
-    # In step with the store
+    # Consistency with the store
 
     def replay(self) -> None:
-        """Read the trials from the store and tell them to the search from the beginning."""
+        """Read the trials from the store, reset the search and tell it all trials."""
         self._trials = self.store.trials()
         self._changes = self.store.signature()[2]
         seed = self.draws.search_seed(self._trials) if self.search.iid else self._seed
         self.search.reset(self.validation.space.dimension, seed)
-        told = history_of(self._trials)
-        if told:
-            values = [np.nan if trial.distance is None else trial.distance for trial in told]
-            self.search.tell(np.array([trial.unit_point for trial in told]), values)
-            self.search.remember([trial.note for trial in told])
+        history = history_of(self._trials)
+        if history:
+            values = [np.nan if trial.distance is None else trial.distance for trial in history]
+            self.search.tell(np.array([trial.unit_point for trial in history]), values)
+            self.search.remember([trial.note for trial in history])
 
     def refresh(self) -> None:
-        """Learn what other processes have stored meanwhile.
+        """Read the trials again if other processes have changed the store.
 
         Raises:
-            StoreMismatchError: the store is of another experiment now.
+            StoreMismatchError: if the store now belongs to another experiment.
         """
         own = (len(self._trials), sum(trial.state == "open" for trial in self._trials), self._changes)
         stored = self.store.signature()
@@ -169,25 +168,25 @@ class TrialRecorder:
             self.replay()
 
     def redefine(self, validation: Validation, description: dict[str, Any]) -> None:
-        """Go on with another distance, once the store has its values."""
+        """Continue with another distance, after its values were stored."""
         self.validation, self.description = validation, description
         self.replay()
 
     # Opening
 
     def open(self, choice: Choice) -> OpenTrial:
-        """Store a new trial that somebody else executes.
+        """Store a new trial that people execute.
 
         Raises:
-            ModelError, DesignError: the task cannot be planned; the trial is stored as failed.
+            ModelError, DesignError: if the task cannot be planned; the trial is stored as failed.
         """
         return self._open(choice, attempts=0)
 
     def start(self, chosen: Choice | Trial) -> OpenTrial:
-        """Store the beginning of an execution: the first one of a new trial, or another one of an interrupted trial.
+        """Store that an execution starts: the first one of a new trial, or a repetition of an interrupted trial.
 
         Raises:
-            ModelError, DesignError: the task cannot be planned; the trial is stored as failed, without an execution.
+            ModelError, DesignError: if the task cannot be planned; the trial is stored as failed without an execution.
         """
         if isinstance(chosen, Choice):
             return self._open(chosen, attempts=1)
@@ -199,7 +198,7 @@ class TrialRecorder:
         return self.repeat(OpenTrial(chosen, plan))
 
     def repeat(self, opened: OpenTrial) -> OpenTrial:
-        """Store that one more execution of an open trial begins."""
+        """Store that another execution of an open trial starts."""
         trial = opened.trial
         begun = replace(trial, attempts=trial.attempts + 1)
         self.store.begin_attempt(begun, changes=self._changes)
@@ -211,7 +210,7 @@ class TrialRecorder:
         try:
             return self._store_next(choice, attempts)
         except BaseException:
-            # Whatever stopped it, the search must know the stored trials and no other.
+            # After every error, the search must know exactly the stored trials.
             self.replay()
             raise
 
@@ -230,7 +229,7 @@ class TrialRecorder:
         return OpenTrial(trial, plan)
 
     def _next_trial(self, choice: Choice, attempts: int) -> Trial:
-        """Return the trial of a choice; its point is pending for the search from now on."""
+        """Return the trial of a choice, and tell the search that its point has no value yet."""
         note = None
         if choice.unit_point is None:
             unit_point, origin = self._proposal(), self._origin()
@@ -270,11 +269,11 @@ class TrialRecorder:
         trajectory: Trajectory | None = None,
         seconds: float | None = None,
     ) -> Trial:
-        """Store an execution with its distance, or as unmeasured; return the trial as it has ended.
+        """Store an execution with its distance, or as unmeasured; return the trial in its final state.
 
         Raises:
-            DistanceError: the distance gave no usable number; the execution is stored all the same.
-            StoreError, InputError: the store does not take it; the message says where it is kept instead.
+            DistanceError: if the distance gave no usable number; the execution is stored as unmeasured.
+            StoreError, InputError: if the store cannot record it; the message names the file that keeps the result.
         """
         ended = replace(
             trial,
@@ -287,16 +286,16 @@ class TrialRecorder:
         self._close(ended, trajectory)
         if measurement.unusable is not None:
             raise DistanceError(
-                f"{measurement.unusable} The execution of trial {ended.number} is stored: once the distance is mended, "
-                "`ctxval remeasure STORE` measures it, without another execution."
+                f"{measurement.unusable} The execution of trial {ended.number} is stored: correct the distance, and "
+                "`ctxval remeasure STORE` computes it without another execution."
             )
         return ended
 
     def fail(self, trial: Trial, reason: object, *, seconds: float | None = None, executed: bool = True) -> Trial:
-        """Store why a trial failed; return the trial as it has ended.
+        """Store the reason why a trial failed; return the failed trial.
 
         Raises:
-            StoreError, InputError: the store does not take it; the message says where it is kept instead.
+            StoreError, InputError: if the store cannot record it; the message names the file that keeps the result.
         """
         ended = replace(trial, state="failed", executed=executed, failure=text_of(reason), seconds=seconds)
         self._close(ended, None)
@@ -313,15 +312,15 @@ class TrialRecorder:
             self.search.tell(ended.unit_point[None], [ended.distance])
 
     def abandon_executions(self) -> None:
-        """Forget which trials this process was executing; those that have not ended are interrupted from now on."""
+        """End the executions of this process; the trials that are still open become interrupted ones."""
         self._executing.clear()
 
     def add(self, known: KnownExecution, wait: float = 0.0) -> Trial | None:
-        """Store an execution that was made before; return None if the store has it already.
+        """Store an earlier execution; return None if it is already in the store.
 
         Args:
             known: the execution.
-            wait: seconds to wait for another process that is running the store.
+            wait: seconds to wait while another process is running the store.
         """
         with self.store.sole_writer(wait):
             self.refresh()
@@ -345,16 +344,18 @@ class TrialRecorder:
 
     @contextmanager
     def not_executing(self, trial: Trial) -> Iterator[None]:
-        """Refuse what is told of a trial that is being executed: how that ends is recorded by who executes it.
+        """Refuse the result of a trial that a process is executing: that process records the result.
 
         Raises:
-            InputError: it is.
+            InputError: if a process is executing the trial.
         """
-        refusal = f"trial {trial.number} is being executed, and nothing can be told of it before that has ended."
+        refusal = (
+            f"trial {trial.number} is being executed: its result cannot be recorded before the execution has ended."
+        )
         if trial.number in self._executing:
             raise InputError(refusal)
         if not trial.attempts:
-            yield  # opened by hand, and nobody else executes it
+            yield  # a person opened it, and no process executes it
             return
         with ExitStack() as stack:
             try:

@@ -34,21 +34,21 @@ _GRACE_PERIOD = 2.0
 """Seconds that a worker has to clean up before it is killed."""
 
 _TERMINATED = 143
-"""Exit status of a worker that was asked to end, as shells have it for SIGTERM."""
+"""Exit status of a worker that ended after SIGTERM, as in shells."""
 
 _POLL_INTERVAL = 0.5
-"""Seconds between two looks at what cannot be waited for."""
+"""Seconds between two checks of a state that cannot be waited for."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExecutionResult:
-    """How an execution ended, before anybody has checked its trajectory.
+    """The result of an execution, before its trajectory is checked.
 
     Attributes:
-        trajectory: what the system returned, whole or not; None if there is none.
-        failure: why there is none: the system's own failure, or that it took too long.
-        lost: why the worker is gone, which says nothing of the system.
-        seconds: how long the execution took; None if that is not known.
+        trajectory: the object that the system returned, complete or not; None if there is none.
+        failure: the reason why there is none: the system failed, or the execution took too long.
+        lost: the reason why the worker was lost, which is not a failure of the system.
+        seconds: the duration of the execution; None if it is not known.
     """
 
     trajectory: Trajectory | None = None
@@ -58,7 +58,7 @@ class ExecutionResult:
 
 
 def execute_task(system: System, controller: Controller, task: Task) -> ExecutionResult:
-    """Execute a task on the system, here or in a worker; what the system raises is a result too."""
+    """Execute a task on the system, here or in a worker; an exception of the system is returned as a failure."""
     started = time.perf_counter()
     try:
         trajectory = system.execute(controller, task)
@@ -77,7 +77,7 @@ class WorkerPool(ABC):
     """Workers that execute one plan each.
 
     Attributes:
-        size: how many there are.
+        size: the number of workers.
     """
 
     size: int
@@ -87,17 +87,17 @@ class WorkerPool(ABC):
         """Start the execution of a trial on a free worker.
 
         Raises:
-            InputError: system or controller cannot be sent to another process.
-            CampaignError: there is no worker any more.
+            InputError: if the system or the controller cannot be sent to another process.
+            CampaignError: if there is no worker any more.
         """
 
     @abstractmethod
     def wait(self) -> tuple[int, ExecutionResult]:
-        """Wait for the next execution that ends; return the number of its trial, and how it ended."""
+        """Wait for the next execution that ends; return the number of its trial, and its result."""
 
     @abstractmethod
     def close(self) -> None:
-        """End all workers at once, with what they are executing."""
+        """End all workers and their executions at once."""
 
 
 # Processes of this computer
@@ -105,7 +105,7 @@ class WorkerPool(ABC):
 
 @dataclass(eq=False)
 class _Worker:
-    """A process, what it executes, and until when."""
+    """A process, the number of the trial that it executes, and the start time of the execution."""
 
     process: Any
     pipe: Connection
@@ -113,7 +113,7 @@ class _Worker:
     started: float = 0.0
 
     def release(self) -> int:
-        """Make it free for another execution; return the number of the trial that it has executed."""
+        """Make the worker free for another execution; return the number of the trial that it has executed."""
         number, self.number = self.number, None
         assert number is not None
         return number
@@ -125,9 +125,9 @@ class ProcessPool(WorkerPool):
     If processes can be forked, the system need not be picklable. A worker that dies or takes too long is replaced.
 
     Args:
-        system: what they execute.
-        size: how many.
-        timeout: seconds after which an execution is ended and has failed.
+        system: the system to execute.
+        size: the number of processes.
+        timeout: time limit of an execution in seconds; a longer execution is ended and has failed.
     """
 
     def __init__(self, system: System, size: int, timeout: float | None = None) -> None:
@@ -141,13 +141,13 @@ class ProcessPool(WorkerPool):
         try:
             message = pickle.dumps((plan.controller, plan.task))
         except Exception as error:
-            # Whatever a user's object raises.
+            # A user's object may raise any exception.
             raise InputError(
                 f"the controller cannot be sent to a worker: {reason_of(error)}; a policy must be a function of a "
                 "module, not a lambda or a function in a function."
             ) from error
         worker.number, worker.started = number, time.monotonic()
-        with contextlib.suppress(OSError):  # it died meanwhile, which wait() finds
+        with contextlib.suppress(OSError):  # the worker has died; wait() detects this
             worker.pipe.send_bytes(message)
 
     def _start_worker(self) -> _Worker:
@@ -169,7 +169,7 @@ class ProcessPool(WorkerPool):
         return worker
 
     def wait(self) -> tuple[int, ExecutionResult]:
-        """Wait for the next execution that ends; return the number of its trial, and how it ended."""
+        """Wait for the next execution that ends; return the number of its trial, and its result."""
         while True:
             busy = [worker for worker in self._workers if worker.number is not None]
             ready = wait_for([worker.pipe for worker in busy], self._remaining(busy))
@@ -200,7 +200,7 @@ class ProcessPool(WorkerPool):
         return worker.release(), _timed_out(self.timeout, time.monotonic() - worker.started)
 
     def _stop(self, worker: _Worker) -> None:
-        """End a worker: it may clean up first, as a command's process must go with it."""
+        """End a worker, with some time to clean up, because it must end the process of a command too."""
         worker.process.terminate()
         worker.process.join(_GRACE_PERIOD)
         if worker.process.is_alive():
@@ -210,7 +210,7 @@ class ProcessPool(WorkerPool):
         self._workers.remove(worker)
 
     def close(self) -> None:
-        """End all workers at once, with what they are executing."""
+        """End all workers and their executions at once."""
         for worker in self._workers:
             worker.process.terminate()
         for worker in list(self._workers):
@@ -218,14 +218,14 @@ class ProcessPool(WorkerPool):
 
 
 def _run_worker(system: System, pipe: Connection, others: list[Connection], parent: int) -> None:
-    """Execute what comes through the pipe, until it is closed."""
-    # Ctrl-C reaches every process of a terminal; which execution ends is decided by the campaign.
+    """Execute the tasks that come through the pipe, until it is closed."""
+    # Ctrl-C reaches every process of a terminal, but the campaign decides which executions end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _exit_on_signal)
     for other in others:
         other.close()
     threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
-    # A copy of the campaign's randomness would give every worker the same noise.
+    # With a copy of the campaign's random state, every worker would have the same noise.
     np.random.seed()  # noqa: NPY002
     random.seed()
     while True:
@@ -239,7 +239,7 @@ def _run_worker(system: System, pipe: Connection, others: list[Connection], pare
 
 
 def _result_of_exit(status: int | None) -> ExecutionResult:
-    """Return what the end of a worker's process says: who ends by itself has failed, who is killed is lost."""
+    """Return the result after the end of a worker's process: failed if the system ended it, lost if it was killed."""
     if status is None:
         return ExecutionResult(lost="the worker ended for no known reason")
     if status < 0 or status == _TERMINATED:
@@ -252,7 +252,7 @@ def _exit_on_signal(_signal: int, _frame: FrameType | None) -> NoReturn:
 
 
 def _exit_with_parent(parent: int) -> None:
-    """End with the campaign: an execution whose result nobody takes must not go on beside its repetition."""
+    """End if the campaign's process has ended, because a resumed campaign repeats the execution."""
     while os.getppid() == parent:
         time.sleep(_POLL_INTERVAL)
     os.kill(os.getpid(), signal.SIGTERM)
@@ -266,14 +266,14 @@ def _exit_with_parent(parent: int) -> None:
 class ExecutorPool(WorkerPool):
     """An executor of ``concurrent.futures``: a pool of threads or processes, Dask, and others.
 
-    A system in a pool of threads is shared by all of them. What takes too long is cancelled; a thread cannot be, and
-    goes on behind our back.
+    All threads of a pool share one system. An execution that takes too long is cancelled; a thread cannot be cancelled
+    and continues in the background.
 
     Args:
-        system: what the workers execute.
-        executor: where to.
-        size: how many executions at a time.
-        timeout: seconds after which an execution has failed.
+        system: the system to execute.
+        executor: the executor that runs the executions.
+        size: the number of executions at a time.
+        timeout: time limit of an execution in seconds; a longer execution has failed.
     """
 
     def __init__(self, system: System, executor: cf.Executor, size: int, timeout: float | None = None) -> None:
@@ -292,7 +292,7 @@ class ExecutorPool(WorkerPool):
         self._running[future] = number, time.monotonic()
 
     def wait(self) -> tuple[int, ExecutionResult]:
-        """Wait for the next execution that ends; return the number of its trial, and how it ended."""
+        """Wait for the next execution that ends; return the number of its trial, and its result."""
         while True:
             cf.wait(self._running, timeout=_POLL_INTERVAL, return_when=cf.FIRST_COMPLETED)
             for future, (number, started) in list(self._running.items()):
@@ -304,14 +304,15 @@ class ExecutorPool(WorkerPool):
                     del self._running[future]
                     future.cancel()
                     return number, _timed_out(self.timeout, seconds)
-            # What was sent while a client looked for its scheduler stays pending for ever.
+            # A task that was sent while a client searched for its scheduler stays pending for ever.
             self._await_scheduler()
 
     def _await_scheduler(self) -> None:
-        """Wait as long as a Dask client looks for a scheduler that it has lost.
+        """Wait while a Dask client searches for a scheduler that it has lost.
 
         Raises:
-            CampaignError: it has given up. The trials stay open, so that the campaign can go on with another.
+            CampaignError: if the client gives up. The trials stay open, so the campaign can continue with another
+                scheduler.
         """
         while self._status() == "connecting":
             time.sleep(_POLL_INTERVAL)
@@ -331,13 +332,13 @@ class ExecutorPool(WorkerPool):
             raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
 
     def close(self) -> None:
-        """Cancel what has not started; the executor is its owner's."""
+        """Cancel the executions that have not started; the owner of the executor closes it."""
         for future in self._running:
             future.cancel()
 
 
 def _is_loss(error: BaseException) -> bool:
-    """Return whether a worker was lost, which is no fault of the system."""
+    """Return whether an error means that a worker was lost, which is not a failure of the system."""
     known = (cf.BrokenExecutor, cf.CancelledError, EOFError, OSError)
     return isinstance(error, known) or type(error).__module__.split(".")[0] == "distributed"
 
@@ -349,10 +350,10 @@ def worker_pool(
     executor: cf.Executor | None = None,
     timeout: float | None = None,
 ) -> WorkerPool | None:
-    """Return the workers that are asked for; None if one execution after the other runs in this process.
+    """Return a pool of workers; None if the executions run one after the other in this process.
 
     Raises:
-        InputError: a value cannot be used.
+        InputError: if a value cannot be used.
     """
     if workers is not None and (not isinstance(workers, int) or isinstance(workers, bool) or workers < 1):
         raise InputError(f"workers must be a positive integer, got {workers!r}.")
@@ -361,7 +362,7 @@ def worker_pool(
     if executor is not None:
         if not isinstance(executor, cf.Executor):
             raise InputError(f"executor must be one of concurrent.futures, got {type(executor).__name__}.")
-        # Every pool of the standard library has it, under this name.
+        # Every pool of the standard library has its size under this name.
         size = getattr(executor, "_max_workers", 1) if workers is None else workers
         return ExecutorPool(system, executor, int(size), timeout)
     if (workers or 1) > 1 or timeout is not None:

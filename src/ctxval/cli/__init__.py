@@ -10,4 +10,4 @@ __all__ = ["app", "certify", "files", "hand", "main", "paper", "remeasure", "run
 def main() -> None:
     """Run the command line."""
     print_anything()
-    app()
+    app(prog_name="ctxval")

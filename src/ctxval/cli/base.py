@@ -10,9 +10,9 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -34,46 +34,49 @@ _BAD = (InputError, StoreError, CertificateError)
 app = typer.Typer(
     name="ctxval",
     cls=Commands,
-    help="Decide whether a learned model of a robot can be trusted for the control tasks it is meant for.",
+    help="Find the task at which a system differs most from its learned model, and decide whether the difference stays "
+    "below a threshold.",
+    epilog="The glossary in docs/glossary.md explains the words and numbers that these commands print.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
 out = Screen()
 err = Screen(stderr=True)
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
-
 
 def command(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Turn ctxval's errors into one sentence and an exit status; what a command returns is its JSON."""
+    """Let a command print its result as JSON, and turn its errors into one sentence and an exit status.
+
+    The command returns the JSON object, or the object and the exit status.
+    """
 
     @functools.wraps(function)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
         warnings.showwarning = _show_warning
         try:
-            with _stdout_to_stderr() if kwargs.get("as_json") else _as_it_is() as stdout:
-                return _answered(function(*args, **kwargs), stdout if kwargs.get("as_json") else None)
+            with _stdout_to_stderr() if kwargs.get("as_json") else nullcontext() as stdout:
+                return _finish(function(*args, **kwargs), stdout)
         except CtxvalError as error:
             say_error(str(error))
             raise typer.Exit(BAD_INPUT if isinstance(error, _BAD) else CANNOT_GO_ON) from None
         except (typer.Exit, typer.Abort):
             raise
         except KeyboardInterrupt:
-            err.say("stopped; what was executed is stored, run the same command to go on.")
+            err.say("stopped. All executions are stored; run the same command to resume.")
             raise typer.Exit(INTERRUPTED) from None
         except BaseException as error:  # users' code may raise anything
             if isinstance(error.__context__, BrokenPipeError):
-                raise typer.Exit(CUT_OFF) from None  # the reader of our output has gone, as in `| head`
-            # Python's own exit status here would be 1, which says that a model is falsified.
+                raise typer.Exit(CUT_OFF) from None  # the reader of the output has ended, as in `| head`
+            # Python's own exit status here would be 1, which means that a model is falsified.
             say_error(reason_of(error))
             raise typer.Exit(CANNOT_GO_ON) from None
 
     return wrapped
 
 
-def _answered(answer: Any, stdout: Any) -> None:
-    """Print a command's JSON where that was asked for, and leave with its exit status."""
-    report, status = answer if isinstance(answer, tuple) else (answer, 0)
+def _finish(result: Any, stdout: Any) -> None:
+    """Print the JSON of a command if there is a stream for it, and leave with the command's exit status."""
+    report, status = result if isinstance(result, tuple) else (result, 0)
     if stdout is not None:
         print(json.dumps(describe(report), allow_nan=False), file=stdout, flush=True)
     if status:
@@ -81,17 +84,12 @@ def _answered(answer: Any, stdout: Any) -> None:
 
 
 @contextmanager
-def _as_it_is() -> Iterator[None]:
-    yield None
-
-
-@contextmanager
 def _stdout_to_stderr() -> Iterator[Any]:
-    """Send what users' code and programs print to stderr; yield what is the standard output for us."""
+    """Send the output of users' code and programs to stderr; yield a stream to the real standard output."""
     sys.stdout.flush()
     try:
         kept = os.dup(sys.stdout.fileno())
-    except (io.UnsupportedOperation, OSError, ValueError):  # no file of its own, as in a test
+    except (io.UnsupportedOperation, OSError, ValueError):  # stdout has no file descriptor, as in a test
         ours = sys.stdout
         with redirect_stdout(sys.stderr):
             yield ours
@@ -107,22 +105,12 @@ def _stdout_to_stderr() -> Iterator[Any]:
             os.dup2(ours.fileno(), number)
 
 
-RESOLUTION_HELP = (
-    "How far from every trial a task may be for a validation, in diagonals of the task space; 0.125 if not given. "
-    "What is larger is more often wrong: of campaigns with a threshold just below d*, 1 of 74 said validated at 0.125, "
-    "8 of 75 at 0.25, and of those on narrow peaks in 2-D 11 of 48."
-)
-Workers = Annotated[int | None, typer.Option(help="Executions at a time, each in a process of its own.")]
-Dask = Annotated[str | None, typer.Option(metavar="ADDRESS", help="Of a Dask scheduler whose workers execute.")]
-Timeout = Annotated[float | None, typer.Option(help="Seconds after which an execution has failed.")]
-
-
 @contextmanager
 def worker_options(workers: int | None, dask: str | None, timeout: float | None) -> Iterator[dict[str, Any]]:
-    """Yield the options of a campaign's run that say who executes: processes, or the workers of a Dask scheduler.
+    """Yield the arguments of :meth:`ctxval.Campaign.run` for local processes or for the workers of a Dask scheduler.
 
     Raises:
-        InputError: there is no such scheduler, or it has no workers.
+        InputError: if there is no scheduler at this address, or if it has no workers.
     """
     if dask is None:
         yield {"workers": workers, "timeout": timeout}
@@ -150,13 +138,13 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
 
 
 def say_error(sentence: str) -> None:
-    """Print what is wrong."""
+    """Print an error message."""
     err.say(("error:", "bold red"), f" {sentence}")
 
 
 @contextmanager
 def progress(campaign: Campaign, total: int, *, show: bool) -> Iterator[Callable[[Trial], None]]:
-    """Show how many executions have ended, of how many."""
+    """Show a progress bar of the executions; yield the function that updates it after each trial."""
     columns = (
         TextColumn("executions"),
         BarColumn(bar_width=30),
@@ -165,11 +153,11 @@ def progress(campaign: Campaign, total: int, *, show: bool) -> Iterator[Callable
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=err, disable=not show) as display:
-        line = display.add_task("", total=total, completed=campaign.executions, best="-", pace="")
+        task = display.add_task("", total=total, completed=campaign.executions, best="-", pace="")
 
         def on_trial(trial: Trial) -> None:
             best = "-" if campaign.worst is None else f"{campaign.worst.distance:.4g}"
-            display.update(line, completed=campaign.executions, best=best, pace=_pace(trial))
+            display.update(task, completed=campaign.executions, best=best, pace=_pace(trial))
 
         yield on_trial
 
@@ -179,7 +167,7 @@ def _pace(trial: Trial) -> str:
 
 
 def certificate_of(verdict: Verdict | None) -> dict[str, Any]:
-    """Return what stands behind a verdict, and what is expected of further executions."""
+    """Return the certificate of a verdict and the forecast of further executions."""
     if verdict is None:
         return {"certificate": None, "expected": None}
     return {
@@ -189,37 +177,37 @@ def certificate_of(verdict: Verdict | None) -> dict[str, Any]:
 
 
 def worst_of(trial: Trial | None) -> dict[str, Any] | None:
-    """Return a trial's task and distance."""
+    """Return the task and the distance of a trial."""
     return None if trial is None else {"task": trial.parameters, "distance": trial.distance}
 
 
 def failures_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
-    """Return why trials failed, the most frequent reason first, and which ones."""
+    """Return the reasons why trials failed with the numbers of the trials, the most frequent reason first."""
     by_reason: dict[str, list[int]] = {}
     for trial in trials:
         if trial.state == "failed":
-            reason = shortened(trial.failure or "for no stated reason")
+            reason = shortened(trial.failure or "no reason was stated")
             by_reason.setdefault(reason, []).append(trial.number)
     ordered = sorted(by_reason.items(), key=lambda item: -len(item[1]))
     return [{"reason": reason, "trials": numbers} for reason, numbers in ordered]
 
 
 def print_failures(failures: list[dict[str, Any]]) -> None:
-    """Print the most frequent reasons."""
+    """Print the most frequent reasons of failures."""
     for failure in failures[:_REASONS]:
         count = len(failure["trials"])
         which = f"trial {failure['trials'][0]}" if count == 1 else f"{count} trials"
         err.say((f"{which} failed", "yellow"), f": {failure['reason']}")
     if len(failures) > _REASONS:
-        err.say(f"and {len(failures) - _REASONS} other reasons; ctxval export has them.")
+        err.say(f"and {len(failures) - _REASONS} other reasons; `ctxval export` lists them.")
 
 
 _REASONS = 3
-"""Reasons of failures that are printed."""
+"""Largest number of reasons that are printed."""
 
 
 def print_table(rows: dict[str, Any], units: str = "") -> None:
-    """Print names and values."""
+    """Print a table of names and values."""
     table = Table(show_header=False, box=None, pad_edge=False)
     for key, value in rows.items():
         table.add_row(line(key.replace("_", " ")), line(_text(value, units)))
@@ -233,7 +221,7 @@ def _text(value: Any, units: str) -> str:
         case {"task": dict() as task, "distance": distance, **rest}:
             at = ", ".join(f"{name} = {_text(item, '')}" for name, item in task.items())
             how = f" ({rest['method']})" if "method" in rest else ""
-            return f"{distance:.4g} {units} at {at}{how}"
+            return f"{f'{distance:.4g} {units}'.rstrip()} at {at}{how}"
         case dict():
             return ", ".join(f"{name} {_text(item, '')}" for name, item in value.items())
         case _:
@@ -243,12 +231,13 @@ def _text(value: Any, units: str) -> str:
 def print_other_stores(others: list[str]) -> None:
     """Name the other campaigns of the same experiment, if there are any."""
     if others:
-        count = f"{len(others)} other store{'s' if len(others) > 1 else ''} of this experiment beside this one"
-        out.say(f"{count}: {', '.join(others)}. The best of several campaigns is wrong more often than stated.")
+        count = f"{len(others)} other store{'s' if len(others) > 1 else ''} of this experiment"
+        sentence = f"the folder contains {count}: {', '.join(others)}."
+        out.say(f"{sentence} The best result of several campaigns is wrong more often than its confidence states.")
 
 
 def print_verdict(verdict: Verdict) -> None:
-    """Print the answer and its reason."""
+    """Print the verdict, its reason and its assumptions."""
     out.say((verdict.answer, "bold"), f" against {verdict.threshold:g}: {verdict.reason}", wrap=True)
     if verdict.rests_on is not None:
         out.say(verdict.rests_on, wrap=True)

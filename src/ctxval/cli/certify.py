@@ -1,9 +1,7 @@
-"""``ctxval certify``."""
+"""``ctxval certify``: compute a certificate from the trials in a store."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -11,60 +9,77 @@ import typer
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import KINDS, Assessment, Certificate, Provenance, TheoremConstants, assess
 from ctxval.certificates.verdict import require_threshold
-from ctxval.cli.base import (
-    FALSIFIED,
-    RESOLUTION_HELP,
+from ctxval.cli.base import FALSIFIED, app, command, out, print_other_stores, print_verdict, progress
+from ctxval.cli.options import (
     AsJson,
-    app,
-    command,
-    out,
-    print_other_stores,
-    print_verdict,
-    progress,
+    Confidence,
+    Resolution,
+    Stochastic,
+    StoreArgument,
+    Threshold,
+    named_values,
 )
 from ctxval.cli.trust import AcceptChange, Named, Trust, open_store, settings_of
 from ctxval.config.settings import planned_settings
-from ctxval.errors import CertificateError, InputError
+from ctxval.errors import InputError
 from ctxval.storage.other_stores import other_stores
 from ctxval.storage.store import Store
 
-Stored = Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials.")]
-Threshold = Annotated[float | None, typer.Option(help="Largest distance that you can accept.")]
-Confidence = Annotated[float | None, typer.Option(help="Confidence level of the certificate (default: 0.95).")]
 Kind = Annotated[
     str | None,
-    typer.Option(help=f"Kind of certificate: {', '.join(KINDS.built_in)}, or one of an installed package."),
+    typer.Option(
+        help=f"Kind of the certificate: {', '.join(KINDS.built_in)}, or a kind from an installed package (default: "
+        "posterior, or audit if --audit is given)."
+    ),
 ]
 Draws = Annotated[
     int | None,
-    typer.Option(help="First execute independent draws of tasks, until the store has this many of them in all."),
+    typer.Option(help="Execute independent random tasks first, until the store contains this number of them."),
 ]
-Volume = Annotated[float | None, typer.Option(help="Share of the task space that may exceed the threshold.")]
+Volume = Annotated[
+    float | None,
+    typer.Option(
+        help="Share of the task space, from 0 to 0.5, that may exceed the threshold (default: 0). Only for "
+        "--kind audit, scenario and sampling-discarding."
+    ),
+]
 Discard = Annotated[
     int | None,
-    typer.Option(help="sampling-discarding: how many distances are discarded; choose it before you know them."),
+    typer.Option(
+        help="Number of largest distances to discard. Choose it before the distances are known. Only for --kind "
+        "sampling-discarding, which needs it."
+    ),
 ]
 Constant = Annotated[
     float | None,
-    typer.Option(help="convergence: the constant C, in the distance's units. A bound by it validates nothing."),
+    typer.Option(
+        help="Constant C of the convergence bound, in the units of the distance. This bound never validates a model. "
+        "Only for --kind convergence."
+    ),
 ]
 Theorem = Annotated[
-    str | None, typer.Option(help="convergence: SCALE,NOISE,A,B,GAIN, from which C is computed (see docs/theory.md).")
+    str | None,
+    typer.Option(
+        metavar="SCALE,NOISE,A,B,GAIN",
+        help="Five numbers from which C is computed (see docs/theory.md), in place of --constant. Only for --kind "
+        "convergence.",
+    ),
 ]
-Stochastic = Annotated[
-    bool | None, typer.Option("--stochastic", help="posterior: two executions of one task may differ.")
-]
-Resolution = Annotated[float | None, typer.Option(help=f"posterior: {RESOLUTION_HELP[0].lower()}{RESOLUTION_HELP[1:]}")]
-OfKind = Annotated[
+KindOptions = Annotated[
     list[str] | None,
-    typer.Option("--option", metavar="NAME=VALUE", help="Option of a kind of certificate, such as one of a plug-in."),
+    typer.Option(
+        "--option",
+        metavar="NAME=VALUE",
+        help="Option of the kind of certificate, for example of a kind from an installed package. Repeat --option to "
+        "set several.",
+    ),
 ]
 
 
 @app.command("certify")
 @command
 def certify_store(
-    store: Stored,
+    store: StoreArgument,
     threshold: Threshold = None,
     confidence: Confidence = None,
     kind: Kind = None,
@@ -75,23 +90,23 @@ def certify_store(
     theorem: Theorem = None,
     stochastic: Stochastic = None,
     resolution: Resolution = None,
-    option: OfKind = None,
+    option: KindOptions = None,
     experiment: Named = None,
     trust: Trust = False,
     accept_change: AcceptChange = None,
     as_json: AsJson = False,
 ) -> Any:
-    """Compute a certificate from the trials in a store; only --audit executes anything.
+    """Compute a certificate from the trials in a store. The system is executed only if --audit is given.
 
-    An option that is not given has the value in the store's experiment file, if there is one.
+    Options that are not given have the values that the campaign was run with.
     """
     opened = Store.existing(store)
     if audit is None and (trust or experiment is not None):
-        raise InputError("--trust and --experiment are for an --audit; nothing is imported or run without one.")
+        raise InputError("--trust and --experiment need --audit: without an audit, no code is imported or run.")
     settings = planned_settings(opened, kind) if audit is None else settings_of(opened, experiment, trust)
-    stated = {"discard": discard, "constant": constant, "theorem": _theorem(theorem), "volume": volume}
-    stated |= {"stochastic": stochastic, "resolution": resolution, **_named_values(option or [])}
-    given = {name: value for name, value in stated.items() if value is not None}
+    constants = None if theorem is None else TheoremConstants.parse(theorem)
+    own = {"discard": discard, "constant": constant, "theorem": constants, "volume": volume}
+    given = named_values(option, **own, stochastic=stochastic, resolution=resolution)
     limit = settings.threshold if threshold is None else require_threshold(threshold)
     _require_together(given, limit)
     options = settings.certificate.options(
@@ -111,45 +126,17 @@ def certify_store(
     return report, FALSIFIED if found.verdict is not None and found.verdict.answer == "falsified" else 0
 
 
-def _theorem(text: str | None) -> TheoremConstants | None:
-    return None if text is None else TheoremConstants.parse(text)
-
-
-def _named_values(given: list[str]) -> dict[str, Any]:
-    """Return values by name; what is no JSON is a text."""
-    found: dict[str, Any] = {}
-    for one in given:
-        name, equals, value = one.partition("=")
-        if not (name and equals):
-            raise InputError(f"--option must be NAME=VALUE, got {one!r}.")
-        try:
-            found[name] = json.loads(value)
-        except ValueError:
-            found[name] = value
-    return found
-
-
 def _require_together(given: dict[str, Any], threshold: float | None) -> None:
     if "volume" in given and threshold is None:
-        raise InputError("--volume is a share of the task space that may exceed a threshold; say --threshold too.")
+        raise InputError("--volume needs --threshold: it is the share of the task space that may exceed the threshold.")
     if "constant" in given and "theorem" in given:
-        raise InputError("of --constant and --theorem only one can be given.")
+        raise InputError("--constant and --theorem cannot be given together.")
 
 
 def _audit(campaign: Campaign, draws: int, *, show: bool) -> None:
-    _require_closed(campaign)
     drawn = sum(trial.origin == "iid" for trial in campaign.trials)
     with progress(campaign, campaign.executions + max(0, draws - drawn), show=show) as on_trial:
         campaign.audit(draws, on_trial)
-
-
-def _require_closed(campaign: Campaign) -> None:
-    """Refuse trials that people are executing; those that were interrupted are executed again by the audit itself."""
-    if getattr(campaign.validation.system, "manual", False):
-        return  # nothing can be executed at all, which the audit says
-    waiting = [str(trial.number) for trial in campaign.trials if trial.state == "open" and not trial.attempts]
-    if waiting:
-        raise CertificateError(f"trials are open: {', '.join(waiting)}; tell how they ended before auditing.")
 
 
 def _print_assessment(found: Assessment) -> None:

@@ -1,4 +1,4 @@
-"""``ctxval init`` and ``ctxval check``: experiment files."""
+"""``ctxval init`` and ``ctxval check``: write and check experiment files."""
 
 from __future__ import annotations
 
@@ -9,60 +9,60 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval.cli.base import BAD_INPUT, AsJson, app, command, out
-from ctxval.cli.case_options import CaseOptions, case_options
+from ctxval.cli.base import BAD_INPUT, app, command, out
+from ctxval.cli.options import TARGET, AsJson, PartOptions, named_values
 from ctxval.config.check import Finding, check_experiment
 from ctxval.config.settings import read_settings
 from ctxval.errors import InputError
 
 _EXPERIMENT = """\
-# An experiment: what is validated, for which tasks, and what would satisfy you.
-#   ctxval check {name}      looks at it without executing the system
-#   ctxval run {name}        searches for the task at which system and model differ most
+# An experiment file: system, model, tasks and threshold.
+#   ctxval check {name}      checks the file without executing the system
+#   ctxval run {name}        searches for the task at which the system differs most from its model
 name = "cart"
-budget = 40             # executions of the system, in all; fewer with ctxval run --until-decided
-threshold = 0.5         # the largest distance that you can accept
-confidence = 0.95       # of a validation
-seed = 0                # of the search
-units = "m"             # of the distance
-# store = "runs/cart.sqlite"   # file of the trials; running again resumes
+budget = 40             # maximum number of executions of the system
+threshold = 0.5         # largest acceptable distance
+confidence = 0.95       # confidence level of the certificate
+seed = 0                # seed of the random numbers of the search
+units = "m"             # units of the distance
+# store = "runs/cart.sqlite"   # store of the campaign; running again resumes it
 
-[space]                 # the tasks: name = [low, high, "unit"]
+[space]                 # range of each task parameter: name = [low, high, "unit"]
 goal = [0.5, 3.0, "m"]
 load = [0.0, 0.4, "m/s"]
 
-[task]                  # numbers, and task parameters by name ("goal", "-goal", "vector[0]")
+[task]                  # each component is a number or the name of a task parameter ("goal", "-goal", "vector[0]")
 initial_state = [0.0, "load"]
 goal = ["goal", 0.0]
-horizon = 60            # steps
-dt = 0.05               # seconds in a step
-# Tasks that need more than that are a function p -> Task of yours: task = "my_module:my_task", above [space].
+horizon = 60            # number of time steps
+dt = 0.05               # time step in seconds
+# For other tasks, write a function p -> Task and name it above [space]: task = "my_module:my_task"
 
-[states]                # names and units, for files and pictures
+[states]                # names and units of the states, for files and figures
 position = "m"
 speed = "m/s"
 
-[inputs]
+[inputs]                # names and units of the inputs
 force = "N"
 
-[system]                # the true one, here a step function in {module}.py
+[system]                # the true system; here a step function in {module}.py
 type = "Simulated"
 step = {{ ref = "{module}:step" }}
-# Others, each with the arguments that it has in Python:
+# Other types, with the same arguments as in Python:
 #   type = "Gymnasium"    environment = "InvertedPendulum-v5"
 #   type = "FMU"          path = "Cart.fmu", states = ["position", "speed"], inputs = ["force"]
 #   type = "MuJoCo"       mjcf = "arm.xml"
 #   type = "Subprocess"   command = "./my_rig", timeout = 60
-#   type = "Manual"       states, inputs and dt: people execute it, with `ctxval ask` and `ctxval tell`
+#   type = "Manual"       states, inputs, dt; people execute the tasks with `ctxval ask` and `ctxval tell`
 #   type = "my_module:MySystem"
 
-[model]                 # the learned one
+[model]                 # the learned model
 type = "Linear"         # or Onnx, with source = "model.onnx"; or my_module:my_model
 A = [[1.0, 0.05], [0.0, 1.0]]
 B = [[0.0], [0.05]]
-# Learned from recorded trajectories instead of A and B: data = ["run1.csv", "run2.npz"]
+# To learn the model from recorded trajectories, replace A and B by: data = ["run1.csv", "run2.npz"]
 
-[synthesizer]           # how controllers are designed on the model: LQR, ILQR, StationaryLQR, MPC, OnnxPolicy
+[synthesizer]           # method that designs the controllers on the model: LQR, ILQR, StationaryLQR, MPC, OnnxPolicy
 type = "LQR"
 Q = [10.0, 1.0]
 R = [0.1]
@@ -71,24 +71,24 @@ limits = 4.0
 [distance]              # FinalState, WholeTrajectory, MeanDeviation, GoalError; or my_module:my_distance
 type = "FinalState"
 norm = 2
-components = [0]        # the position alone
+components = [0]        # only the position
 
-[search]                # ctxval run --help
+[search]                # `ctxval run --help` lists the search methods
 name = "auto"
-repeats = 1             # executions of each task: more where two of one task differ
+repeats = 1             # executions of each task; raise it if two executions of one task differ
 
-[certificate]           # what a validation rests on: see `ctxval certify --help`
+[certificate]           # certificate for the verdict: see `ctxval certify --help`
 kind = "posterior"
-stochastic = false      # whether two executions of one task may differ
+stochastic = false      # true if two executions of one task may differ
 """
 
-_SYSTEM = '''"""The system of {name}; yours goes here."""
+_SYSTEM = '''"""The system of {name}. Replace it by your own system."""
 
 import numpy as np
 
 
 def step(x, u):
-    """Return the next state of a cart with a drag and a dry friction that its model does not know."""
+    """Return the next state of a cart, with a drag and a dry friction that the model does not contain."""
     position, speed = x
     friction = 0.3 * speed * abs(speed) + 0.5 * np.tanh(20 * speed)
     return np.array([position + 0.05 * speed, speed + 0.05 * (u[0] - friction)])
@@ -98,12 +98,12 @@ def step(x, u):
 @app.command()
 @command
 def init(
-    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The experiment file to write.")] = Path(
+    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="Experiment file to write.")] = Path(
         "experiment.toml"
     ),
     as_json: AsJson = False,
 ) -> Any:
-    """Write a commented experiment file that runs, and the system that it names."""
+    """Write an example experiment file and the Python module of its system."""
     if file.suffix != ".toml":
         raise InputError(f"an experiment file ends in .toml, got {str(file)!r}.")
     module = "".join(c if c.isascii() and c.isalnum() else "_" for c in file.stem) + "_system"
@@ -113,7 +113,7 @@ def init(
     }
     for path in contents:
         if path.exists():
-            raise InputError(f"{path} exists already, and is left as it is.")
+            raise InputError(f"{path} already exists and was not changed.")
     try:
         for path, content in contents.items():
             with path.open("x", encoding="utf-8") as opened:
@@ -131,13 +131,21 @@ def init(
 @app.command()
 @command
 def check(
-    target: Annotated[str, typer.Argument(metavar="CASE|FILE.toml|module:attr", help="What to check.")],
-    execute: Annotated[bool, typer.Option("--execute", help="Execute one task twice on the system.")] = False,
+    target: Annotated[
+        str,
+        typer.Argument(
+            metavar=TARGET,
+            help="Experiment to check: a case, an experiment file, or a reference to an object in Python.",
+        ),
+    ],
+    execute: Annotated[
+        bool, typer.Option("--execute", help="Also execute one task twice and compare the two executions.")
+    ] = False,
     as_json: AsJson = False,
-    option: CaseOptions = None,
+    option: PartOptions = None,
 ) -> Any:
-    """Check an experiment and its parts against each other; the system is executed only with --execute."""
-    settings = read_settings(target, {"options": case_options(option)})
+    """Check that the parts of an experiment fit together. The system is executed only if --execute is given."""
+    settings = read_settings(target, {"options": named_values(option)})
     experiment = settings.load()
     settings.search.build(settings.folder)
     findings = check_experiment(experiment, execute=execute, seed=settings.seed)

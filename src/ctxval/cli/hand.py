@@ -1,4 +1,4 @@
-"""``ctxval ask``, ``ctxval tell`` and ``ctxval import``: systems that people operate."""
+"""``ctxval ask``, ``ctxval tell`` and ``ctxval import``: tasks that people execute, and earlier runs."""
 
 from __future__ import annotations
 
@@ -9,73 +9,96 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval.campaign.by_hand import parameters_from, read_recording, read_runs, write_files
+from ctxval.campaign.by_hand import KnownRun, parameters_from, read_recording, read_runs, write_files
 from ctxval.campaign.campaign import Campaign, OpenTrial
-from ctxval.cli.base import AsJson, app, command, out
+from ctxval.campaign.known import KnownExecution
+from ctxval.cli.base import app, command, out
+from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, named_values
 from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, open_store
 from ctxval.config.settings import read_settings
 from ctxval.core.experiment import Experiment
 from ctxval.core.trial import Trial
-from ctxval.core.validation import START
 from ctxval.errors import InputError
 from ctxval.storage.store import Store
 
 _WAIT = 60.0
-"""Seconds to wait for other terminals: each of them holds the store while it chooses a task."""
+"""Seconds to wait for other terminals: each of them locks the store while it chooses a task."""
 
 _STORES = (".sqlite", ".sqlite3", ".db")
-"""How files of trials are mostly called."""
+"""Usual suffixes of stores."""
 
-Resample = Annotated[
-    bool, typer.Option("--resample", help="Bring a recording with other time steps to those of the task.")
+Target = Annotated[
+    str, typer.Argument(metavar=f"STORE|{TARGET}", help="Existing store, or the experiment of a store to create.")
 ]
-StartTolerance = Annotated[
-    float | None, typer.Option(help="By how much a recording may start elsewhere, as a share of what the model covers.")
+StoreFile = Annotated[
+    Path | None, typer.Option(help="Store to create or to resume, if the first argument is an experiment.")
+]
+OutFolder = Annotated[
+    Path | None, typer.Option("--out", help="Folder for the files of the trial (default: a folder next to the store).")
 ]
 Set = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
         metavar="NAME=VALUE",
-        help="A task parameter, once for each: goal=1.5, goal='1.5 rad', goal=[1.5, 0.5] or goal[0]=1.5.",
+        help="Value of a task parameter. Repeat --set for each parameter. Examples: goal=1.5, goal='1.5 rad', "
+        "goal=[1.5, 0.5], goal[0]=1.5.",
     ),
 ]
-StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials.")]
+Draw = Annotated[bool, typer.Option("--draw", help="Choose the task by an independent random draw, for an audit.")]
+Again = Annotated[
+    int | None, typer.Option(metavar="TRIAL", help="Open a new trial with the task of this earlier trial.")
+]
+Because = Annotated[
+    str | None,
+    typer.Option(
+        metavar="REASON",
+        help='The change that was made to the system since the earlier trial, such as "fuse replaced". Only with '
+        "--again.",
+    ),
+]
+Reopened = Annotated[int | None, typer.Option(help="Write the files of this open trial again.")]
+SearchName = Annotated[
+    str | None, typer.Option(help=f"Search method of a new store: {SEARCH_METHODS} (default: auto).")
+]
+Seed = Annotated[int | None, typer.Option(help="Seed of the random numbers of a new store (default: 0).")]
+Resample = Annotated[bool, typer.Option("--resample", help="Interpolate a recording to the time steps of the task.")]
+StartTolerance = Annotated[
+    float | None,
+    typer.Option(
+        help="Largest permitted difference between the start of a recording and the initial state of its task, as a "
+        "fraction of the range of each state in the trajectory of the model (default: the value of the experiment, "
+        "which is 0.05 if it states none)."
+    ),
+]
 
 
 @app.command()
 @command
 def ask(
-    target: Annotated[
-        str,
-        typer.Argument(metavar="STORE|CASE|FILE.toml|module:attr", help="A store, or what a new one is to be of."),
-    ],
-    store: Annotated[Path | None, typer.Option(help="File of the trials, if the first argument is none.")] = None,
-    out_folder: Annotated[
-        Path | None, typer.Option("--out", help="Folder for the trial's files; one beside the store by default.")
-    ] = None,
+    target: Target,
+    store: StoreFile = None,
+    out_folder: OutFolder = None,
     parameters: Set = None,
-    draw: Annotated[bool, typer.Option("--draw", help="An independent draw, for an audit by hand.")] = False,
-    again: Annotated[
-        int | None, typer.Option(metavar="TRIAL", help="The task of this trial once more, as a new one.")
-    ] = None,
-    because: Annotated[
-        str | None, typer.Option(help='With --again: what was changed on the system since, such as "fuse replaced".')
-    ] = None,
-    trial: Annotated[int | None, typer.Option(help="Write the files of this open trial again.")] = None,
-    search: Annotated[str | None, typer.Option(help="How tasks are chosen, for a new store.")] = None,
-    seed: Annotated[int | None, typer.Option(help="For a new store.")] = None,
+    draw: Draw = False,
+    again: Again = None,
+    because: Because = None,
+    trial: Reopened = None,
+    search: SearchName = None,
+    seed: Seed = None,
     experiment: Named = None,
     trust: Trust = False,
     accept_change: AcceptChange = None,
     as_json: AsJson = False,
+    option: PartOptions = None,
 ) -> Any:
-    """Open the next trial and write its task and its controller, for a rig that people operate."""
+    """Open the next trial of a system that people operate, and write its task and controller to files."""
     if sum((bool(parameters), draw, again is not None, trial is not None)) > 1:
-        raise InputError("of --set, --draw, --again and --trial only one can be given.")
+        raise InputError("--set, --draw, --again and --trial cannot be combined.")
     if because is not None and again is None:
-        raise InputError("--because says why a task is executed again; say --again TRIAL too.")
-    opened = _opened(target, {"store": store, "search": search, "seed": seed}, experiment, trust, accept_change)
+        raise InputError("--because needs --again TRIAL: it states why the task is executed again.")
+    overrides = {"store": store, "search": search, "seed": seed, "options": named_values(option) or None}
+    opened = _opened(target, overrides, experiment, trust, accept_change)
     if trial is not None:
         found = opened.campaign.reopen(trial)
     else:
@@ -97,7 +120,7 @@ def ask(
 
 
 def _parameters_of(campaign: Campaign, number: int | None) -> dict[str, Any] | None:
-    """Return the parameters of a trial's task, None where none is named."""
+    """Return the parameters of the task of a trial; None if no trial is named."""
     if number is None:
         return None
     known = {trial.number: trial.parameters for trial in campaign.trials}
@@ -110,11 +133,17 @@ def _parameters_of(campaign: Campaign, number: int | None) -> dict[str, Any] | N
 @command
 def tell(
     store: StoreArgument,
-    trial: Annotated[int, typer.Argument(metavar="TRIAL", help="The number that `ctxval ask` said.")],
-    trajectory: Annotated[Path | None, typer.Option(help="CSV of what happened, with named columns.")] = None,
-    npz: Annotated[Path | None, typer.Option(help="NPZ of what happened: times, states, inputs.")] = None,
-    distance: Annotated[float | None, typer.Option(help="The distance alone, where nothing was recorded.")] = None,
-    failed: Annotated[str | None, typer.Option(help="Why there is no result.")] = None,
+    trial: Annotated[int, typer.Argument(metavar="TRIAL", help="Number of the trial, as printed by `ctxval ask`.")],
+    trajectory: Annotated[
+        Path | None, typer.Option(help="CSV file of the recorded trajectory, with named columns.")
+    ] = None,
+    npz: Annotated[
+        Path | None, typer.Option(help="NPZ file of the recorded trajectory, with the arrays times, states and inputs.")
+    ] = None,
+    distance: Annotated[float | None, typer.Option(help="Distance of the trial, if there is no recording.")] = None,
+    failed: Annotated[
+        str | None, typer.Option(metavar="REASON", help="Reason why the execution has no usable result.")
+    ] = None,
     resample: Resample = False,
     start_tolerance: StartTolerance = None,
     experiment: Named = None,
@@ -122,22 +151,22 @@ def tell(
     accept_change: AcceptChange = None,
     as_json: AsJson = False,
 ) -> Any:
-    """Say how an open trial ended."""
+    """Record the result of an open trial: exactly one of --trajectory, --npz, --distance and --failed."""
     given = {"--trajectory": trajectory, "--npz": npz, "--distance": distance, "--failed": failed}
     if sum(value is not None for value in given.values()) != 1:
         raise InputError(f"exactly one of {', '.join(given)} must be given.")
     if failed is not None and not failed.strip():
         raise InputError('--failed needs a reason, such as "the motor cut out".')
     if trajectory is None and npz is None and (resample or start_tolerance is not None):
-        raise InputError("--resample and --start-tolerance are for a recording, and there is none.")
-    tolerance = _tolerance(start_tolerance)
+        raise InputError("--resample and --start-tolerance need a recording: give --trajectory or --npz.")
+    _require_tolerance(start_tolerance)
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
     recording = None
     path = trajectory or npz
     if path is not None:
         plan = opened.campaign.reopen(trial).plan
         recording = read_recording(path, opened.experiment, plan, npz=npz is not None, resample=resample)
-    ended = opened.campaign.tell(trial, recording, distance=distance, failed=failed, start_tolerance=tolerance)
+    ended = opened.campaign.tell(trial, recording, distance=distance, failed=failed, start_tolerance=start_tolerance)
     report = _ended(ended, opened)
     if not as_json:
         out.say(_sentence(ended, opened.experiment))
@@ -152,8 +181,8 @@ def import_runs(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="Tables of known runs: CSV with the task parameters and trajectory, distance or failed; "
-            "with --set, one trajectory.",
+            help="CSV tables of earlier runs. Each row has the task parameters and a value in one of the columns "
+            "trajectory, distance and failed. With --set, the file is one recorded trajectory.",
         ),
     ],
     parameters: Set = None,
@@ -164,18 +193,15 @@ def import_runs(
     accept_change: AcceptChange = None,
     as_json: AsJson = False,
 ) -> Any:
-    """Take in executions that were made before; each counts as one, and none is taken in twice."""
-    tolerance = _tolerance(start_tolerance)
+    """Import earlier executions into a store.
+
+    Each one counts in the budget. A run that is already in the store is not imported again.
+    """
+    _require_tolerance(start_tolerance)
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
     space = opened.experiment.validation.space
     runs = read_runs(files, parameters_from(parameters, space) if parameters else None, space)
-    checked = []
-    for run in runs:
-        # All of it before any is stored.
-        try:
-            checked.append(run.checked(opened.campaign.validation, opened.experiment, resample, tolerance))
-        except InputError as error:
-            raise InputError(f"{run.where}: {error}") from error
+    checked = [_checked(run, opened, resample, start_tolerance) for run in runs]  # all of them before any is stored
     ended = [opened.campaign.add_known(execution, _WAIT) for execution in checked]
     new = [trial for trial in ended if trial is not None]
     report = {
@@ -186,14 +212,21 @@ def import_runs(
     if not as_json:
         for trial in new:
             out.say(_sentence(trial, opened.experiment))
-        out.say(f"{len(new)} imported, {len(ended) - len(new)} were there already.")
+        out.say(f"{len(new)} runs imported, {len(ended) - len(new)} already in the store.")
     return report
 
 
-def _tolerance(given: float | None) -> float:
+def _checked(run: KnownRun, opened: Opened, resample: bool, start_tolerance: float | None) -> KnownExecution:
+    """Return an earlier run after all checks; an error names the file and the line."""
+    try:
+        return run.checked(opened.campaign.validation, opened.experiment, resample, start_tolerance)
+    except InputError as error:
+        raise InputError(f"{run.where}: {error}") from error
+
+
+def _require_tolerance(given: float | None) -> None:
     if given is not None and not (0 <= given < math.inf):
-        raise InputError(f"--start-tolerance must be a share, a finite number >= 0, got {given!r}.")
-    return START if given is None else given
+        raise InputError(f"--start-tolerance must be a finite number >= 0, got {given!r}.")
 
 
 def _opened(
@@ -202,12 +235,14 @@ def _opened(
     path = Path(target)
     if path.suffix != ".toml" and path.is_file():
         if any(value is not None for value in overrides.values()):
-            raise InputError(f"{target} is a store, which knows its search and its seed; give no other.")
+            raise InputError(
+                f"{target} is a store and keeps its own settings: remove --store, --search, --seed and --option."
+            )
         return open_store(Store.existing(path), path, experiment, trust, accept_change)
     if path.suffix in _STORES:
-        raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` makes one.")
+        raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` creates one.")
     if experiment is not None or trust:
-        raise InputError(f"--experiment and --trust are for a store, and {target} is what a store is of.")
+        raise InputError(f"--experiment and --trust need a store as the first argument, and {target} is an experiment.")
     settings = read_settings(target, overrides)
     made = settings.load()
     where = settings.store_path(made.name)
@@ -239,6 +274,5 @@ def _print_asked(report: dict[str, Any], opened: OpenTrial) -> None:
     out.say(f"trial {opened.number}: {task}")
     out.say(f"{', '.join(report['files'])} in {report['folder']}")
     if "controller.json" not in report["files"]:
-        out.say("its controller cannot be written to a file: only affine feedback, of LQR and iLQR, can.")
-    told = f"ctxval tell {shlex.quote(report['store'])} {opened.number} --trajectory run.csv"
-    out.say(f"afterwards: {told}")
+        out.say("the controller cannot be written to a file: this is possible only for affine feedback (LQR and iLQR).")
+    out.say(f"next: ctxval tell {shlex.quote(report['store'])} {opened.number} --trajectory run.csv")

@@ -1,4 +1,4 @@
-"""``ctxval cases`` and ``ctxval reproduce``: the cases that are found by name, and the paper's experiments."""
+"""``ctxval cases`` and ``ctxval reproduce``: the built-in cases and the experiments of the paper."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import typer
 from rich.progress import Progress, TextColumn
 
 from ctxval import cases as known_cases
-from ctxval.cli.base import AsJson, app, command, err, print_table
+from ctxval.cli.base import app, command, err, print_table
 from ctxval.cli.base import out as screen
+from ctxval.cli.options import AsJson
 from ctxval.config.experiments import plain_options
 from ctxval.errors import InputError
 
@@ -18,12 +19,15 @@ from ctxval.errors import InputError
 @app.command()
 @command
 def cases(
-    name: Annotated[str | None, typer.Argument(metavar="CASE", help="Show this case alone.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="CASE", help="Name of one case; the others are not listed.")
+    ] = None,
     as_json: AsJson = False,
 ) -> Any:
-    """List the cases that can be run by name, with their options: the paper's systems, and those of installed packages.
+    """List the cases, with their options: the systems of the paper, and those of installed packages.
 
-    Set an option with `ctxval run CASE --option NAME=VALUE`.
+    A case is an experiment that `ctxval run` finds by its name. Set its options with `ctxval run CASE --option
+    NAME=VALUE`.
     """
     listed = list(known_cases.REGISTRY) if name is None else [name]
     found = {each: _described(each, skip_broken=name is None) for each in listed}
@@ -36,7 +40,7 @@ def cases(
 
 
 def _described(name: str, *, skip_broken: bool) -> tuple[str, dict[str, Any]]:
-    """Return what a case is, and its options; of one that cannot be loaded why, if it is to be skipped."""
+    """Return the description and the options of a case; if it cannot be loaded and is skipped, the reason."""
     try:
         return known_cases.text_of(name), plain_options(name)
     except InputError as error:
@@ -53,18 +57,20 @@ def _options_text(options: dict[str, Any]) -> list[str]:
 @app.command()
 @command
 def reproduce(
-    name: Annotated[str, typer.Argument(metavar="STUDY|all", help="Which of the paper's figures, or all.")],
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer trials, coarser grids.")] = False,
+    name: Annotated[str, typer.Argument(metavar="STUDY|all", help="Figure or study of the paper, or all.")],
+    quick: Annotated[bool, typer.Option("--quick", help="Use fewer trials and coarser grids.")] = False,
     out: Annotated[
-        Path, typer.Option(help="Folder of the figures and their data; the table is written beside it.")
+        Path, typer.Option(help="Folder for the figures and their data. The table is written next to the folder.")
     ] = Path("reproduction"),
     results: Annotated[
         Path | None,
-        typer.Option(help="Folder of the stored runs, which are not run again (default: OUT/results)."),
+        typer.Option(
+            help="Folder of the stored runs. A run in it is not computed again (default: results in the --out folder)."
+        ),
     ] = None,
-    workers: Annotated[int, typer.Option(help="Processes.")] = 2,
+    workers: Annotated[int, typer.Option(help="Number of parallel processes.")] = 2,
 ) -> None:
-    """Run the paper's experiments: figures, their data, and the table of its claims."""
+    """Run the experiments of the paper and write its figures, their data and a table of its claims."""
     from ctxval import reproduce as paper  # imported here: the other commands do not need it
 
     with Progress(TextColumn("runs"), *Progress.get_default_columns(), console=err) as progress:

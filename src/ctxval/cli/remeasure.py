@@ -1,13 +1,11 @@
-"""``ctxval remeasure``: distances anew for what was executed."""
+"""``ctxval remeasure``: recompute the distances of stored executions."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
-from ctxval.cli.base import AsJson, app, command, out, worst_of
+from ctxval.cli.base import app, command, out, worst_of
+from ctxval.cli.options import AsJson, StoreArgument
 from ctxval.cli.trust import AcceptChange, Named, Trust, open_store
 from ctxval.storage.store import Store
 
@@ -15,16 +13,16 @@ from ctxval.storage.store import Store
 @app.command()
 @command
 def remeasure(
-    store: Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials.")],
+    store: StoreArgument,
     experiment: Named = None,
     trust: Trust = False,
     accept_change: AcceptChange = None,
     as_json: AsJson = False,
 ) -> Any:
-    """Compute the distance of every stored execution again, after the distance was changed or mended.
+    """Recompute the distances of all stored executions, after you changed the distance function.
 
-    Nothing is executed. If the distance stands in an experiment file, name the file with --experiment. The values that
-    were stored before stay in the store's history.
+    Nothing is executed. If an experiment file defines the distance, name the file with --experiment. The history of the
+    store keeps the earlier values.
     """
     known = Store.existing(store)
     before = {trial.number: trial.distance for trial in known.trials()}
@@ -46,11 +44,12 @@ def remeasure(
 def _print(report: dict[str, Any]) -> None:
     changed, waiting = len(report["changed"]), report["unmeasured"]
     if changed:
-        out.say(f"{changed} of {report['measured']} distances have changed; the store's history has those of before.")
+        count = f"{changed} of {report['measured']}"
+        out.say(f"{count} distances have changed. The history of the store keeps the earlier values.")
     else:
-        out.say("no distance has changed; if the distance stands in an experiment file, name it with --experiment.")
+        out.say("no distance has changed. If an experiment file defines the distance, name the file with --experiment.")
     if waiting:
-        out.say(f"without a distance: trials {', '.join(map(str, waiting))}.")
+        out.say(f"trials without a distance: {', '.join(map(str, waiting))}.")
     if report["worst"] is not None:
         task = ", ".join(f"{name} = {value}" for name, value in report["worst"]["task"].items())
         out.say(f"the largest distance is {report['worst']['distance']:.4g} at {task}.")

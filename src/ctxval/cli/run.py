@@ -1,4 +1,4 @@
-"""``ctxval run``."""
+"""``ctxval run``: search for the worst task and give the verdict."""
 
 from __future__ import annotations
 
@@ -16,11 +16,6 @@ from ctxval.certificates.verdict import Verdict, require_threshold
 from ctxval.cli.base import (
     CANNOT_GO_ON,
     FALSIFIED,
-    RESOLUTION_HELP,
-    AsJson,
-    Dask,
-    Timeout,
-    Workers,
     app,
     certificate_of,
     command,
@@ -35,7 +30,20 @@ from ctxval.cli.base import (
     worker_options,
     worst_of,
 )
-from ctxval.cli.case_options import CaseOptions, case_options
+from ctxval.cli.options import (
+    SEARCH_METHODS,
+    TARGET,
+    AsJson,
+    Confidence,
+    Dask,
+    PartOptions,
+    Resolution,
+    Stochastic,
+    Threshold,
+    Timeout,
+    Workers,
+    named_values,
+)
 from ctxval.cli.trust import AcceptChange
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment
@@ -43,50 +51,80 @@ from ctxval.core.truth import Truth
 from ctxval.errors import InputError
 from ctxval.storage.other_stores import other_stores
 
+Target = Annotated[
+    str,
+    typer.Argument(
+        metavar=TARGET, help="Experiment to run: a case, an experiment file, or a reference to an object in Python."
+    ),
+]
+Budget = Annotated[
+    int | None,
+    typer.Option(
+        help="Maximum number of executions of the system, including earlier ones in the store (default: the budget of "
+        "the experiment)."
+    ),
+]
+SearchName = Annotated[str | None, typer.Option(help=f"Search method: {SEARCH_METHODS} (default: auto).")]
+UntilDecided = Annotated[
+    bool,
+    typer.Option(
+        "--until-decided", help="Stop as soon as the model is validated or falsified, or when the budget is spent."
+    ),
+]
+Seed = Annotated[
+    int | None, typer.Option(help="Seed of the random numbers of the data, the model and the search (default: 0).")
+]
+StoreFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Store of the campaign. If the file exists, the campaign is resumed (default: a file in the folder runs, "
+        "named after the experiment, the search and the seed)."
+    ),
+]
+WithTruth = Annotated[
+    bool, typer.Option("--truth", help="Also compute the true maximum distance. This needs a simulated system.")
+]
+Variant = Annotated[str | None, typer.Option(help="Variant of a case; the same as --option variant=VALUE.")]
+ModelName = Annotated[str | None, typer.Option(help="Learned model of a case; the same as --option model=VALUE.")]
+Dimension = Annotated[int | None, typer.Option(help="Number of states of a case; the same as --option dim=VALUE.")]
+
 
 @app.command()
 @command
 def run(
-    target: Annotated[str, typer.Argument(metavar="CASE|FILE.toml|module:attr", help="What to validate.")],
-    budget: Annotated[int | None, typer.Option(help="Executions of the system in all, earlier ones counted.")] = None,
-    search: Annotated[str | None, typer.Option(help="How tasks are chosen: auto, gp-ucb, random, ...")] = None,
-    threshold: Annotated[float | None, typer.Option(help="Largest distance that you can accept.")] = None,
-    confidence: Annotated[float | None, typer.Option(help="Of a validation, at least 0.5; 0.95 if not given.")] = None,
-    until_decided: Annotated[
-        bool, typer.Option("--until-decided", help="Stop as soon as the verdict is reached; the budget is the most.")
-    ] = False,
-    stochastic: Annotated[
-        bool | None,
-        typer.Option("--stochastic", help="Executions of one task may differ; what is judged is the expected one."),
-    ] = None,
-    resolution: Annotated[
-        float | None,
-        typer.Option(help=RESOLUTION_HELP),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of the data, the model and the search.")] = None,
-    store: Annotated[Path | None, typer.Option(help="File of the trials; it is resumed if it exists.")] = None,
-    truth: Annotated[bool, typer.Option("--truth", help="Find the true maximum too, of a simulated system.")] = False,
+    target: Target,
+    budget: Budget = None,
+    search: SearchName = None,
+    threshold: Threshold = None,
+    confidence: Confidence = None,
+    until_decided: UntilDecided = False,
+    stochastic: Stochastic = None,
+    resolution: Resolution = None,
+    seed: Seed = None,
+    store: StoreFile = None,
+    truth: WithTruth = False,
     workers: Workers = None,
     dask: Dask = None,
     timeout: Timeout = None,
     accept_change: AcceptChange = None,
     as_json: AsJson = False,
-    option: CaseOptions = None,
-    variant: Annotated[str | None, typer.Option(help="Variant of a case; the same as --option variant=...")] = None,
-    model: Annotated[str | None, typer.Option(help="Learned model of a case; the same as --option model=...")] = None,
-    dim: Annotated[int | None, typer.Option(help="Number of states of a case; the same as --option dim=...")] = None,
+    option: PartOptions = None,
+    variant: Variant = None,
+    model: ModelName = None,
+    dim: Dimension = None,
 ) -> Any:
-    """Search for the task at which the system differs most from its model."""
-    options = case_options(option, variant=variant, model=model, dim=dim)
+    """Search for the task at which the system differs most from its model.
+
+    If the store exists, the campaign is resumed. Options that are not given have the values in the experiment file.
+    """
+    options = named_values(option, variant=variant, model=model, dim=dim)
     given = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence, "seed": seed}
     settings = read_settings(target, {**given, "store": store, "options": options})
-    said = {"stochastic": stochastic, "resolution": resolution}
-    settings = settings.certified_as({key: value for key, value in said.items() if value is not None})
+    settings = settings.certified_as({"stochastic": stochastic, "resolution": resolution})
     experiment = settings.load()
     if truth:
         _require_truth(experiment)  # before executions are paid for
-    chosen = experiment.threshold if settings.threshold is None else settings.threshold
-    limit = None if chosen is None else require_threshold(chosen)
+    limit = _limit(experiment, settings)
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
     total = experiment.budget if settings.budget is None else settings.budget
@@ -99,22 +137,34 @@ def run(
     report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path)]
     if not as_json:
         _print_report(report, verdict)
+    return report, _status(campaign, verdict)
+
+
+def _limit(experiment: Experiment, settings: Settings) -> float | None:
+    """Return the threshold of the verdict; None if neither the settings nor the experiment have one."""
+    threshold = experiment.threshold if settings.threshold is None else settings.threshold
+    return None if threshold is None else require_threshold(threshold)
+
+
+def _status(campaign: Campaign, verdict: Verdict | None) -> int:
+    """Return the exit status of a run; if all executions failed, print an error."""
     if campaign.failed and not campaign.completed:
         say_error(f"all {len(campaign.failed)} executions failed, so there is no distance.")
-        return report, CANNOT_GO_ON
-    return report, FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
+        return CANNOT_GO_ON
+    return FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
 
 def _until_decided(campaign: Campaign, threshold: float | None, settings: Settings) -> Callable[..., Campaign]:
     if threshold is None:
-        raise InputError("--until-decided needs a threshold to decide about; say --threshold.")
+        raise InputError("--until-decided needs a threshold: give --threshold.")
     return functools.partial(campaign.run_until_decided, threshold, certificate=settings.certificate_options)
 
 
 def _require_truth(experiment: Experiment) -> None:
     if experiment.truth is None:
         raise InputError(
-            f"the truth of {experiment.name!r} is not known: only cases, and experiments that say it, have it."
+            f"the true maximum of {experiment.name!r} is not known. Only experiments with a `truth` function have it, "
+            "such as the cases of the paper."
         )
 
 
@@ -159,7 +209,7 @@ def _save_pictures(campaign: Campaign, experiment: Experiment, path: Path) -> li
     try:
         return _draw_pictures(campaign, experiment, path)
     except Exception as error:
-        # A picture must not hide the verdict that was paid for.
+        # An error in a figure must not hide the verdict, for which executions were paid.
         err.say(f"no pictures: {reason_of(error)}")
         return []
 
@@ -180,7 +230,7 @@ def _draw_pictures(campaign: Campaign, experiment: Experiment, path: Path) -> li
 
 
 def _true_curve(experiment: Experiment) -> plot.Curve | None:
-    """Return the distance on a grid, where that is cheap: a simulated system over one parameter."""
+    """Return the distance on a grid if this is cheap, that is, for a simulated system and one task parameter."""
     space = experiment.validation.space
     if experiment.truth is None or space.dimension > 1:
         return None

@@ -1,4 +1,4 @@
-"""``ctxval status`` and ``ctxval export``: what a store holds."""
+"""``ctxval status`` and ``ctxval export``: the trials in a store."""
 
 from __future__ import annotations
 
@@ -8,31 +8,20 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval.cli.base import (
-    AsJson,
-    app,
-    command,
-    failures_of,
-    out,
-    print_failures,
-    print_table,
-    worst_of,
-)
+from ctxval.cli.base import app, command, failures_of, out, print_failures, print_table, worst_of
+from ctxval.cli.options import AsJson, StoreArgument
 from ctxval.errors import StoreAccessError
 from ctxval.storage.recovery import export, recover
 from ctxval.storage.store import Store
 
 _SENTENCES = 20
-"""Sentences on what is damaged that are printed."""
+"""Largest number of sentences about damage that are printed."""
 
 
 @app.command()
 @command
-def status(
-    store: Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials.")],
-    as_json: AsJson = False,
-) -> Any:
-    """Say what a store holds; nothing is executed."""
+def status(store: StoreArgument, as_json: AsJson = False) -> Any:
+    """Summarise the trials in a store. Nothing is executed."""
     opened = Store.existing(store)
     description, trials = opened.description(), opened.trials()
     search = description.get("search")
@@ -62,14 +51,21 @@ def status(
 @app.command("export")
 @command
 def export_store(
-    store: Annotated[Path, typer.Argument(metavar="STORE", help="File of a campaign's trials, whole or damaged.")],
-    folder: Annotated[Path | None, typer.Option("--out", help="Folder to write to; one beside the store.")] = None,
+    store: Annotated[
+        Path, typer.Argument(metavar="STORE", help="Store of a campaign (a .sqlite file). It may be damaged.")
+    ],
+    folder: Annotated[
+        Path | None, typer.Option("--out", help="Output folder (default: a folder next to the store).")
+    ] = None,
     as_json: AsJson = False,
 ) -> Any:
-    """Write what is readable of a store as CSV and JSON."""
+    """Write the trials of a store as CSV and JSON.
+
+    If the store is damaged, everything that can be read is written.
+    """
     found = recover(store)
     if found.damaged and not found.trials and not found.trajectories:
-        raise StoreAccessError(f"nothing can be read in {store}: it is no store, or all of it is damaged.")
+        raise StoreAccessError(f"nothing can be read from {store}: it is not a store, or it is damaged completely.")
     target = store.with_suffix(".export") if folder is None else folder
     export(found, target)
     report = {
@@ -80,8 +76,8 @@ def export_store(
     }
     if not as_json:
         for sentence in found.damaged[:_SENTENCES]:
-            out.say(("not readable", "yellow"), f": {sentence}")
+            out.say(("cannot be read", "yellow"), f": {sentence}")
         if len(found.damaged) > _SENTENCES:
-            out.say(f"and {len(found.damaged) - _SENTENCES} other things; trials.json names them.")
+            out.say(f"and {len(found.damaged) - _SENTENCES} others; trials.json lists them.")
         out.say(f"{len(found.trials)} trials and {len(found.trajectories)} trajectories in {target}")
     return report

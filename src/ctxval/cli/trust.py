@@ -1,4 +1,4 @@
-"""Opening a store with the experiment that it names, if the user made the store or trusts it."""
+"""Open a store with the experiment that it names, if the user made the store or trusts it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import typer
 
 from ctxval.campaign.campaign import Campaign
 from ctxval.cli.base import err
+from ctxval.cli.options import TARGET
 from ctxval.config.settings import Settings, trusted_settings
 from ctxval.config.signatures import code_named, verifies, why_no_key
 from ctxval.core.experiment import Experiment
@@ -20,24 +21,24 @@ Trust = Annotated[
     bool,
     typer.Option(
         "--trust",
-        help="Import and run the code that the store names, although you did not make the store on this computer.",
+        help="Allow the code that the store names to run, although you did not make the store on this computer.",
     ),
 ]
 AcceptChange = Annotated[
     str | None,
     typer.Option(
         "--accept-change",
-        metavar="WHY",
-        help="Continue although the experiment differs from the stored one. Give the reason, which the store keeps: "
-        "for example, the system was repaired, or the code computes the same.",
+        metavar="REASON",
+        help="Continue although the experiment differs from the stored one. Give the reason, for example that the "
+        "system was repaired or that the code still computes the same. The store keeps the reason.",
     ),
 ]
 Named = Annotated[
     str | None,
     typer.Option(
         "--experiment",
-        metavar="CASE|FILE.toml|module:attr",
-        help="Name the experiment of the store yourself. Use it if you do not trust what the store names.",
+        metavar=TARGET,
+        help="Experiment of the store. Use this option if you do not trust the code that the store names.",
     ),
 ]
 
@@ -53,13 +54,13 @@ class Opened:
 
 
 def settings_of(store: Store, experiment: str | None, trust: bool) -> Settings:
-    """Return the settings that the experiment of a store may be built from.
+    """Return the settings that the experiment of a store is built from.
 
     Raises:
-        InputError: they name code that the user has not allowed to run.
+        InputError: if the settings name code that the user has not allowed to run.
     """
     if experiment is not None and trust:
-        raise InputError("of --trust and --experiment only one can be given.")
+        raise InputError("--trust and --experiment cannot be given together.")
     return trusted_settings(store, experiment=experiment, trust=trust)
 
 
@@ -76,15 +77,15 @@ def open_store(
 
     Args:
         store: the store.
-        path: of its file, as it was typed.
-        experiment: the experiment that the user names; None if it is the one that the store names.
-        trust: whether the user trusts what the store names.
-        accept_change: why the experiment may differ from the stored one; None if it may not.
+        path: the path of its file, as the user typed it.
+        experiment: the experiment that the user names; None to use the one that the store names.
+        trust: whether the user trusts the code that the store names.
+        accept_change: the reason why the experiment may differ from the stored one; None if it may not.
         remeasure: whether the distance may differ from the stored one.
 
     Raises:
-        InputError: it names code that the user has not allowed to run.
-        StoreError: it was made by another experiment.
+        InputError: if the store names code that the user has not allowed to run.
+        StoreError: if another experiment made the store.
     """
     settings = settings_of(store, experiment, trust)
     asked = (trust or experiment is not None) and not verifies(store.settings())
@@ -104,14 +105,14 @@ def _load(settings: Settings) -> Experiment:
         if settings.folder is None or settings.folder.is_dir():
             raise
         raise InputError(
-            f"{error} It is to be sought in {str(settings.folder)!a}, which is no folder any more: name the experiment "
-            "where it is now, --experiment FILE.toml or module:attr."
+            f"{error} The store names the folder {str(settings.folder)!a}, which does not exist any more: name the "
+            "experiment at its present place with --experiment FILE.toml or module:attr."
         ) from error
 
 
 def _say_signed(opened: Opened) -> None:
     reason = why_no_key()
-    sentence = f"{opened.path} is signed for you now, and you are not asked again."
+    sentence = f"{opened.path} now carries your signature, and the question will not be asked again."
     if reason is not None:
-        sentence = f"{opened.path} cannot be signed for you, and you will be asked again: {reason}."
+        sentence = f"{opened.path} cannot carry your signature, and the question will be asked again: {reason}."
     err.say(sentence)

@@ -1,4 +1,4 @@
-"""The table ``[certificate]`` of an experiment file, and what the command line states over it."""
+"""The table ``[certificate]`` of an experiment file, and the options of the command line that override it."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from ctxval.config.parts import require_types
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 
 _OF_ANY_KIND = ("stochastic", "resolution", "volume")
-"""Settings of a file that hold for a certificate of another kind too, if that has a use for them."""
+"""Settings of a file that also apply to a certificate of another kind, if that kind has these options."""
 
 
 class CertificateTable(BaseModel):
-    """The table ``[certificate]``: what a validation is to rest on, chosen before it is run.
+    """The table ``[certificate]``: the certificate for the verdict, chosen before the campaign is run.
 
-    Kinds of certificates from other packages have their own options in it.
+    A kind of certificate from another package has its own options in the table.
 
     Attributes:
-        kind: which certificate.
+        kind: the kind of the certificate.
         stochastic: whether two executions of one task may differ.
-        volume: share of the task space that may exceed the threshold.
-        resolution: how far from every trial a task may be, in diagonals of the task space.
-        discard, constant: of some kinds.
+        volume: the share of the task space that may exceed the threshold.
+        resolution: the largest distance between a task and its nearest trial, in diagonals of the task space.
+        discard: the number of largest distances to discard, for ``sampling-discarding``.
+        constant: the constant C, for ``convergence``.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -49,7 +50,7 @@ class CertificateTable(BaseModel):
     @model_validator(mode="after")
     def _used(self) -> CertificateTable:
         if self.kind not in KINDS.imported:
-            return self  # its options are checked when it is used: reading settings imports nothing
+            return self  # reading settings imports nothing, so the options are checked when the kind is used
         try:
             for name in self.model_extra or {}:
                 self._require_known(name)
@@ -65,7 +66,7 @@ class CertificateTable(BaseModel):
             raise UnknownNameError.among("setting", name, names)
 
     def _changed(self) -> set[str]:
-        """Return the options that are not as they are by default."""
+        """Return the names of the options whose values differ from the default."""
         fields = {name: field for name, field in type(self).model_fields.items() if name != "kind"}
         changed = {name for name, field in fields.items() if getattr(self, name) != field.default}
         return changed | set(self.model_extra or {})
@@ -73,17 +74,17 @@ class CertificateTable(BaseModel):
     def options(
         self, confidence: float, *, kind: str | None = None, stated: Mapping[str, Any] | None = None
     ) -> CertificateOptions:
-        """Return by which certificate trials are to be judged.
+        """Return the kind, the options and the confidence of the certificate for the verdict.
 
         Args:
-            confidence: of the certificate.
-            kind: in place of the table's; the table's own options of a kind are then left out.
-            stated: options over those of the table; none of them is None.
+            confidence: the confidence level of the certificate.
+            kind: replaces the kind of the table; the options of the table's own kind are then not used.
+            stated: options that override those of the table; no value is None.
 
         Raises:
-            UnknownNameError: there is no such kind, or no such option.
-            CertificateError: an option is for other kinds, or has a value that the kind does not allow.
-            InputError: an option has another type, or the confidence or the volume are out of range.
+            UnknownNameError: if there is no such kind or no such option.
+            CertificateError: if an option is for other kinds, or has a value that the kind does not allow.
+            InputError: if an option has the wrong type, or if the confidence or the volume is out of range.
         """
         given, chosen = dict(stated or {}), KINDS.find(kind or self.kind)
         if kind is None and self.kind not in KINDS.imported:
@@ -95,9 +96,9 @@ class CertificateTable(BaseModel):
 
 
 def typed(kind: type[CertificateKind], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options of a kind, lists made tuples if it wants tuples.
+    """Return the options of a kind, with lists converted to tuples if the kind takes tuples.
 
     Raises:
-        InputError: an option has another type than the kind says.
+        InputError: if an option does not have the type that the kind declares.
     """
     return require_types(f"certificate {kind.name!r}", kind, options)

@@ -1,4 +1,4 @@
-"""Checks of an experiment: its parts against each other without executing the system, and two executions on request."""
+"""Checks that the parts of an experiment fit together; the system is executed only on request."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ FindingState = Literal["ok", "noted", "failed", "skipped"]
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found.
+    """The result of one check.
 
     Attributes:
-        check: what was checked.
-        state: ``failed`` is a fault, ``noted`` is worth knowing, ``skipped`` was not checked.
-        text: one sentence.
+        check: the name of the check.
+        state: ``ok``; ``failed`` if there is an error; ``noted`` if the user should read the text; ``skipped`` if the
+            check was not made.
+        text: one sentence that explains the result.
     """
 
     check: str
@@ -43,7 +44,7 @@ class Finding:
 
 
 def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int = 0) -> list[Finding]:
-    """Check the parts of an experiment against each other.
+    """Check that the parts of an experiment fit together.
 
     Args:
         experiment: the experiment.
@@ -117,7 +118,7 @@ def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Fin
         "controller on the model",
         "ok" if reached else "noted",
         f"ends at most {errors[worst]:.3g} from the goal (1-norm of the states), at {where}"
-        + ("" if reached else "; a controller that fails on the model itself is no use on the system"),
+        + ("" if reached else "; a controller that fails on the model itself cannot be expected to work on the system"),
     )
 
 
@@ -129,7 +130,7 @@ def _names(experiment: Experiment, plan: Plan) -> Iterator[Finding]:
     counts = plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1]
     for kind, labels, count in zip(("states", "inputs"), (experiment.states, experiment.inputs), counts, strict=True):
         if labels and len(labels) != count:
-            sentence = f"there are {count} {kind}, but names for {len(labels)}: {', '.join(labels)}"
+            sentence = f"there are {count} {kind}, but the number of names is {len(labels)}: {', '.join(labels)}"
             yield Finding("names", "failed", sentence)
     for kind, named in zip(("states", "inputs"), experiment.names(*counts), strict=True):
         bare = [name for name, unit in named.items() if not unit]
@@ -141,17 +142,19 @@ def _names(experiment: Experiment, plan: Plan) -> Iterator[Finding]:
 
 
 def _system(validation: Validation, plan: Plan) -> Iterator[Finding]:
-    """Compare the time step, states and inputs that a system states with those of the task and the controller."""
+    """Compare the time step, the states and the inputs of the system with those of the task and the model."""
     system, task = validation.system, plan.task
     dt = getattr(system, "dt", None)
     if isinstance(dt, int | float) and not np.isclose(dt, task.dt, rtol=1e-9, atol=0):
-        yield Finding("system", "failed", f"its time step is {dt:g} s, the task's {task.dt:g} s")
+        yield Finding("system", "failed", f"the time step of the system is {dt:g} s, that of the task is {task.dt:g} s")
     counts = plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1]
     for kind, count in zip(("states", "inputs"), counts, strict=True):
         own = getattr(system, kind, None)
         if isinstance(own, dict | list | tuple) and len(own) != count:
             yield Finding(
-                "system", "failed", f"it has {len(own)} {kind}, the model {count}: {', '.join(map(str, own))}"
+                "system",
+                "failed",
+                f"the system has {len(own)} {kind}, the model has {count}: {', '.join(map(str, own))}",
             )
 
 
@@ -159,10 +162,12 @@ def _model(validation: Validation, plan: Plan) -> Iterator[Finding]:
     states, inputs = plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1]
     try:
         check_model(validation.model, states=states, inputs=inputs)
-        yield Finding("model", "ok", "takes batches as single states; its Jacobian, if it has one, is its derivative")
+        yield Finding(
+            "model", "ok", "batches and single states give the same; the Jacobian, if there is one, is the derivative"
+        )
     except ConformanceError:
         check_model(validation.model, states=states, inputs=inputs, tolerance=1e-5)
-        yield Finding("model", "noted", "agrees with itself in single precision only")
+        yield Finding("model", "noted", "its results for batches and single states agree only to single precision")
 
 
 def _batches(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]:
@@ -173,17 +178,21 @@ def _batches(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]
     except Exception:
         same = False
     if not same:
-        yield Finding("batches", "noted", "the task function takes one point at a time: true maxima are slower to find")
+        yield Finding("batches", "noted", "the task function takes one point at a time, so --truth is slower")
         return
     for index, plan in enumerate(plans):
         one = batch[index]
         if not np.array_equal(one.reference, plan.task.reference) or not np.array_equal(
             one.initial_state, plan.task.initial_state
         ):
-            yield Finding("batches", "failed", f"the task function makes another task {index} in a batch than alone")
+            yield Finding(
+                "batches",
+                "failed",
+                f"task {index} of a batch differs from the same task alone: check the task function",
+            )
             return
     check_synthesizer(validation.synthesizer, _first(batch, 4), validation.model)
-    yield Finding("batches", "ok", "task function and synthesizer do in a batch what they do alone")
+    yield Finding("batches", "ok", "task function and synthesizer give the same results in a batch as alone")
 
 
 def _first(batch: Task, count: int) -> Task:
@@ -205,10 +214,12 @@ def _distance(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding
     except Exception:
         for plan, trajectory in zip(plans, trajectories, strict=True):
             validation.measure(plan, trajectory)
-        yield Finding("distance", "noted", "takes one task at a time, so true maxima are slower to find")
+        yield Finding("distance", "noted", "the distance takes one task at a time, so --truth is slower")
     own = [validation.measure(plan, trajectory) for plan, trajectory in zip(plans, trajectories, strict=True)]
     if max(own) > 0:
-        yield Finding("distance", "noted", f"up to {max(own):.3g} already between the model and itself")
+        yield Finding(
+            "distance", "noted", f"the distance between a trajectory and itself is up to {max(own):.3g}, not 0"
+        )
 
 
 def _stacked(trajectories: Sequence[Trajectory], shift: float) -> Trajectory:
@@ -222,13 +233,15 @@ def _executions(validation: Validation, plan: Plan, execute: bool) -> Iterator[F
         yield Finding("execution", "skipped", "people execute this system: see `ctxval ask`")
         return
     if not execute:
-        yield Finding("execution", "skipped", "say --execute to execute one task twice")
+        yield Finding("execution", "skipped", "give --execute to execute one task twice")
         return
     first, second = validation.execute(plan), validation.execute(plan)
     for trajectory in (first, second):
         gap = float(np.abs(trajectory.states[0] - plan.task.initial_state).max())
         if gap > _SAME_START:
-            yield Finding("execution", "failed", f"it starts {gap:.3g} away from the task's initial state")
+            yield Finding(
+                "execution", "failed", f"the execution starts {gap:.3g} away from the initial state of the task"
+            )
     noise = float(np.abs(first.states - second.states).max())
     distances = [validation.measure(plan, trajectory) for trajectory in (first, second)]
     if noise == 0:
@@ -238,5 +251,5 @@ def _executions(validation: Validation, plan: Plan, execute: bool) -> Iterator[F
         "execution",
         "noted",
         f"two executions of one task differ by up to {noise:.3g} in a state and {abs(distances[0] - distances[1]):.3g} "
-        "in the distance: the system is stochastic; say so in [certificate]",
+        "in the distance: the system is stochastic; give --stochastic, or stochastic = true in [certificate]",
     )

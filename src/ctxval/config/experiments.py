@@ -1,4 +1,4 @@
-"""Experiments that are made elsewhere: cases by name, and ``module:attr`` references."""
+"""Experiments that are not described in a file: cases by name, and ``module:attr`` references."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from ctxval.errors import CtxvalError, InputError
 
 
 def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path | None = None) -> Experiment:
-    """Return a case, or what ``module:attr`` names or makes; the latter runs the module's code.
+    """Return the experiment that the name of a case or a reference gives; a reference runs the code of its module.
 
     Args:
-        text: the name of a case, or the reference.
-        seed: of the data and so of the model.
-        options: plain values, passed on to the case or the function.
-        folder: where the module is sought; the current folder by default.
+        text: the name of a case, or ``module:attr`` of an experiment or of a function that makes one.
+        seed: the seed of the data, and therefore of the model.
+        options: plain values that are passed on to the case or the function.
+        folder: the folder in which the module is searched; the current folder by default.
 
     Raises:
-        UnknownNameError: there is no such case, or it has no such option; the message has the nearest name.
-        InputError: the experiment cannot be loaded or made.
+        UnknownNameError: if there is no such case or the case has no such option; the message has the nearest name.
+        InputError: if the experiment cannot be loaded or made.
     """
     if ":" in text:
         return _from_reference(text, seed, options, folder)
@@ -36,11 +36,13 @@ def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path
 
 
 def plain_options(case: str) -> dict[str, Any]:
-    """Return the options of a case that a file or a command line can set, with their defaults; None if there is none.
+    """Return the options of a case that a file or a command line can set, with their defaults.
+
+    The default of an option that must be given is None.
 
     Raises:
-        UnknownNameError: there is no such case.
-        InputError: the case belongs to an installed package and cannot be loaded.
+        UnknownNameError: if there is no such case.
+        InputError: if the case belongs to an installed package and cannot be loaded.
     """
     try:
         hints = get_type_hints(cases.REGISTRY.find(case))
@@ -56,7 +58,7 @@ def _is_plain(hint: Any) -> bool:
 
 
 def _from_reference(text: str, seed: int, options: dict[str, Any], folder: Path | None) -> Experiment:
-    """Return what ``module:attr`` names or makes; this runs the module's code."""
+    """Return the experiment that ``module:attr`` names or makes; this runs the code of the module."""
     found = reference(text, folder)
     if is_function(found) and not isinstance(found, Validation | Experiment):
         found = _called(text, found, seed, options)

@@ -37,15 +37,15 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) 
     """Return a system, model, synthesizer or distance.
 
     Args:
-        kind: which of them.
+        kind: ``system``, ``model``, ``synthesizer`` or ``distance``.
         given: ``module:attr``; or a table with ``type``, a name of the registry or ``module:attr``, and its arguments.
-            An argument ``{ref = "module:attr"}`` is what that names. A model with ``data``, files of trajectories, is
-            learned from them.
-        folder: where files and modules are sought; the current folder by default.
+            An argument ``{ref = "module:attr"}`` stands for the object of this name. If a model has the argument
+            ``data``, it is learned from these files of trajectories.
+        folder: the folder of files and modules; the current folder by default.
 
     Raises:
-        UnknownNameError: there is no such part, or it takes no such argument.
-        InputError: it cannot be made so; the message says why.
+        UnknownNameError: if there is no such part, or it takes no such argument.
+        InputError: if the part cannot be made; the message gives the reason.
     """
     registry = REGISTRIES[kind]
     table = {"type": given} if isinstance(given, str) else dict(given)
@@ -66,14 +66,17 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) 
 
 
 def _referenced(registry: Registry[Any], what: str, found: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
-    """Return the part that a reference names: an object, or what a class or a function makes; checked before a call."""
+    """Return the part that a reference names, or that the named class or function makes.
+
+    The class or function is checked before it is called.
+    """
     kind = registry.kind
     if isinstance(found, type):
         build = require_part(registry, what, found)
         return require_part(registry, what, _built(kind, what, build, arguments, folder))
     if inspect.isfunction(found) and (arguments or not _is_part(kind, found)):
         if not arguments and not accepts(found, 0):
-            require_part(registry, what, found)  # says what is wrong
+            require_part(registry, what, found)  # raises an error with the reason
         return require_part(registry, what, _built(kind, what, found, arguments, folder))
     if arguments:
         raise InputError(f"{what} is an object already, so it takes no arguments, got {', '.join(arguments)}.")
@@ -81,7 +84,7 @@ def _referenced(registry: Registry[Any], what: str, found: Any, arguments: dict[
 
 
 def _is_part(kind: str, found: Any) -> bool:
-    """Return whether a function is a part itself, and does not make one."""
+    """Return whether a function is itself a part, rather than a function that makes one."""
     return kind in ("model", "distance") and is_function(found) and accepts(found, 2 if kind == "model" else 3)
 
 
@@ -92,7 +95,7 @@ def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: 
 
 
 def _with_paths(declared: Declaration, table: Mapping[str, Any], folder: Path | None) -> dict[str, Any]:
-    """Return the arguments of a part, in which the paths that they name begin with the folder."""
+    """Return the arguments of a part, with the folder put before their paths."""
     found = dict(table)
     if folder is None:
         return found
@@ -100,16 +103,16 @@ def _with_paths(declared: Declaration, table: Mapping[str, Any], folder: Path | 
         found[declared.folder] = str(folder / str(found.get(declared.folder, "")))
     for name in declared.files:
         file = found.get(name)
-        if isinstance(file, str) and "<" not in file:  # which begins a model of MuJoCo as text
+        if isinstance(file, str) and "<" not in file:  # "<" begins a MuJoCo model that is given as text
             found[name] = str(folder / file)
     return found
 
 
 def argument(value: Any, folder: Path | None = None) -> Any:
-    """Return an argument as it is, or what ``{ref = "module:attr"}`` names.
+    """Return an argument unchanged, or the object that ``{ref = "module:attr"}`` names.
 
     Raises:
-        InputError: what is named cannot be loaded, or is a builtin function, a method or a module.
+        InputError: if the object cannot be loaded, or is a builtin function, a method or a module.
     """
     if isinstance(value, Mapping):
         if set(value) == {"ref"}:
@@ -129,15 +132,15 @@ def recorded(files: Any, folder: Path | None = None) -> Transitions:
     """Return the transitions in recorded trajectories, CSV or NPZ, or in an NPZ file with x, u and x_next.
 
     Args:
-        files: one or several.
-        folder: where they are sought; the current folder by default.
+        files: one path or a list of paths.
+        folder: the folder of the files; the current folder by default.
 
     Raises:
-        InputError: a file cannot be read.
+        InputError: if a file cannot be read.
     """
     paths = [files] if isinstance(files, str) else files
     if not isinstance(paths, list) or not paths or not all(isinstance(path, str) for path in paths):
-        raise InputError(f"data must be files of recorded trajectories, got {files!r}.")
+        raise InputError(f"data must be a file of recorded trajectories or a list of files, got {files!r}.")
     return Transitions.joined([_transitions(Path(folder or "", path)) for path in paths])
 
 
@@ -163,9 +166,10 @@ class TaskTable:
     """A task function without code: every component is a number, or a task parameter by name.
 
     Attributes:
-        initial_state, goal: ``1.5``, ``"name"``, ``"-name"`` or ``"name[2]"``; no goal is zero.
+        initial_state: one component for each state: ``1.5``, ``"name"``, ``"-name"`` or ``"name[2]"``.
+        goal: components in the same form; None for the origin.
         horizon: number of steps.
-        dt: seconds in a step.
+        dt: time step in seconds.
     """
 
     initial_state: tuple[float | str, ...]
@@ -194,10 +198,10 @@ _TASK_KEYS = ("initial_state", "goal", "horizon", "dt")
 
 
 def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any, folder: Path | None = None) -> Any:
-    """Return the map p -> task of an experiment file: ``module:attr``, or a table.
+    """Return the map p -> task of an experiment file, from ``module:attr`` or from a table.
 
     Raises:
-        InputError: the table misses something, or names what is no task parameter.
+        InputError: if an entry of the table is missing, or if a name is not that of a task parameter.
     """
     if isinstance(given, str):
         return require_function(f"the task {given}", reference(given, folder), "p -> Task")
@@ -235,10 +239,10 @@ def _components(name: str, entries: Any) -> tuple[float | str, ...]:
 
 
 def require_types(what: str, function: Any, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options, lists made tuples where the function wants tuples.
+    """Return the options, with lists converted to tuples.
 
     Raises:
-        InputError: an option has another type than the function's annotation says.
+        InputError: if an option does not have the type of the function's annotation.
     """
     target = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
     try:
@@ -252,9 +256,11 @@ def _typed(what: str, hint: Any, value: Any) -> Any:
     try:
         adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
     except (PydanticUserError, SchemaError, TypeError):
-        # A protocol, which no plain value has.
+        # The annotation is a protocol, which no plain value fulfils.
         if isinstance(value, str | int | float | list | dict):
-            raise InputError(f"{what}: it is an object of Python, {{ ref = 'module:attr' }}, got {value!r}.") from None
+            raise InputError(
+                f"{what} must be an object in Python, written as {{ ref = 'module:attr' }}, got {value!r}."
+            ) from None
         return value
     given = tuple(value) if isinstance(value, list) else value
     try:
@@ -268,6 +274,6 @@ def space_of(bounds: Mapping[str, Sequence[Any]]) -> TaskSpace:
     """Return a task space from ``name = [low, high, "unit"]``.
 
     Raises:
-        InputError: bounds cannot be used.
+        InputError: if bounds are not valid.
     """
     return TaskSpace(**{name: tuple(bound) for name, bound in bounds.items()})

@@ -1,4 +1,4 @@
-"""References ``module:attr``: where the module is sought, and what the object must be before it is called."""
+"""References ``module:attr``: the search for the module, and the checks of the object before it is called."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ctxval._util.texts import reason_of
 from ctxval.errors import CtxvalError, InputError
 
 _added: set[str] = set()
-"""Folders of experiments that were put on the path of modules here."""
+"""Folders of experiments that this module has put on ``sys.path``."""
 
 
 def reference(text: str, folder: Path | None = None) -> Any:
@@ -26,17 +26,17 @@ def reference(text: str, folder: Path | None = None) -> Any:
 
     Args:
         text: the reference.
-        folder: where the module is sought first, before installed ones; the current folder by default. A module in
-            the current folder is not found if another folder is given.
+        folder: the folder that is searched first, before the installed modules; the current folder by default. A module
+            in the current folder is not found if another folder is given.
 
     Raises:
-        InputError: the text is not a reference, or the object cannot be loaded, or is in Python's standard library, or
-            another module of this name is in use already.
+        InputError: if the text is not a reference, if the object cannot be loaded or is in Python's standard library,
+            or if another module of this name is already in use.
     """
     module, colon, attribute = text.partition(":")
     if not (colon and attribute and all(name.isidentifier() for name in module.split("."))):
         raise InputError(f"a reference must be module:attr, such as 'my_rig:experiment', got {text!r}.")
-    with _sought_in(os.path.realpath(folder or _here())) as home:
+    with _searched_first(os.path.realpath(folder or _here())) as home:
         _require_place(text, module.partition(".")[0], home)
         _require_apart(text, home)
         try:
@@ -50,7 +50,7 @@ def reference(text: str, folder: Path | None = None) -> Any:
 
 
 @contextmanager
-def _sought_in(home: str) -> Iterator[str]:
+def _searched_first(home: str) -> Iterator[str]:
     """Put a folder first on ``sys.path``. It stays there, because a module may import others when it is called.
 
     Meanwhile neither the current folder, which ``python -m`` adds, nor the folder of another experiment is searched.
@@ -80,27 +80,27 @@ def _here() -> str:
 
 
 def _require_place(text: str, module: str, home: str) -> None:
-    """Check that importing a top-level module gives the one that would be found now, not another that is loaded.
+    """Check that a top-level module is found, and that no other module of this name is already loaded.
 
     Raises:
-        InputError: it is not found, or is another.
+        InputError: if it is not found, or if another one is loaded.
     """
     importlib.invalidate_caches()
     found = _found(module)
     own = found is not None and os.path.dirname(found) in (home, os.path.join(home, module))
     if module in sys.stdlib_module_names and not own:
-        raise InputError(f"{text} is of Python's standard library, which has no part of an experiment.")
+        raise InputError(f"{text} is in Python's standard library, which contains no part of an experiment.")
     loaded = sys.modules.get(module)
     if loaded is None:
         if found is None:
             raise InputError(
-                f"{text} cannot be loaded: no module named {module!r} is in {home} or installed; what an experiment "
-                "file names is sought in the file's folder, and elsewhere what is named is sought in the current one."
+                f"{text} cannot be loaded: no module named {module!r} is in {home} or installed. The modules of an "
+                "experiment file must be in the folder of the file, and those of the command line in the current one."
             )
         return
     used = _place(getattr(loaded, "__file__", None), getattr(loaded, "__path__", None))
     if used is not None and used != found:
-        other = f"none of this name is in {home} or installed" if found is None else f"the one that is meant is {found}"
+        other = f"none of this name is in {home} or installed" if found is None else f"the reference means {found}"
         raise _in_use(text, module, used, other)
 
 
@@ -108,7 +108,7 @@ def _require_apart(text: str, home: str) -> None:
     """Check that no loaded module of another experiment's folder has the name of a module in this folder.
 
     Raises:
-        InputError: a module of the same name is in use from there.
+        InputError: if a module of the same name from another folder is in use.
     """
     others = _added - {home}
     for name, loaded in list(sys.modules.items()):
@@ -122,13 +122,13 @@ def _require_apart(text: str, home: str) -> None:
 
 def _in_use(text: str, name: str, used: str, other: str) -> InputError:
     return InputError(
-        f"{text} cannot be loaded: a module named {name!r} is in use already, {used}, and {other}; give one of them "
-        "another name, or use another process."
+        f"{text} cannot be loaded: a module named {name!r} is already in use, {used}, and {other}. Rename one of them, "
+        "or use another process."
     )
 
 
 def _found(module: str) -> str | None:
-    """Return the file or folder that would be imported; None if there is none, as for what is built into Python."""
+    """Return the file or folder that would be imported; None if there is none, as for built-in modules."""
     for finder in sys.meta_path:
         spec = finder.find_spec(module, None)
         if spec is not None:
@@ -141,19 +141,21 @@ def _place(file: str | None, folders: Any) -> str | None:
     return None if where is None else os.path.realpath(where)
 
 
-# What a reference must name
+# Checks of the object that a reference names
 
 
 def require_part(registry: Registry[Any], what: str, found: Any) -> Any:
-    """Return an object or a class if it has the method of its kind, a model or a distance also if it is a function.
+    """Return an object or a class if it can be a part of the kind.
+
+    It must have the method of the kind; a model or a distance may also be a function.
 
     Args:
-        registry: of the systems, models, synthesizers or distances.
-        what: how the message calls the object.
+        registry: the registry of the kind.
+        what: the name of the object in the message.
         found: the object or the class, which is not called here.
 
     Raises:
-        InputError: it does not have the method, or is not a function of the right arguments.
+        InputError: if it does not have the method, or is not a function with the right arguments.
     """
     kind, method = registry.kind, str(registry.method)
     if isinstance(found, type):
@@ -171,15 +173,15 @@ def require_part(registry: Registry[Any], what: str, found: Any) -> Any:
 
 
 def require_function(what: str, found: Any, form: str) -> Any:
-    """Return a function that takes as many positional arguments as its form says; it is not called here.
+    """Return a function if it takes the number of positional arguments of a form; it is not called here.
 
     Args:
-        what: how the message calls the function.
+        what: the name of the function in the message.
         found: the function.
-        form: the arguments and what they give, such as ``(x, u) -> x_next`` or ``p -> Task``.
+        form: the arguments and the result, such as ``(x, u) -> x_next`` or ``p -> Task``.
 
     Raises:
-        InputError: it is not a function written in Python, or takes other arguments.
+        InputError: if it is not a function written in Python, or takes other arguments.
     """
     count = form.partition("->")[0].count(",") + 1
     if not is_function(found):
@@ -190,7 +192,7 @@ def require_function(what: str, found: Any, form: str) -> Any:
 
 
 def is_function(found: Any) -> bool:
-    """Return whether it is a function written in Python, or an object whose class has such a ``__call__``.
+    """Return whether an object is a function written in Python, or has a ``__call__`` that is one.
 
     Builtin functions and methods of other libraries' objects do not count: no user wrote them for an experiment.
     """
@@ -204,7 +206,7 @@ def is_function(found: Any) -> bool:
 
 
 def _unwrapped(found: Any) -> Any:
-    """Return the function below decorators such as those of compilers."""
+    """Return the function inside decorators, such as those of compilers."""
     try:
         return inspect.unwrap(found)
     except (ValueError, AttributeError):
@@ -212,12 +214,12 @@ def _unwrapped(found: Any) -> Any:
 
 
 def accepts(function: Any, count: int, /, **named: Any) -> bool:
-    """Return whether a function can be called with so many positional arguments, and with these named ones."""
+    """Return whether a function can be called with this number of positional arguments and these named ones."""
     try:
         inspect.signature(function).bind(*range(count), **named)
     except TypeError:
         return False
-    except ValueError:  # it does not say
+    except ValueError:  # the function has no signature
         return True
     return True
 

@@ -1,4 +1,4 @@
-"""Settings: what to run, as an experiment file and the command line say it, and as a store keeps it."""
+"""Settings: the content of an experiment file with the options of the command line, as a store keeps them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class SearchTable(BaseModel):
 
     Attributes:
         name: the name in the registry of searches.
-        repeats: how often each task is executed; more than once if the system is noisy.
+        repeats: the number of executions of each task; more than 1 if the system is noisy.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -42,11 +42,11 @@ class SearchTable(BaseModel):
         """Return the search.
 
         Args:
-            folder: where modules are sought that the options name; the current folder by default.
+            folder: the folder of the modules that the options name; the current folder by default.
 
         Raises:
-            UnknownNameError: there is no such search.
-            InputError: it does not take these options.
+            UnknownNameError: if there is no such search.
+            InputError: if the search does not take these options.
         """
         options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
         options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
@@ -60,26 +60,27 @@ _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
 
 class Settings(BaseModel):
-    """What to run: the content of an experiment file, overridden by the options of the command line.
+    """The content of an experiment file, overridden by the options of the command line.
 
-    Either ``experiment`` names the experiment, or ``name`` to ``units`` describe all of it.
+    Either ``experiment`` names the experiment, or ``name`` to ``units`` describe it completely.
 
     Attributes:
         experiment: a case, or ``module:attr`` of an experiment or of a function of a seed that makes one.
-        options: passed on to the case or function.
+        options: the options of the case or of the function.
         name: the name of the experiment.
         space: ``name = [low, high, "unit"]`` for each task parameter.
         task: ``module:attr`` of a function, or a table with an initial state, a goal, a horizon and a time step.
         system, model, synthesizer, distance: ``module:attr``, or a table with a type and its arguments.
-        states, inputs: names and units.
+        states, inputs: the unit of each state and of each input, by name.
         units: the units of the distance.
-        budget, threshold, store: None if the experiment's own are used.
+        budget, threshold, store: the budget, the threshold and the store of the campaign; None for those of the
+            experiment.
         seed: the seed of the data, the model and the search.
         confidence: the confidence level of the certificate.
-        certificate: the certificate that a validation needs.
-        search: which search, and its options.
-        folder: where modules and files are sought: the folder of the experiment file. None if it is not known; then the
-            current folder.
+        certificate: the certificate for the verdict.
+        search: the search, and its options.
+        folder: the folder of modules and files, which is the folder of the experiment file. None means the current
+            folder.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -109,17 +110,18 @@ class Settings(BaseModel):
         """Return the experiment.
 
         Raises:
-            InputError: it cannot be found or made.
+            InputError: if it cannot be found or made.
         """
         if self.experiment is None:
             return self._described()
         given = [name for name in (*_WHOLE, "distance", "name") if getattr(self, name) is not None]
         if given:
             raise InputError(
-                f"an experiment that is made elsewhere has its own {given[0]}; leave it out, or experiment."
+                f"the file has both 'experiment' and {given[0]!r}: remove one of them, because a named experiment has "
+                f"its own {given[0]}."
             )
         if "seed" in self.options:
-            raise InputError("the seed stands beside [options], not in it.")
+            raise InputError("[options] must not contain the seed: write it at the top of the file, or give --seed.")
         return named_experiment(self.experiment, self.seed, self.options, self.folder)
 
     def _described(self) -> Experiment:
@@ -130,7 +132,9 @@ class Settings(BaseModel):
                 f"it has no {', '.join(missing)}."
             )
         if self.options:
-            raise InputError("[options] are for an experiment that is made elsewhere; this file describes its own.")
+            raise InputError(
+                "[options] is only for a named experiment (experiment = ...); this file describes its own."
+            )
         space, system = space_of(self.space or {}), part("system", self.system or {}, self.folder)
         validation = Validation(
             space=space,
@@ -163,11 +167,11 @@ class Settings(BaseModel):
         Args:
             experiment: the experiment that :meth:`load` returned.
             store: the store, or its path.
-            accept_change, remeasure: as :class:`ctxval.Campaign` takes them.
+            accept_change, remeasure: as in :class:`ctxval.Campaign`.
 
         Raises:
-            StoreError: the store cannot be used, or was made by another experiment.
-            InputError: there is no such search, or the key of this user is damaged.
+            StoreError: if the store cannot be used, or another experiment made it.
+            InputError: if there is no such search, or the key of this user is damaged.
         """
         search = self.search.build(self.folder)
         campaign = Campaign(
@@ -181,29 +185,37 @@ class Settings(BaseModel):
         )
         plain = self.model_dump(mode="json", exclude={"store"})
         if self.folder is None and code_named(plain):
-            plain["folder"] = str(Path().resolve())  # from where it is just now
+            plain["folder"] = str(Path().resolve())  # the folder in which its code was found now
         campaign.store.keep_settings(signed(plain, campaign.store.settings()))
         return campaign
 
     def certified_as(self, stated: dict[str, Any]) -> Settings:
-        """Return these settings with what the command line states of the certificate over what the file says.
+        """Return these settings with options of the certificate from the command line, which override the file.
+
+        Args:
+            stated: options of the certificate; None if an option was not given.
 
         Raises:
-            InputError: a value is not allowed.
+            InputError: if a value is not allowed.
         """
+        given = {name: value for name, value in stated.items() if value is not None}
         try:
-            table = CertificateTable.model_validate({**self.certificate.model_dump(), **stated})
+            table = CertificateTable.model_validate({**self.certificate.model_dump(), **given})
         except ValidationError as error:
             raise InputError(_sentence("certificate", error)) from error
         return self.model_copy(update={"certificate": table})
 
     @property
     def certificate_options(self) -> CertificateOptions:
-        """By which certificate the trials are to be judged."""
+        """The kind, the options and the confidence of the certificate for the verdict."""
         return self.certificate.options(self.confidence)
 
     def store_path(self, name: str) -> Path:
-        """Return where the trials go: the given store, or a file under ``runs/`` named after what is run."""
+        """Return the path of the store: the given one, or a file in ``runs/`` with the names of experiment and search.
+
+        Args:
+            name: the name of the experiment.
+        """
         if self.store is not None:
             return self.store
         options = [f"{key}-{value}" for key, value in self.options.items()]
@@ -218,15 +230,17 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
         overrides: options of the command line, which override the file; None if an option was not given.
 
     Raises:
-        InputError: the file cannot be read, or a value in it is not allowed; the message names it.
+        InputError: if the file cannot be read, or a value is not allowed; the message names it.
     """
     is_file = target.endswith(".toml")
     content = _read_toml(Path(target)) if is_file else {"experiment": target}
     if "folder" in content:
-        raise InputError(f"{target}: no setting is called 'folder'; what the file names is sought beside it.")
+        raise InputError(
+            f"{target}: no setting is called 'folder'; modules and files are read from the folder of this file."
+        )
     if "experiment" not in content and not any(key in content for key in _WHOLE):
         raise InputError(
-            f"{target} must say what to run: experiment = 'pendulum', or 'module:attr', or the whole of it."
+            f"{target} has no experiment: name one, as in experiment = 'pendulum' or 'module:attr', or describe one."
         )
     given = {key: value for key, value in overrides.items() if value is not None}
     options = {**_table(content, "options"), **given.pop("options", {})}
@@ -244,23 +258,25 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
 
 
 def stored_settings(store: Store) -> Settings:
-    """Return the settings in a store, whoever wrote them. Nothing may be built from them: see :func:`trusted_settings`.
+    """Return the settings in a store, whoever wrote them.
+
+    Do not build anything from them: :func:`trusted_settings` returns those that may be used.
 
     Raises:
-        InputError: the store has no settings, or they are not valid.
+        InputError: if the store has no settings, or they are not valid.
     """
     return _of_store(store.settings())
 
 
 def planned_settings(store: Store, kind: str | None = None) -> Settings:
-    """Return what was run into a store, as :func:`stored_settings` does; the defaults if no command made the store.
+    """Return the settings in a store, as :func:`stored_settings` does; the defaults if no command made the store.
 
     Args:
-        store: of the trials.
-        kind: the kind of certificate that the user asks for; None if the store's settings decide.
+        store: the store of the trials.
+        kind: the kind of certificate that the user asks for; None to use the kind in the store's settings.
 
     Raises:
-        InputError: what the store says is not allowed, or its certificate would run code that its user did not choose.
+        InputError: if the settings are not valid, or their certificate would run code that the user did not choose.
     """
     kept = store.settings()
     if not kept:
@@ -270,7 +286,7 @@ def planned_settings(store: Store, kind: str | None = None) -> Settings:
     if kind is None and not KINDS.is_data(planned) and not verifies(kept):
         raise InputError(
             f"{store.name} names the certificate {planned!r}, which is code of another package, and you did not make "
-            f"the store; say --kind {planned} if you trust that package, or another kind."
+            f"the store. Give --kind {planned} if you trust that package, or give another kind."
         )
     return settings
 
@@ -278,8 +294,8 @@ def planned_settings(store: Store, kind: str | None = None) -> Settings:
 def _of_store(kept: dict[str, Any]) -> Settings:
     if not kept:
         raise InputError(
-            "the store does not say what was run into it, as it was not made by a command; name its experiment where a "
-            "command needs it: --experiment FILE.toml."
+            "the store does not name its experiment, because it was not made by a command: name the experiment with "
+            "--experiment FILE.toml."
         )
     try:
         return Settings.model_validate(unsigned(kept))
@@ -292,12 +308,12 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
 
     Args:
         store: the store. If its settings name code, this user must have signed them.
-        experiment: a case, a file or ``module:attr`` that the user names instead. The seed is still the store's, and so
-            is the search if it names no code.
-        trust: accept the store's settings, whoever wrote them.
+        experiment: a case, a file or ``module:attr`` that the user names instead. The seed of the store is used all the
+            same, and its search if the search names no code.
+        trust: accept the settings of the store, whoever wrote them.
 
     Raises:
-        InputError: the settings name code that the user has not allowed to run; the message shows the code.
+        InputError: if the settings name code that the user has not allowed to run; the message shows the code.
     """
     kept = store.settings()
     if experiment is not None:
@@ -310,15 +326,16 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
         return settings.model_copy(update={"folder": folder})
     more = f" and {len(code) - _SHOWN} more" if len(code) > _SHOWN else ""
     raise InputError(
-        f"{store.path} would import or run code: {'; '.join(code[:_SHOWN])}{more}, sought in "
+        f"{store.path} would import or run code: {'; '.join(code[:_SHOWN])}{more}, from the folder "
         f"{ascii(str(folder))[:200]}. You did not make the store on this computer, or it was changed since, or an "
-        "older version made it. If you know what it is of, say so by --experiment FILE.toml (or module:attr); if you "
-        "trust what it names, say --trust. The store is then signed for you, and you are not asked again."
+        "older version made it. If you know its experiment, name it with --experiment FILE.toml (or module:attr). If "
+        "you trust the code that the store names, give --trust. The store then carries your signature, and the "
+        "question will not be asked again."
     )
 
 
 _SHOWN = 8
-"""How many of the things that would be imported or run a message shows."""
+"""Largest number of pieces of code that the message shows."""
 
 
 def _named_again(kept: dict[str, Any], experiment: str) -> Settings:
@@ -346,9 +363,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
             return tomllib.load(file)
     except FileNotFoundError:
         name = shlex.quote(str(path))
-        raise InputError(
-            f"there is no experiment file {path}; `ctxval init {name}` writes one to begin with."
-        ) from None
+        raise InputError(f"there is no experiment file {path}; `ctxval init {name}` writes an example.") from None
     except OSError as error:
         raise InputError(f"the experiment file {path} cannot be read: {error.strerror}.") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:

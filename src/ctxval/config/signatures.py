@@ -1,7 +1,7 @@
-"""Signatures of the settings in a store, and which settings would run code.
+"""Signatures of the settings in a store, and the settings that would run code.
 
-A command that writes settings signs them with a secret key of its user; settings that were edited, or that come from
-somebody else, do not verify. Signatures of several users stand side by side.
+A command that writes settings signs them with a secret key of its user. Settings that were edited, or that come from
+somebody else, do not verify. A store keeps the signatures of several users.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from ctxval.config.parts import REGISTRIES
 from ctxval.errors import InputError
 
 SIGNATURES = "signatures"
-"""The key of the settings in a store under which their signatures stand."""
+"""The key of the signatures in the settings of a store."""
 
 _BYTES = 32
 _USERS = 16
-"""Largest number of signatures that settings keep; each is of one user on one computer."""
+"""Largest number of signatures that settings keep, one for each user and computer."""
 
 _SHOWN = 160
-"""Characters of a setting in a store that are shown."""
+"""Largest number of characters of a setting that are shown."""
 
 
 def key_path() -> Path:
-    """Return where this user's secret key is: ``$XDG_STATE_HOME/ctxval/key``, or %LOCALAPPDATA% on Windows.
+    """Return the path of this user's secret key: ``$XDG_STATE_HOME/ctxval/key``, or in %LOCALAPPDATA% on Windows.
 
     Raises:
-        OSError: this user has no home folder.
+        OSError: if this user has no home folder.
     """
     base = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_STATE_HOME", "")
     if os.path.isabs(base):
@@ -53,10 +53,10 @@ def signed(settings: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, 
 
     Args:
         settings: plain values, as they are stored.
-        before: what is stored now; if only its signatures differ, those of other users are kept.
+        before: the settings that are stored now. If only the signatures differ, those of other users are kept.
 
     Raises:
-        InputError: the key is damaged.
+        InputError: if the key is damaged.
     """
     plain = _plain(settings)
     others = _signatures(before) if _plain(before) == plain else []
@@ -70,10 +70,10 @@ def signed(settings: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, 
 
 
 def verifies(settings: Mapping[str, Any]) -> bool:
-    """Return whether settings are as this user signed them.
+    """Return whether settings carry a valid signature of this user.
 
     Raises:
-        InputError: the user's key is damaged.
+        InputError: if the user's key is damaged.
     """
     signatures = _signatures(settings)
     try:
@@ -92,7 +92,7 @@ def why_no_key() -> str | None:
     """Return why this user cannot sign; None if there is a key or one can be made.
 
     Raises:
-        InputError: the key is damaged.
+        InputError: if the key is damaged.
     """
     try:
         _made_key()
@@ -102,7 +102,7 @@ def why_no_key() -> str | None:
 
 
 def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings without signatures as they come out of a store."""
+    """Return settings without signatures, in the form in which a store returns them."""
     found: dict[str, Any] = json.loads(json.dumps(unsigned(settings)))
     return found
 
@@ -118,7 +118,7 @@ def _signature(key: bytes, settings: Mapping[str, Any]) -> str:
 
 
 def _made_key() -> bytes:
-    """Return the user's key, which is made if there is none; of two processes that make it, one wins."""
+    """Return the user's key, and make it if there is none; if two processes make it, both return the same one."""
     path = key_path()
     with suppress(FileNotFoundError):
         return _read_key(path)
@@ -137,14 +137,14 @@ def _made_key() -> bytes:
 
 
 def _publish(name: str, path: Path) -> None:
-    """Give a whole file its name, unless another process was faster."""
+    """Give a complete file its name, unless another process was faster."""
     try:
         os.link(name, path)
     except FileExistsError:
         return
     except OSError:
-        # There are no hard links on this disk: of two processes at this very moment the last one wins, and the other's
-        # store asks once more.
+        # This disk has no hard links. If two processes make a key at the same moment, the last one is kept, and the
+        # store of the other process asks the user again.
         if not path.exists():
             os.replace(name, path)
 
@@ -155,7 +155,7 @@ def _read_key(path: Path) -> bytes:
     if len(key) != _BYTES:
         raise InputError(
             f"the key {path} is damaged: it must have {_BYTES} bytes, got {len(key) if len(key) < _BYTES else 'more'}. "
-            "Delete it; a new one is made, and stores that were signed with the old one ask once more."
+            "Delete it: a new key is made, and for stores that carry the old signature the question is asked again."
         )
     return key
 
@@ -166,14 +166,14 @@ def _read_key(path: Path) -> bytes:
 def code_named(settings: Mapping[str, Any]) -> list[str]:
     """Return the settings whose code would run if the experiment were built, each as a text to show.
 
-    Whatever is not known to be data counts as code: a reference anywhere, a task by name, a part of this package that
-    runs programs or foreign libraries, and every case, part, search and certificate that this package does not have:
-    an installed package may have it, and its code would be imported. No package is looked at to find out.
+    Everything that is not known to be data counts as code: every reference, a task by name, a part of this package that
+    runs programs or other libraries, and every case, part, search and certificate that this package does not have. An
+    installed package may have it, and its code would be imported. This function does not search the packages.
     """
     try:
         return _code_named(settings)
     except RecursionError:
-        return ["what is nested too deeply to be looked through"]
+        return ["settings that are nested too deeply to be checked"]
 
 
 def _code_named(settings: Mapping[str, Any]) -> list[str]:
@@ -209,6 +209,6 @@ def _references(where: str, value: Any) -> Iterator[str]:
 
 
 def _shown(where: str, value: Any) -> str:
-    """Return a setting as text in which nothing steers a terminal, cut where it is long."""
+    """Return a setting as text, shortened and with control characters escaped."""
     text = f"{ascii(where)[1:-1]} = {value!a}"
     return text if len(text) <= _SHOWN else f"{text[: _SHOWN // 2]}...{text[-_SHOWN // 2 :]}"

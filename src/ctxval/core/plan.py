@@ -1,4 +1,4 @@
-"""What is known of a task before, and after, the execution of S."""
+"""A task before the execution of S (plan) and after it (outcome, measurement)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ctxval.core.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Everything about a task that can be known before S is executed; one task or a batch.
+    """Everything that is known about a task before S is executed; one task or a batch.
 
     Attributes:
         parameters: p.
@@ -37,7 +37,7 @@ class Outcome:
     """A plan after the execution of S.
 
     Attributes:
-        plan: what was known before.
+        plan: the plan of the task.
         system_trajectory: the closed loop on the system.
         distance: d(p).
     """
@@ -58,11 +58,11 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Measurement:
-    """The distance of an execution, or why there is none.
+    """The distance of an execution, or the reason why there is none.
 
     Attributes:
-        distance: d(p); None if the distance gave no usable number.
-        unusable: why it gave none; None if there is a distance.
+        distance: d(p); None if the distance function gave no usable number.
+        unusable: the reason why it gave none; None if there is a distance.
     """
 
     distance: float | None

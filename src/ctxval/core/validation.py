@@ -32,27 +32,28 @@ from ctxval.errors import (
 )
 
 START = 0.05
-"""By how much a recording may miss the start of its task, as a share of what the model's trajectory covers."""
+"""Default start tolerance, as a fraction of the range of each state in the trajectory of the model."""
 
 _CHUNK = 4096
-"""Tasks in one batched call: enough to be fast, few enough for memory."""
+"""Number of tasks in one batched call: large enough for speed, small enough for the memory."""
 
 
 class Validation:
-    """A system, a model of it, and what the model is for: the map p -> d(p).
+    """The map p -> d(p), made of a task space, a system, its model, a synthesizer and a distance.
 
     Args:
         space: the task space P.
-        task: ``p -> Task``; called with named parameters, of one task or of a batch.
+        task: a function ``p -> Task``, which is called with the named parameters of one task or of a batch.
         system: the true system S.
         model: the model M, or a function ``(x, u) -> x_next``.
-        synthesizer: how controllers are designed on M.
-        distance: d between the trajectories of M and S.
-        start_tolerance: by how much each state may miss the task's initial state when an execution starts, as a share
-            of that state's range in the model's trajectory, or of its initial value if that is larger.
+        synthesizer: designs the controllers on M.
+        distance: the distance d between the trajectories of M and S.
+        start_tolerance: the largest permitted difference between the first state of an execution and the initial state
+            of its task. It is a fraction of the range of each state in the trajectory of the model, or of its initial
+            value if that is larger.
 
     Raises:
-        InputError: one of them is not what it should be; the message says which and what is missing.
+        InputError: if one of them has the wrong type; the message names it and what is missing.
     """
 
     def __init__(
@@ -85,9 +86,9 @@ class Validation:
         self.start_tolerance = float(start_tolerance)
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this validation in a store."""
+        """Return the description that identifies this validation in a store."""
         parts = ("space", "task", "system", "model", "synthesizer", "distance")
-        # A function's name says nothing of the constants in it, three of its tasks do.
+        # Three tasks show the constants in the task function, which its name does not show.
         probes = np.stack([self.space.low, 0.5 * (self.space.low + self.space.high), self.space.high])
         tasks = [describe(self._task(self.space.parameters(point))) for point in probes]
         return {**{part: describe(getattr(self, part)) for part in parts}, "tasks": tasks}
@@ -96,7 +97,7 @@ class Validation:
         """Return this validation with another distance.
 
         Raises:
-            InputError: it is no function.
+            InputError: if it is not a function.
         """
         return Validation(
             space=self.space,
@@ -111,12 +112,12 @@ class Validation:
     # One task, step by step
 
     def plan(self, point: ArrayLike) -> Plan:
-        """Design the controller for the task at ``(d,)`` and run it on the model; S is not touched.
+        """Design the controller for the task at ``(d,)`` and run it on the model; S is not executed.
 
         Raises:
-            InputError: the task function does not make one task of the point.
-            DesignError: the synthesizer failed.
-            ModelError: the model failed or its closed loop is not finite.
+            InputError: if the task function does not return one task for the point.
+            DesignError: if the synthesizer failed.
+            ModelError: if the model failed, or its closed loop is not finite.
         """
         plan = self._plan(self.space.parameters(point))
         if plan.task.batch_shape:
@@ -130,8 +131,8 @@ class Validation:
         """Execute S once.
 
         Raises:
-            ExecutionError: the system raised or tried to exit, or what it returned is no execution of the plan; the
-                message says why.
+            ExecutionError: if the system raises an exception or tries to exit, or if its result is not an execution of
+                the plan; the message gives the reason.
         """
         try:
             trajectory = self.system.execute(plan.controller, plan.task)
@@ -145,16 +146,16 @@ class Validation:
             raise ExecutionError(str(error)) from error
 
     def require(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Trajectory:
-        """Check that a trajectory, wherever it comes from, is a whole and finite execution of a plan; return it.
+        """Check that a trajectory is a complete and finite execution of a plan; return it.
 
         Args:
-            plan: of the task.
-            trajectory: what the system returned, or a recording.
-            start_tolerance: in place of this validation's own.
+            plan: the plan of the task.
+            trajectory: the result of the system, or a recording.
+            start_tolerance: replaces the start tolerance of this validation.
 
         Raises:
-            ExecutionError: it is no whole and finite execution.
-            InputError: it is of another task: it has other dimensions, other times, or starts elsewhere.
+            ExecutionError: if it is not a complete and finite execution.
+            InputError: if it belongs to another task, that is, if its dimensions, its times or its first state differ.
         """
         if not isinstance(trajectory, Trajectory):
             raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
@@ -168,16 +169,16 @@ class Validation:
     def accept(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Measurement:
         """Check that a trajectory is an execution of a plan, as :meth:`require` does, and measure its distance.
 
-        Every execution passes here, whether it was run, told, imported or returned by a worker.
+        This is the single check for all executions: those of a system, those of workers, and recordings of users.
 
         Args:
-            plan: of the task.
-            trajectory: what the system returned, or a recording.
-            start_tolerance: in place of this validation's own.
+            plan: the plan of the task.
+            trajectory: the result of the system, or a recording.
+            start_tolerance: replaces the start tolerance of this validation.
 
         Raises:
-            ExecutionError: it is no whole and finite execution.
-            InputError: it is of another task.
+            ExecutionError: if it is not a complete and finite execution.
+            InputError: if it belongs to another task.
         """
         executed = self.require(plan, trajectory, start_tolerance)
         try:
@@ -189,12 +190,12 @@ class Validation:
         """Return d(p).
 
         Raises:
-            DistanceError: the distance raised, or is no finite number that is not negative.
+            DistanceError: if the distance function raises an exception, or its value is not a finite number >= 0.
         """
         return self._measured(plan.parameters, plan.task, plan.model_trajectory, trajectory)
 
     def remeasure(self, point: ArrayLike, model_trajectory: Trajectory, system_trajectory: Trajectory) -> float:
-        """Return d(p) between trajectories that are known, without designing a controller.
+        """Return d(p) between two known trajectories, without the design of a controller.
 
         Raises:
             DistanceError: as in :meth:`measure`.
@@ -226,7 +227,7 @@ class Validation:
 
         Raises:
             InputError, DesignError, ModelError: as in :meth:`plan`.
-            DistanceError: the distance raised or has the wrong shape.
+            DistanceError: if the distance function raises an exception or returns the wrong shape.
         """
         rows = require_shape("points", as_floats("points", points), (self.space.dimension,))
         if not self.batched or not len(rows):
@@ -253,7 +254,7 @@ class Validation:
         try:
             trajectory = self.system.execute(plan.controller, plan.task)
         except Exception:
-            # Which task it was, only one by one can tell.
+            # Only single executions show which task failed.
             return np.array([self._distance_or_nan(point) for point in points])
         values = self._distance(plan.task, plan.model_trajectory, trajectory)
         if values.shape != (len(points),):
@@ -264,7 +265,7 @@ class Validation:
             self._refuse_distance(values[np.argmax(wrong)], points[np.argmax(wrong)])
         return np.where(executed, values, np.nan)
 
-    # What both share
+    # Used for one task and for many
 
     def _plan(self, parameters: Parameters) -> Plan:
         task = self._task(parameters)
@@ -331,14 +332,15 @@ def _require_task(plan: Plan, trajectory: Trajectory, start_tolerance: float) ->
         i = int(np.argmax(~(misses <= start_tolerance * scale)))
         raise InputError(
             f"the trajectory starts elsewhere: state {i} must start at {start[i]:g} within "
-            f"{start_tolerance * scale[i]:.3g}, got {trajectory.states[0, i]:g}; is it of this trial?"
+            f"{start_tolerance * scale[i]:.3g}, got {trajectory.states[0, i]:g}. "
+            "Check that it belongs to this trial."
         )
 
 
 def _executed(expected: Trajectory, batch: Trajectory) -> Mask:
-    """Return which tasks of a batch have a whole and finite trajectory, shape ``(N,)``."""
+    """Return which tasks of a batch have a complete and finite trajectory, shape ``(N,)``."""
     same = batch.states.shape == expected.states.shape and batch.inputs.shape == expected.inputs.shape
-    # Where the batch ended early but nothing in it is broken, it is not known which task that was.
+    # If the batch ended early but all its values are finite, it is not known which task ended early.
     unknown = batch.ended != COMPLETE and bool(batch.finite.all())
     return batch.finite if same and not unknown else np.zeros(expected.finite.shape, dtype=bool)
 

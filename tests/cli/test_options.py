@@ -1,4 +1,4 @@
-"""Options of cases on the command line."""
+"""Values of ``--option NAME=VALUE``, and the options of cases."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
 from ctxval.cli import app
-from ctxval.cli.case_options import case_options, parsed
+from ctxval.cli.options import named_values, parsed
 from ctxval.errors import InputError
 
 
@@ -54,8 +54,8 @@ def test_no_text_is_too_odd_for_a_value(text: str) -> None:
 
 
 def test_options_with_an_option_of_their_own_stand_beside_the_others() -> None:
-    assert case_options(["drag=0.5", " name = x=y "], dim=3, model=None) == {"dim": 3, "drag": 0.5, "name": "x=y"}
-    assert case_options(None) == {}
+    assert named_values(["drag=0.5", " name = x=y "], dim=3, model=None) == {"dim": 3, "drag": 0.5, "name": "x=y"}
+    assert named_values(None) == {}
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_options_with_an_option_of_their_own_stand_beside_the_others() -> None:
 )
 def test_an_option_that_cannot_be_used_is_named(given_options: list[str], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        case_options(given_options, model="fnn")
+        named_values(given_options, model="fnn")
 
 
 @pytest.mark.slow
