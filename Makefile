@@ -24,7 +24,7 @@ check: .venv/.test
 	$(BIN)/mypy
 
 reliability: .venv/.test  ## kill -9 and resume, KILLS times
-	$(BIN)/python -m pytest tests/test_kill.py --kills $(KILLS)
+	$(BIN)/python -m pytest tests/campaign/test_kill.py --kills $(KILLS)
 
 crash-states: .venv/.test  ## power cuts, thousands of them; needs strace; writes docs/reliability.md
 	$(BIN)/python benchmarks/crash_states.py

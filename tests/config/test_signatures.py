@@ -396,6 +396,20 @@ def test_cases_of_installed_packages_are_listed_with_their_options(site: Path) -
     refusal("cases", "swing")
 
 
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("swing = dict", "the case 'swing' must be a function of a seed and its options"),
+        ("def swing(seed, size: '1 / 0' = 2): ...", "options: size=2"),
+    ],
+)
+def test_a_case_that_cannot_be_inspected_hides_no_other_one(code: str, said: str, site: Path) -> None:
+    (site / "their_parts.py").write_text(code)
+    listed = " ".join(done("cases").stdout.split())
+    assert said in listed
+    assert "pendulum" in listed
+
+
 # Naming the experiment again
 
 

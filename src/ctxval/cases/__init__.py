@@ -49,9 +49,13 @@ def options_of(name: str) -> dict[str, Any]:
 
     Raises:
         UnknownNameError: there is no such case.
-        InputError: the case belongs to an installed package and cannot be loaded.
+        InputError: the case belongs to an installed package and cannot be loaded, or does not say its parameters.
     """
-    parameters = list(inspect.signature(REGISTRY.find(name)).parameters.values())[1:]
+    found = REGISTRY.find(name)
+    try:
+        parameters = list(inspect.signature(found).parameters.values())[1:]
+    except (TypeError, ValueError) as error:
+        raise InputError(f"the case {name!r} must be a function of a seed and its options: {error}.") from error
     variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     return {parameter.name: parameter.default for parameter in parameters if parameter.kind not in variadic}
 

@@ -46,7 +46,9 @@ def plain_options(case: str) -> dict[str, Any]:
     """
     try:
         hints = get_type_hints(cases.REGISTRY.find(case))
-    except (NameError, TypeError):
+    except InputError:
+        raise
+    except Exception:  # annotations that are texts are evaluated, and anything may stand in them
         hints = {}
     found = {name: default for name, default in cases.options_of(case).items() if _is_plain(hints.get(name, str))}
     return {name: None if default is Parameter.empty else default for name, default in found.items()}
