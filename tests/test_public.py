@@ -37,7 +37,7 @@ def test_all_is_complete(package: str) -> None:
         for name, value in vars(module).items()
         if not name.startswith("_") and (getattr(value, "__module__", None) or "").startswith("ctxval")
     }
-    assert public - {"Registry", "InputError", "UnknownNameError", "Experiment"} <= set(module.__all__)
+    assert public - {"Registry", "construct", "InputError", "UnknownNameError", "Experiment"} <= set(module.__all__)
 
 
 def test_the_part_packages_are_usable_after_importing_ctxval_alone() -> None:

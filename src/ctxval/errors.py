@@ -45,7 +45,7 @@ class UnknownNameError(InputError, AttributeError):
         """Return the error that ``name`` is unknown; its message gives the nearest known name, or all of them."""
         names = sorted(known)
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
-        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names)}."
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names) or 'none'}."
         return cls(f"no {kind} is called {name!r}; {hint}")
 
 

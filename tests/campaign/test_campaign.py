@@ -12,7 +12,7 @@ from scipy.stats import kstest
 from conftest import interrupt_at_once, make_validation
 from ctxval import Campaign, TaskSpace, Validation, controllers, models, searches
 from ctxval._util.arrays import Array
-from ctxval.certificates import RESOLUTION, farthest_task
+from ctxval.certificates import RESOLUTION, CertificateOptions, farthest_task
 from ctxval.core.trial import Trial
 from ctxval.errors import (
     CertificateError,
@@ -565,3 +565,55 @@ def test_a_resumed_random_search_keeps_its_plan(validation: Validation, tmp_path
     stopped.store.close()
     trials = Campaign(validation, search=searches.Random(), store=tmp_path / "a.sqlite").run(3).trials
     assert [trial.note for trial in trials] == [{"draws": 3}] * 3
+
+
+def test_options_beside_a_certificate_are_refused() -> None:
+    campaign = Campaign(make_validation(), seed=1).run(3)
+    by = CertificateOptions(confidence=0.9)
+    for options in ({"confidence": 0.99}, {"stochastic": True}, {"resolution": 0.5}):
+        with pytest.raises(InputError, match="options of certificate=; state them there"):
+            campaign.verdict(9.0, certificate=by, **options)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="certificate must be a CertificateOptions, got 'audit'"):
+        campaign.verdict(9.0, certificate="audit")  # type: ignore[arg-type]
+
+
+class Odd(searches.BaseSearch):
+    """A search that returns odd things."""
+
+    def __init__(self, points: object, note: object = None) -> None:
+        self.points, self.noted = points, note
+
+    def reset(self, dimension: int, seed: int) -> None:
+        pass
+
+    def ask(self, n: int = 1) -> Any:
+        return self.points
+
+    def tell(self, points: object, values: object) -> None:
+        pass
+
+    def note(self) -> Any:
+        return self.noted
+
+
+@pytest.mark.parametrize("points", [[[1.0], [2.0, 3.0]], "left", [[1j]], [["a"]], None, [[1.5]]])
+def test_points_of_an_own_search_that_are_none_are_named(points: object) -> None:
+    with pytest.raises(InputError, match="a search must return points of the unit cube"):
+        Campaign(make_validation(), search=Odd(points)).run(1)
+
+
+@pytest.mark.parametrize("note", [[1], {"a": np.array([1])}, {"b": np.bool_(True)}, {"c": float("nan")}, "text"])
+def test_a_note_that_cannot_be_stored_is_named(note: object) -> None:
+    campaign = Campaign(make_validation(), search=Odd([[0.5]], note))
+    with pytest.raises(InputError, match="the note of a search must be a dictionary of plain values"):
+        campaign.run(1)
+    assert not campaign.trials
+
+
+def test_a_search_that_only_says_that_its_points_are_independent_is_warned_of() -> None:
+    class Own:
+        iid = True
+        reset, ask, tell = searches.Random.reset, searches.Random.ask, searches.Random.tell
+
+    with pytest.warns(UserWarning, match=r"counts only if the class inherits ctxval\.searches\.BaseSearch"):
+        Campaign(make_validation(), search=Own())  # type: ignore[arg-type]

@@ -4,7 +4,7 @@ import sys
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from types import ModuleType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -187,3 +187,31 @@ def test_a_kind_takes_its_own_options_alone() -> None:
 def test_a_certificate_of_an_unknown_kind_rests_on_what_it_assumes() -> None:
     certificate = Largest().certify(sample())
     assert KINDS.of(certificate).rests_on(certificate) == ["what its certificate assumes"]
+
+
+def test_a_class_that_is_defined_again_replaces_itself() -> None:
+    known = KindRegistry()
+    first = known.register(Largest)
+    again = type("Largest", (Largest,), {"__module__": Largest.__module__, "__qualname__": Largest.__qualname__})
+    assert known.register(again) is known.find("largest") is again is not first
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: certificates.CertificateOptions("posterior"),
+        lambda: certificates.CertificateOptions(Posterior),
+        lambda: certificates.CertificateOptions(confidence="high"),
+        lambda: certificates.CertificateOptions(volume=True),
+        lambda: Posterior(resolution="fine"),
+        lambda: Posterior(stochastic="no"),
+    ],
+)
+def test_options_of_another_type_are_refused(make: Any) -> None:
+    with pytest.raises(InputError, match=r"must be .*, got"):
+        make()
+
+
+def test_a_number_to_discard_is_an_integer() -> None:
+    with pytest.raises(CertificateError, match=r"discard must be an integer, got 1\.5"):
+        certificates.SamplingDiscarding(discard=1.5).certify(sample(30))  # type: ignore[arg-type]

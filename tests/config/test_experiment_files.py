@@ -141,7 +141,7 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         ('name = "auto"', 'name = "gp-ucb"\ninitial = true', "search 'gp-ucb': initial"),
         ('name = "auto"', 'name = "gp-ucb"\nkernel = "matern"', "search 'gp-ucb': kernel"),
         ('name = "auto"', 'name = "gp-ucb"\nnoise = 3', "search 'gp-ucb': noise"),
-        ('kind = "posterior"', 'kind = "posteriour"', "certificate.kind"),
+        ('kind = "posterior"', 'kind = "posteriour"', "did you mean 'posterior'"),
         ('name = "cart"', 'name = "cart"\nexperiment = "pendulum"', "has its own"),
         ('name = "cart"', 'name = "cart"\n[options]\nx = 1\n[other]', "other"),
     ],

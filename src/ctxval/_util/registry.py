@@ -245,13 +245,14 @@ def _package(point: EntryPoint) -> str:
     return "of unknown name" if point.dist is None else str(point.dist.name)
 
 
-def construct(what: str, build: Any, arguments: Mapping[str, Any]) -> Any:
+def construct(what: str, build: Any, arguments: Mapping[str, Any], *first: Any) -> Any:
     """Call a class, or a function that makes a part.
 
     Args:
         what: how the part is called in messages.
         build: the class or the function.
         arguments: by name.
+        first: arguments by position, before them.
 
     Raises:
         UnknownNameError: it takes no such argument; the message has the nearest one.
@@ -263,7 +264,7 @@ def construct(what: str, build: Any, arguments: Mapping[str, Any]) -> Any:
             for key in arguments:
                 if key not in taken:
                     raise UnknownNameError.among(f"argument of {what}", key, taken)
-        return build(**arguments)
+        return build(*first, **arguments)
     except CtxvalError:
         raise
     except Exception as error:

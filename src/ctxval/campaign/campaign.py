@@ -109,7 +109,7 @@ class Campaign(CampaignResults):
             InputError: if the threshold is not a positive number, or the confidence is below 0.5.
             CertificateError: if an option of the certificate is not valid.
         """
-        chosen = certificate or CertificateOptions.posterior(confidence, stochastic=stochastic, resolution=resolution)
+        chosen = _by(certificate, confidence, stochastic, resolution)
         known = Provenance.of(self.store.description(), self.store.history())
         return judge(self.trials, threshold, chosen, replace(known, space=self.validation.space))
 
@@ -195,8 +195,7 @@ class Campaign(CampaignResults):
             CertificateError: if an option of the certificate is not valid.
         """
         total = _count("budget must be a positive integer", budget)
-        by = certificate or CertificateOptions.posterior(confidence, stochastic=stochastic, resolution=resolution)
-        stopping = StoppingRule(threshold, by)
+        stopping = StoppingRule(threshold, _by(certificate, confidence, stochastic, resolution))
 
         def rule() -> Choice | None:
             now = stopping.decide(self.trials, total - self.executions)
@@ -413,3 +412,20 @@ def _count(sentence: str, count: object) -> int:
     if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
         raise InputError(f"{sentence}, got {count!r}.")
     return int(count)
+
+
+def _by(
+    certificate: CertificateOptions | None, confidence: float, stochastic: bool, resolution: float
+) -> CertificateOptions:
+    """Return the certificate that is asked for; the posterior bound with these options if none is given.
+
+    Raises:
+        InputError: if it is not a CertificateOptions, or if options are given beside it, which it has itself.
+    """
+    if certificate is None:
+        return CertificateOptions.posterior(confidence, stochastic=stochastic, resolution=resolution)
+    if not isinstance(certificate, CertificateOptions):
+        raise InputError(f"certificate must be a CertificateOptions, got {certificate!r}.")
+    if (confidence, stochastic, resolution) != (CONFIDENCE, False, RESOLUTION):
+        raise InputError("confidence, stochastic and resolution are options of certificate=; state them there.")
+    return certificate

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, lines
-from ctxval._util.texts import text_of
+from ctxval._util.texts import shortened, text_of
 from ctxval.campaign.fallback import error_with_fallback
 from ctxval.campaign.history import history_of, predict_from
 from ctxval.campaign.identity import identify
@@ -233,7 +234,7 @@ class TrialRecorder:
         note = None
         if choice.unit_point is None:
             unit_point, origin = self._proposal(), self._origin()
-            note = self.search.note()
+            note = _plain_note(self.search.note())
         else:
             unit_point, origin = choice.unit_point, choice.origin
             self.search.tell(unit_point[None], [np.nan])
@@ -247,11 +248,15 @@ class TrialRecorder:
         """Return the search's next point ``(d,)``."""
         if self.search.uses_prediction:
             self.search.use_prediction(predict_from(self.validation, self.store, self._trials))
-        point: Array = np.asarray(self.search.ask(1), dtype=np.float64)
+        asked = self.search.ask(1)
+        try:
+            point: Array = np.asarray(asked, dtype=np.float64) if np.isrealobj(asked) else np.array(np.nan)
+        except (TypeError, ValueError):
+            point = np.array(np.nan)
         if point.shape != (1, self.validation.space.dimension) or not ((point >= 0) & (point <= 1)).all():
             raise InputError(
                 f"a search must return points of the unit cube, shape (1, {self.validation.space.dimension}), "
-                f"got {point.tolist()}."
+                f"got {shortened(repr(asked), 200)}."
             )
         return np.asarray(point[0])
 
@@ -364,3 +369,17 @@ class TrialRecorder:
                 raise InputError(refusal) from error
             self.refresh()
             yield
+
+
+def _plain_note(note: Any) -> dict[str, Any] | None:
+    """Return a search's note, which is stored as JSON.
+
+    Raises:
+        InputError: if it is not a dictionary of plain values.
+    """
+    try:
+        if note is None or (isinstance(note, dict) and json.dumps(note, allow_nan=False)):
+            return note
+    except (TypeError, ValueError):
+        pass
+    raise InputError(f"the note of a search must be a dictionary of plain values for JSON, got {note!r}.")

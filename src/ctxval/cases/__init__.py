@@ -6,7 +6,7 @@ import inspect
 from typing import Any
 
 from ctxval import Experiment
-from ctxval._util.registry import Registry
+from ctxval._util.registry import Registry, construct
 from ctxval.errors import InputError, UnknownNameError
 
 NAMES: dict[str, str] = {
@@ -36,7 +36,7 @@ def by_name(name: str, /, seed: int = 0, **options: Any) -> Experiment:
     for option in options:
         if option not in taken:
             raise UnknownNameError.among(f"option of the case {name!r}", option, taken)
-    case = REGISTRY.find(name)(seed, **options)
+    case = construct(f"the case {name}", REGISTRY.find(name), options, seed)
     if not isinstance(case, Experiment):
         raise InputError(f"the case {name!r} must make an Experiment, got {type(case).__name__}.")
     return case

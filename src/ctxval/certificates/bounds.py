@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctxval.errors import CertificateError
+from ctxval.errors import CertificateError, InputError
 
 ERRORS = 2.0
 """Number of its standard errors by which a bound from random draws must stay below a threshold."""
@@ -59,3 +59,14 @@ def as_text(value: object) -> str:
             return ", ".join(f"{name} {as_text(item)}" for name, item in value.items())
         case _:
             return str(value)
+
+
+def require_number(name: str, value: object) -> float:
+    """Return a real number.
+
+    Raises:
+        InputError: if it is not one.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise InputError(f"{name} must be a number, got {value!r}.")
+    return float(value)

@@ -10,6 +10,7 @@ from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
 from ctxval._util.arrays import Array
+from ctxval.certificates.bounds import require_number
 from ctxval.errors import CertificateError
 
 RESOLUTION = 0.125
@@ -33,7 +34,7 @@ def require_resolution(value: float) -> float:
     Raises:
         CertificateError: if it is not a positive number.
     """
-    if not 0 < value < float("inf"):
+    if not 0 < require_number("the resolution", value) < float("inf"):
         raise CertificateError(f"the resolution must be a positive number of diagonals, got {value!r}.")
     return float(value)
 

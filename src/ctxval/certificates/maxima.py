@@ -87,8 +87,8 @@ class Maxima:
 
         It is computed by a block bootstrap over the chain of hyperparameters, because successive draws are correlated,
         and so are draws that share hyperparameters. If the confidence is high, few draws are above the bound and their
-        spread may be too small. So the error of a bound of lower confidence is computed too, and the larger is
-        returned.
+        spread may be too small. The bound with fewer draws below it has an error too, and the larger of the two
+        is returned.
         """
         share = require_probability("confidence", confidence)
         blocks = min(_BLOCKS, len(self.conditioned))

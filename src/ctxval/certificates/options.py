@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from ctxval._util.representation import record
 from ctxval.certificates.base import CertificateKind
-from ctxval.certificates.bounds import require_probability
+from ctxval.certificates.bounds import require_number, require_probability
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.posterior import Posterior
 from ctxval.errors import CertificateError, InputError
@@ -32,7 +32,7 @@ class CertificateOptions:
 
     Raises:
         CertificateError: if the confidence is no probability.
-        InputError: if the confidence is below 0.5, or the volume is negative or above 0.5.
+        InputError: if the kind is not one, the confidence is below 0.5, or the volume is negative or above 0.5.
     """
 
     kind: CertificateKind = field(default_factory=Posterior)
@@ -40,8 +40,10 @@ class CertificateOptions:
     volume: float = 0.0
 
     def __post_init__(self) -> None:
-        require_confidence(self.confidence)
-        require_volume(self.volume)
+        if not isinstance(self.kind, CertificateKind):
+            raise InputError(f"kind must be a kind of certificate, such as Posterior(), got {self.kind!r}.")
+        require_confidence(require_number("the confidence", self.confidence))
+        require_volume(require_number("the volume", self.volume))
 
     @classmethod
     def posterior(

@@ -43,7 +43,8 @@ class Posterior(CertificateKind):
             bound is withdrawn. With 1 the bound is never withdrawn for this reason.
 
     Raises:
-        CertificateError: if the resolution is not a positive number.
+        CertificateError: if the resolution is not positive.
+        InputError: if an option has another type.
     """
 
     name: ClassVar[str] = "posterior"
@@ -53,6 +54,8 @@ class Posterior(CertificateKind):
 
     def __post_init__(self) -> None:
         require_resolution(self.resolution)
+        if not isinstance(self.stochastic, bool):
+            raise InputError(f"stochastic must be True or False, got {self.stochastic!r}.")
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_posterior` of the trials."""

@@ -35,9 +35,12 @@ class KindRegistry(Registry[CertificateKind]):
             InputError: if the class is no kind of certificate, or another kind has its name.
         """
         name = _required(kind).name
-        known = self.find(name) if name in self.built_in else self._registered.setdefault(name, kind)
-        if known is not kind:
+        known = self.find(name) if name in self.built_in else self._registered.get(name, kind)
+        again = (known.__module__, known.__qualname__) == (kind.__module__, kind.__qualname__)
+        if not again:
             raise InputError(f"there is a kind of certificate called {name!r} already: {known.__qualname__}.")
+        if name not in self.built_in:
+            self._registered[name] = kind  # a cell that is run again replaces its own class
         return kind
 
     def find(self, name: str) -> type[CertificateKind]:

@@ -98,6 +98,8 @@ class SamplingDiscarding(_ByDraws):
         super().require_audit_helps(origins)
 
     def _require_discard(self) -> int:
+        if self.discard is not None and (isinstance(self.discard, bool) or not isinstance(self.discard, int)):
+            raise CertificateError(f"discard must be an integer, got {self.discard!r}.")
         if not self.discard:
             raise CertificateError("sampling and discarding needs to know how many to discard, at least 1.")
         return self.discard

@@ -147,6 +147,7 @@ def check(
     """Check that the parts of an experiment fit together. The system is executed only if --execute is given."""
     settings = read_settings(target, {"options": named_values(option)})
     experiment = settings.load()
+    _ = settings.certificate_options  # which refuses a kind or an option that does not exist
     settings.search.build(settings.folder)
     findings = check_experiment(experiment, execute=execute, seed=settings.seed)
     if not as_json:

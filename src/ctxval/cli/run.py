@@ -122,6 +122,7 @@ def run(
     settings = read_settings(target, {**given, "store": store, "options": options})
     settings = settings.certified_as({"stochastic": stochastic, "resolution": resolution})
     experiment = settings.load()
+    certificate = settings.certificate_options  # it is checked before executions are paid for
     if truth:
         _require_truth(experiment)  # before executions are paid for
     limit = _limit(experiment, settings)
@@ -132,7 +133,7 @@ def run(
     with worker_options(workers, dask, timeout) as execution, progress(campaign, total, show=not as_json) as on_trial:
         execute(budget=total, on_trial=on_trial, **execution)
     known = experiment.truth() if truth and experiment.truth is not None else None
-    verdict = None if limit is None else campaign.verdict(limit, certificate=settings.certificate_options)
+    verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
     report = _report(campaign, experiment, settings, total, path, verdict, known)
     report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path)]
     if not as_json:

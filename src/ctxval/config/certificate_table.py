@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from ctxval.certificates import KINDS, RESOLUTION, CertificateKind, CertificateOptions, require_use
@@ -40,17 +40,10 @@ class CertificateTable(BaseModel):
     discard: int | None = Field(default=None, ge=0)
     constant: float | None = None
 
-    @field_validator("kind")
-    @classmethod
-    def _known(cls, kind: str) -> str:
-        if kind not in KINDS:
-            raise PydanticCustomError("kind", f"the kind must be one of {', '.join(KINDS)}")
-        return kind
-
     @model_validator(mode="after")
     def _used(self) -> CertificateTable:
         if self.kind not in KINDS.imported:
-            return self  # reading settings imports nothing, so the options are checked when the kind is used
+            return self  # it is checked when it is used: reading imports nothing, and a store must stay readable
         try:
             for name in self.model_extra or {}:
                 self._require_known(name)

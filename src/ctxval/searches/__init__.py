@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from ctxval._util.registry import Registry
-from ctxval.errors import InputError
 from ctxval.searches.annealing import Annealing
 from ctxval.searches.auto import Auto
 from ctxval.searches.base import BaseSearch, Note, Prediction, Search, SequentialSearch
@@ -67,9 +66,5 @@ def by_name(name: str, *, repeats: int = 1, **options: Any) -> Search:
         UnknownNameError: if no search has this name; the message suggests the nearest name.
         InputError: if the search does not take these options, or if its package cannot be loaded.
     """
-    build = REGISTRY.find(name)
-    try:
-        search: Search = REGISTRY.require_made(name, build(**options))
-    except TypeError as error:
-        raise InputError(f"search {name!r}: {error}.") from error
+    search = REGISTRY.make(name, **options)
     return search if repeats == 1 else Repeated(search, repeats)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -84,7 +85,16 @@ class BaseSearch(ABC):
     @staticmethod
     def of(search: Search) -> BaseSearch:
         """Return the search itself if it is of this class; else wrap it with the defaults of this class."""
-        return search if isinstance(search, BaseSearch) else _WithDefaults(search)
+        if isinstance(search, BaseSearch):
+            return search
+        if getattr(search, "iid", False) is True:
+            # Before version 0.2 this attribute was enough, and such a search would lose its scenario bound in silence.
+            warnings.warn(
+                f"{type(search).__name__} has iid = True, which counts only if the class inherits "
+                "ctxval.searches.BaseSearch; its points are not taken to be independent draws.",
+                stacklevel=2,
+            )
+        return _WithDefaults(search)
 
     @abstractmethod
     def reset(self, dimension: int, seed: int) -> None:
