@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import concurrent.futures as cf
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from ctxval.campaign.known import KnownExecution, TrialResult, check_known, meas
 from ctxval.campaign.results import CampaignResults
 from ctxval.campaign.trials import Choice, OpenTrial, TrialRecorder
 from ctxval.campaign.workers import WorkerPool, worker_pool
-from ctxval.certificates import RESOLUTION, CertificateOptions, Provenance, StoppingRule, Verdict, judge
+from ctxval.certificates import RESOLUTION, CertificateOptions, StoppingRule
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.distance import Distance
 from ctxval.core.trajectory import Trajectory
@@ -79,39 +78,6 @@ class Campaign(CampaignResults):
         super().__init__(TrialRecorder(validation, self.search, trials, self.seed, description))
         if remeasure:
             self.remeasure()
-
-    # The verdict
-
-    def verdict(
-        self,
-        threshold: float,
-        confidence: float = CONFIDENCE,
-        *,
-        stochastic: bool = False,
-        resolution: float = RESOLUTION,
-        certificate: CertificateOptions | None = None,
-    ) -> Verdict:
-        """Return whether the model can be trusted up to a threshold tau.
-
-        The model is falsified if an executed distance exceeds the threshold, and validated if a certificate bounds d*
-        by the threshold. Otherwise the verdict is undecided, with a forecast of the executions that would decide.
-
-        Args:
-            threshold: tau, in the units of the distance.
-            confidence: the confidence level of the certificate.
-            stochastic: whether two executions of one task may differ.
-            resolution: the largest distance between a task and its nearest trial that a validation permits, in
-                diagonals of the task space.
-            certificate: the kind and the options of the certificate, in place of the posterior bound with the three
-                options above.
-
-        Raises:
-            InputError: if the threshold is not a positive number, or the confidence is below 0.5.
-            CertificateError: if an option of the certificate is not valid.
-        """
-        chosen = _by(certificate, confidence, stochastic, resolution)
-        known = Provenance.of(self.store.description(), self.store.history())
-        return judge(self.trials, threshold, chosen, replace(known, space=self.validation.space))
 
     # Running
 
@@ -195,7 +161,8 @@ class Campaign(CampaignResults):
             CertificateError: if an option of the certificate is not valid.
         """
         total = _count("budget must be a positive integer", budget)
-        stopping = StoppingRule(threshold, _by(certificate, confidence, stochastic, resolution))
+        by = CertificateOptions.or_posterior(certificate, confidence, stochastic, resolution)
+        stopping = StoppingRule(threshold, by)
 
         def rule() -> Choice | None:
             now = stopping.decide(self.trials, total - self.executions)
@@ -412,20 +379,3 @@ def _count(sentence: str, count: object) -> int:
     if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
         raise InputError(f"{sentence}, got {count!r}.")
     return int(count)
-
-
-def _by(
-    certificate: CertificateOptions | None, confidence: float, stochastic: bool, resolution: float
-) -> CertificateOptions:
-    """Return the certificate that is asked for; the posterior bound with these options if none is given.
-
-    Raises:
-        InputError: if it is not a CertificateOptions, or if options are given beside it, which it has itself.
-    """
-    if certificate is None:
-        return CertificateOptions.posterior(confidence, stochastic=stochastic, resolution=resolution)
-    if not isinstance(certificate, CertificateOptions):
-        raise InputError(f"certificate must be a CertificateOptions, got {certificate!r}.")
-    if (confidence, stochastic, resolution) != (CONFIDENCE, False, RESOLUTION):
-        raise InputError("confidence, stochastic and resolution are options of certificate=; state them there.")
-    return certificate

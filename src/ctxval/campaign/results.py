@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.campaign import display
 from ctxval.campaign.trials import TrialRecorder
+from ctxval.certificates import RESOLUTION, CertificateOptions, Provenance, Verdict, judge
+from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
@@ -83,6 +86,37 @@ class CampaignResults:
         It is None if there are too few distances.
         """
         return self._recorder.search.estimate(*self._distances())
+
+    def verdict(
+        self,
+        threshold: float,
+        confidence: float = CONFIDENCE,
+        *,
+        stochastic: bool = False,
+        resolution: float = RESOLUTION,
+        certificate: CertificateOptions | None = None,
+    ) -> Verdict:
+        """Return whether the model can be trusted up to a threshold tau.
+
+        The model is falsified if an executed distance exceeds the threshold, and validated if a certificate bounds d*
+        by the threshold. Otherwise the verdict is undecided, with a forecast of the executions that would decide.
+
+        Args:
+            threshold: tau, in the units of the distance.
+            confidence: the confidence level of the certificate.
+            stochastic: whether two executions of one task may differ.
+            resolution: the largest distance between a task and its nearest trial that a validation permits, in
+                diagonals of the task space.
+            certificate: the kind and the options of the certificate, in place of the posterior bound with the three
+                options above.
+
+        Raises:
+            InputError: if the threshold is not a positive number, or the confidence is below 0.5.
+            CertificateError: if an option of the certificate is not valid.
+        """
+        chosen = CertificateOptions.or_posterior(certificate, confidence, stochastic, resolution)
+        known = Provenance.of(self.store.description(), self.store.history())
+        return judge(self.trials, threshold, chosen, replace(known, space=self.validation.space))
 
     def surrogate(self) -> Surrogate:
         """Return the Gaussian process of the distance over the task space, for every search.

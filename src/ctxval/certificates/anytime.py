@@ -30,7 +30,7 @@ from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
 from ctxval.certificates.bounds import at_most, require_probability
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.scenario import UNSEEN, rests_on_draws
+from ctxval.certificates.scenario import ABOUT_DRAWS, rests_on_draws
 from ctxval.core.space import TaskSpace
 from ctxval.errors import CertificateError
 
@@ -102,10 +102,7 @@ def certify_anytime(sample: Sample, threshold: float, confidence: float = 0.95) 
         assumptions=(
             "the audited tasks are independent and uniform over the task space",
             f"the threshold {threshold:.6g} was fixed before any of them was known",
-            UNSEEN,
-            "each task has one distance: the system is deterministic",
-            "nothing is assumed of how the distance depends on the task",
-            "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
+            *ABOUT_DRAWS,
             *sample.remarks,
             ONE_CAMPAIGN,
         ),

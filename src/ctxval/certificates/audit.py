@@ -14,7 +14,7 @@ from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
 from ctxval.certificates.bounds import at_most, require_probability
 from ctxval.certificates.sample import Sample, advice_to_remeasure
-from ctxval.certificates.scenario import UNSEEN, rests_on_draws, violations, volume_bound, when_planned
+from ctxval.certificates.scenario import ABOUT_DRAWS, rests_on_draws, violations, volume_bound, when_planned
 from ctxval.core.space import TaskSpace
 from ctxval.errors import CertificateError
 
@@ -77,10 +77,7 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
             "the audited tasks are independent and uniform over the task space, and "
             f"{when_planned(drawn, len(everything))}",
             *_not_counted(everything, drawn),
-            UNSEEN,
-            "each task has one distance: the system is deterministic",
-            "nothing is assumed of how the distance depends on the task",
-            "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
+            *ABOUT_DRAWS,
             *sample.remarks,
             ONE_CAMPAIGN,
         ),

@@ -52,6 +52,23 @@ class CertificateOptions:
         """Return options with the posterior bound; the arguments are those of :class:`Posterior`."""
         return cls(Posterior(stochastic, resolution), confidence)
 
+    @classmethod
+    def or_posterior(
+        cls, certificate: CertificateOptions | None, confidence: float, stochastic: bool, resolution: float
+    ) -> CertificateOptions:
+        """Return a certificate that is given; otherwise the posterior bound with these options.
+
+        Raises:
+            InputError: if it is not a CertificateOptions, or if options are given beside it, which it has itself.
+        """
+        if certificate is None:
+            return cls.posterior(confidence, stochastic=stochastic, resolution=resolution)
+        if not isinstance(certificate, CertificateOptions):
+            raise InputError(f"certificate must be a CertificateOptions, got {certificate!r}.")
+        if (confidence, stochastic, resolution) != (CONFIDENCE, False, RESOLUTION):
+            raise InputError("confidence, stochastic and resolution are options of certificate=; state them there.")
+        return certificate
+
     def __repr__(self) -> str:
         return record(self)
 

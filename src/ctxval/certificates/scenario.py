@@ -36,6 +36,14 @@ UNSEEN = (
 )
 """The assumption that all bounds from independent draws share."""
 
+ABOUT_DRAWS = (
+    UNSEEN,
+    "each task has one distance: the system is deterministic",
+    "nothing is assumed of how the distance depends on the task",
+    "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
+)
+"""Assumptions and limits of the statements by independent draws among trials of any origin."""
+
 
 class _ByDraws(CertificateKind):
     """A bound from independent draws alone."""
