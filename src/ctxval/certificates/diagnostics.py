@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
 from scipy.special import ndtri, stdtr
 
 from ctxval._util.arrays import Array, Mask
@@ -121,7 +120,7 @@ def _surprises(conditioned: list[Conditioned], unordered: Mask) -> tuple[Array, 
 def _left_out_exceedances(conditioned: Conditioned) -> Array:
     """Return the upper tail probability of each value given all others, shape ``(n,)``."""
     y, n = conditioned.y, len(conditioned.y)
-    inverse = cho_solve((conditioned.L, True), np.eye(n), check_finite=False)
+    inverse = conditioned.factor.solve(np.eye(n))
     ones = inverse.sum(axis=1)
     inverse = inverse - np.outer(ones, ones) / ones.sum()  # the unknown mean is projected out
     pull, own = inverse @ y, np.maximum(np.diag(inverse), np.finfo(np.float64).tiny)
@@ -141,7 +140,7 @@ def _bare(bare: Array, d: int) -> str:
 def _exceedances(conditioned: Conditioned) -> Array:
     """Return the upper tail probabilities of values 3 to n, each given those before it, shape ``(n - 2,)``."""
     y = conditioned.y
-    whitened = solve_triangular(conditioned.L, np.stack([np.ones(len(y)), y], axis=1), lower=True, check_finite=False)
+    whitened = conditioned.factor.whiten(np.stack([np.ones(len(y)), y], axis=1))
     a, b = whitened.T
     precision = np.cumsum(a**2)
     means = np.cumsum(a * b) / precision
@@ -154,6 +153,6 @@ def _exceedances(conditioned: Conditioned) -> Array:
 def _left_out(conditioned: Conditioned) -> float:
     """Return the mean square of the standardised leave-one-out errors (Rasmussen and Williams 2006, eq. 5.12)."""
     y = conditioned.y
-    inverse = cho_solve((conditioned.L, True), np.eye(len(y)), check_finite=False)
+    inverse = conditioned.factor.solve(np.eye(len(y)))
     pull = inverse @ (y - conditioned.mean)
     return float(np.mean(pull**2 / np.diag(inverse)) / conditioned.scale2)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval.certificates.maxima import Maxima
@@ -142,7 +141,7 @@ def _joint(conditioned: Conditioned, X: Array, Z: Array) -> tuple[Array, Array]:
     """Return posterior mean ``(m,)`` and covariance ``(m, m)`` at Z, including the uncertainty of the prior's mean."""
     hyperparameters = conditioned.hyperparameters
     k = hyperparameters.kernel(Z, X)
-    weights = cho_solve((conditioned.L, True), k.T, check_finite=False)
+    weights = conditioned.factor.solve(k.T)
     mean = conditioned.mean + weights.T @ (conditioned.y - conditioned.mean)
     missing = 1 - weights.sum(axis=0)
     covariance = hyperparameters.kernel(Z, Z) - k @ weights + conditioned.mean_variance * np.outer(missing, missing)
