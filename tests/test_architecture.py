@@ -104,6 +104,7 @@ def test_cases_use_the_public_interface_alone(module: str) -> None:
         assert imported in public or imported.startswith("cases."), f"{module} imports {imported}"
 
 
+@pytest.mark.slow
 def test_importing_ctxval_loads_nothing_heavy() -> None:
     heavy = ["matplotlib", "plotly", "scipy.stats", "gymnasium", "mujoco", "sklearn", "torch", "cmaes", "rich", "typer"]
     heavy += ["fmpy", "onnxruntime", "onnx", "casadi", "control"]

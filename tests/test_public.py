@@ -40,6 +40,7 @@ def test_all_is_complete(package: str) -> None:
     assert public - {"Registry", "construct", "InputError", "UnknownNameError", "Experiment"} <= set(module.__all__)
 
 
+@pytest.mark.slow
 def test_the_part_packages_are_usable_after_importing_ctxval_alone() -> None:
     code = (
         "import sys, ctxval; light = [m for m in ctxval._SUBMODULES if f'ctxval.{m}' not in sys.modules]; "

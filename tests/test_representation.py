@@ -278,6 +278,7 @@ def test_public_objects_show_themselves_in_a_few_lines(name: str) -> None:
     require_readable(repr(found))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(INSIDE))
 def test_what_is_inside_them_does_so_too(name: str) -> None:
     found = INSIDE[name]()
@@ -331,6 +332,7 @@ def test_a_validation_shows_its_parts() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_a_campaign_shows_how_far_it_is() -> None:
     worst = campaign().worst
     assert worst is not None

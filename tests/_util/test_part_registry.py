@@ -157,6 +157,7 @@ def test_damaged_metadata_breaks_no_built_in_name(tmp_path: Path, monkeypatch: p
         distances.by_name("Speed")
 
 
+@pytest.mark.slow
 def test_an_installed_package_is_found_by_a_new_process(site: Path) -> None:
     code = (
         "import ctxval, sys; assert 'their_parts' not in sys.modules; "

@@ -57,6 +57,7 @@ def ran(monkeypatch: pytest.MonkeyPatch, folder: Path, act: Callable[[], object]
     return carry_out(Case(("--json",), **case), folder / "f").wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "wrong"),
     [

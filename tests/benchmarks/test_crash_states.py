@@ -92,6 +92,7 @@ def test_no_acknowledged_execution_is_lost_or_doubled(name: str, mode: Mode, tmp
     assert not any(counts[bad] for bad in ("lost", "twice", "changed", "refused", "crashed"))
 
 
+@pytest.mark.slow
 @needs_strace
 def test_a_journal_that_comes_back_takes_an_execution_with_it(tmp_path: Path) -> None:
     """With SQLite's own default, which shows that the check can see a loss."""

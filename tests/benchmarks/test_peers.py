@@ -74,6 +74,7 @@ def test_what_is_said_of_the_functions_is_so(case: str) -> None:
     assert (getattr(validation.model, "data", None) is not None) == CASES[case].data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HERE)
 def test_methods_stop_with_the_budget_and_repeat_themselves(name: str) -> None:
     first, again = (

@@ -571,6 +571,7 @@ def test_several_terminals_ask_and_tell_at_once(invoke: Any) -> None:
     assert [trial.state for trial in Store("a.sqlite").trials()] == ["completed", "open", "completed", "open", "open"]
 
 
+@pytest.mark.slow
 def test_an_asking_campaign_learns_what_others_stored(validation: Any, tmp_path: Path) -> None:
     first, second = (Campaign(validation, store=tmp_path / "a.sqlite", seed=3) for _ in range(2))
     opened = first.ask()

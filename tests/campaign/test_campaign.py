@@ -271,6 +271,7 @@ def test_verdicts_are_executed_facts_or_undecided(validation: Validation) -> Non
             campaign.verdict(threshold)
 
 
+@pytest.mark.slow
 def test_a_store_of_another_experiment_is_refused(validation: Validation, tmp_path: Path) -> None:
     Campaign(validation, store=tmp_path / "a.sqlite").run(2)
     longer = make_validation(horizon=26)
@@ -567,6 +568,7 @@ def test_a_resumed_random_search_keeps_its_plan(validation: Validation, tmp_path
     assert [trial.note for trial in trials] == [{"draws": 3}] * 3
 
 
+@pytest.mark.slow
 def test_options_beside_a_certificate_are_refused() -> None:
     campaign = Campaign(make_validation(), seed=1).run(3)
     by = CertificateOptions(confidence=0.9)

@@ -81,6 +81,7 @@ def test_an_interrupted_execution_and_failures_change_nothing_that_is_chosen(tmp
     assert [t.attempts for t in resumed.trials] == [1] * 4 + [2] + [1]
 
 
+@pytest.mark.slow
 def test_a_note_of_a_task_that_could_not_be_planned_is_kept(tmp_path: Path) -> None:
     class Fussy:
         batched = True

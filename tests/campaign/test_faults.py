@@ -255,6 +255,7 @@ def test_a_full_disk_loses_no_execution(tmp_path: Path) -> None:
     assert rescued
 
 
+@pytest.mark.slow
 def test_a_read_only_folder_is_a_clear_error_and_can_still_be_read(whole: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

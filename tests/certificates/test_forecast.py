@@ -22,6 +22,7 @@ def found(sample: Sample) -> Maxima:
     return draw_maxima(sample, draws=12, paths=4)
 
 
+@pytest.mark.slow
 def test_what_is_decided_already_takes_no_more_executions(sample: Sample, found: Maxima) -> None:
     validated = forecast(sample, found, 100 * found.upper(CONFIDENCE), CONFIDENCE)
     assert (validated.executions, validated.validated, validated.falsified) == (0, 1.0, 0.0)

@@ -78,6 +78,7 @@ def test_a_confidence_that_is_no_probability_is_refused(confidence: float) -> No
 # The draws
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [1, 3])
 def test_no_bound_is_below_the_largest_distance_that_was_executed(d: int) -> None:
     trials = sample(d=d)

@@ -65,6 +65,7 @@ def test_a_bound_is_put_to_the_test_twice_before_it_decides() -> None:
     assert not now.decided
 
 
+@pytest.mark.slow
 def test_a_study_can_vary_how_often_a_bound_is_put_to_the_test() -> None:
     known = [trial(k, x, 0.5 + 0.3 * np.sin(9 * x)) for k, x in enumerate([0.0, 0.2, 0.42, 0.6, 0.8, 1.0])]
     assert not StoppingRule(50.0).decide(known, left=5).decided

@@ -139,6 +139,7 @@ def test_a_counterexample_needs_no_certificate_and_no_model() -> None:
     assert StoppingRule(0.5).decide(known, 0).decided
 
 
+@pytest.mark.slow
 def test_undecided_says_what_more_would_take() -> None:
     known = trials(5)
     upper = certify_posterior(Sample.of(known)).upper_bound
@@ -151,6 +152,7 @@ def test_undecided_says_what_more_would_take() -> None:
     assert not StoppingRule(tau).decide(known, 0).decided
 
 
+@pytest.mark.slow
 def test_a_bound_that_is_withdrawn_is_not_forecast() -> None:
     known = [*trials(25), trial(25, 0.51, 30.0)]
     verdict = judge(known, 1e6)
@@ -201,6 +203,7 @@ def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> No
         )
 
 
+@pytest.mark.slow
 def test_what_nothing_came_near_to_is_missing_where_the_bound_keeps_the_threshold() -> None:
     known = [one for one in trials(9) if not 0.3 < one.unit_point[0] < 0.7]
     now = StoppingRule(50.0).decide(known, left=1)

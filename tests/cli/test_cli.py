@@ -83,6 +83,7 @@ def test_the_default_search_learns_from_trajectories(invoke) -> None:  # type: i
     assert Store(Path(report["store"])).trials()[-1].note["engine"] == "climb"  # type: ignore[index]
 
 
+@pytest.mark.slow
 def test_json_is_one_object_with_everything_asked_for(invoke) -> None:  # type: ignore[no-untyped-def]
     asked = ("--budget", "8", "--seed", "3", "--truth", "--threshold", "9", "--resolution", "1", "--json")
     result = invoke("run", "rig:experiment", *asked)
@@ -573,6 +574,7 @@ def test_every_command_is_in_the_readme() -> None:
         assert f"ctxval {command}" in readme
 
 
+@pytest.mark.slow
 def test_the_installed_command_runs_without_a_traceback(tmp_path: Path) -> None:
     result = subprocess.run(
         [sys.executable, "-m", "ctxval.cli", "run", "nothing"],

@@ -32,6 +32,7 @@ def test_a_batched_random_search_is_the_search_of_the_same_seed() -> None:
     np.testing.assert_allclose(running_estimate(distances_of(result), "random"), np.maximum.accumulate(distances))
 
 
+@pytest.mark.slow
 def test_results_are_stored_once_and_reused(tmp_path: Path) -> None:
     results, done = Results(tmp_path / "results"), []
     results.fill([PROFILE, PROFILE], 1, done.append)

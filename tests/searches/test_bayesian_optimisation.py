@@ -48,12 +48,14 @@ def run(search: Search, function: Function, budget: int, dimension: int = 2, see
     return np.array(values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("dimension", "budget"), [(1, 12), (2, 20), (6, 40)])
 def test_it_finds_the_top_of_a_hill(dimension: int, budget: int, seed: int) -> None:
     assert run(BayesianOptimisation(), peak, budget, dimension, seed).max() > 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_it_finds_the_highest_corner_of_a_folded_plane(seed: int) -> None:
     values = run(BayesianOptimisation(), fold, 40, 8, seed)
@@ -165,6 +167,7 @@ def test_it_keeps_the_contract_of_a_search() -> None:
     assert type(by_name("scalar", beta=1.0)) is BayesianOptimisation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("told", [1, 21, 30, 43])
 def test_told_its_history_late_and_in_another_order_it_asks_for_the_same_point(told: int) -> None:
     whole = BayesianOptimisation()

@@ -61,6 +61,7 @@ def test_a_wrong_prediction_does_not_keep_the_top_hidden() -> None:
     assert "leaving one out, the prediction errs by" in fallen[0]["why"]
 
 
+@pytest.mark.slow
 def test_without_a_prediction_the_scalar_search_goes_on_and_says_so() -> None:
     search, random = TrustRegion(), Random()
     search.reset(2, 5)

@@ -174,6 +174,7 @@ def test_a_failure_in_the_middle_ends_the_trajectory(path: Path) -> None:
     assert system.execute(feedback, TASK).ended == "complete"
 
 
+@pytest.mark.slow
 def test_a_process_is_kept_until_something_goes_wrong(path: Path) -> None:
     system = FMU(path, **NAMES)
     (first,) = processes(system)
@@ -222,6 +223,7 @@ def test_a_crash_ends_the_trajectory_and_not_the_process(deadly: Path) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"workers": 2}])
 def test_a_crash_is_a_failed_trial_of_a_campaign(deadly: Path, options: dict[str, int]) -> None:
     validation = Validation(
@@ -428,6 +430,7 @@ def test_the_process_serves_line_by_line(fmi2: Path) -> None:
     assert values[2:] == [None, [0.0, 0.0], None]
 
 
+@pytest.mark.slow
 def test_threads_do_not_disturb_each_other(path: Path) -> None:
     system = FMU(path, **NAMES)
     alone = system.execute(feedback, TASK).states
@@ -436,6 +439,7 @@ def test_threads_do_not_disturb_each_other(path: Path) -> None:
             np.testing.assert_array_equal(trajectory.states, alone)
 
 
+@pytest.mark.slow
 def test_shapes_and_steps_must_fit(path: Path) -> None:
     system = FMU(path, **NAMES, step=0.04)
     with pytest.raises(InputError, match=r"whole multiple of the step 0\.04 s, got 0\.1 s"):

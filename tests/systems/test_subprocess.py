@@ -272,6 +272,7 @@ python(Path({folder!r}), ESCAPE + "time.sleep(60)", {folder!r}).execute(designed
 """
 
 
+@pytest.mark.slow
 @LINUX
 def test_what_left_the_group_ends_with_a_process_that_is_killed(tmp_path: Path) -> None:
     code = CAMPAIGN.format(path=sys.path, folder=str(tmp_path))
@@ -318,6 +319,7 @@ def test_all_is_killed_when_we_are_interrupted(tmp_path: Path, monkeypatch: pyte
     assert gone(pids[0])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("false") is None, reason="no false")
 def test_the_status_of_the_shortest_command_is_never_lost() -> None:
     system = Subprocess("false", timeout=30)
