@@ -67,7 +67,7 @@ def test_mean_and_scale_are_those_of_generalised_least_squares(nu: float, noise:
     assert seen.mean == pytest.approx(mean, rel=1e-8)
     assert seen.mean_variance == pytest.approx(1 / (ones @ inverse @ ones), rel=1e-8)
     assert seen.scale2 == pytest.approx((y - mean) @ inverse @ (y - mean) / (len(y) - 1), rel=1e-8)
-    np.testing.assert_allclose(seen.L @ seen.L.T, dense(hyper, X), atol=1e-12)
+    np.testing.assert_allclose(seen.factor.L @ seen.factor.L.T, dense(hyper, X), atol=1e-12)
 
 
 def test_the_likelihood_is_the_integral_over_mean_and_scale() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -64,18 +64,17 @@ def _by_known_value(prediction: Prediction, points: Array, executed: Rows) -> Pr
         executed: the row of the trajectory of each value, ``(n,)``; -1 if there is none.
     """
 
-    def left_out(rows: Rows) -> Array:
-        found = np.empty(len(rows))
-        has_trajectory = executed[rows] >= 0
-        if has_trajectory.any():
-            found[has_trajectory] = prediction.left_out(executed[rows[has_trajectory]])
-        if not has_trajectory.all():
-            # Nothing was learned from this point, so leaving it out does not change the prediction there.
-            found[~has_trajectory] = prediction.expected(points[rows[~has_trajectory]])[0]
-        return found
+    def left_out_of(one: Prediction) -> Callable[[Rows], Array]:
+        def left_out(rows: Rows) -> Array:
+            found = np.empty(len(rows))
+            has_trajectory = executed[rows] >= 0
+            if has_trajectory.any():
+                found[has_trajectory] = one.left_out(executed[rows[has_trajectory]])
+            if not has_trajectory.all():
+                # Nothing was learned from this point, so leaving it out does not change the prediction there.
+                found[~has_trajectory] = one.expected(points[rows[~has_trajectory]])[0]
+            return found
 
-    def otherwise() -> Prediction | None:
-        other = None if prediction.otherwise is None else prediction.otherwise()
-        return None if other is None else _by_known_value(other, points, executed)
+        return left_out
 
-    return replace(prediction, left_out=left_out, otherwise=otherwise)
+    return prediction.with_rows(left_out_of)

@@ -172,11 +172,6 @@ class Conditioned:
     scale2: float
     log_likelihood: float
 
-    @property
-    def L(self) -> Array:
-        """The lower triangular matrix of the factor, shape ``(n, n)``."""
-        return self.factor.L
-
     def __repr__(self) -> str:
         return call(self, self.hyperparameters, values=self.y, mean=self.mean, scale2=self.scale2)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -39,6 +39,19 @@ class Prediction:
     left_out: Callable[[Rows], Array]
     budget: int
     otherwise: Callable[[], Prediction | None] | None = None
+
+    def with_rows(self, left_out_of: Callable[[Prediction], Callable[[Rows], Array]]) -> Prediction:
+        """Return the prediction with other rows, also in those that it may turn to.
+
+        Args:
+            left_out_of: a prediction with these rows -> its ``left_out`` for the other rows.
+        """
+
+        def otherwise() -> Prediction | None:
+            other = None if self.otherwise is None else self.otherwise()
+            return None if other is None else other.with_rows(left_out_of)
+
+        return replace(self, left_out=left_out_of(self), otherwise=otherwise)
 
     def __repr__(self) -> str:
         return record(self)

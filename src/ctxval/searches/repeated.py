@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -126,10 +126,4 @@ class Repeated(SequentialSearch):
 
 def _by_point(prediction: Prediction, evaluated: Rows) -> Prediction:
     """Return a prediction whose rows count distinct points; ``evaluated`` has the row of one evaluation of each."""
-    otherwise = prediction.otherwise
-
-    def alternative() -> Prediction | None:
-        found = None if otherwise is None else otherwise()
-        return None if found is None else _by_point(found, evaluated)
-
-    return replace(prediction, left_out=lambda rows: prediction.left_out(evaluated[rows]), otherwise=alternative)
+    return prediction.with_rows(lambda one: lambda rows: one.left_out(evaluated[rows]))
