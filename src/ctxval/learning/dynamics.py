@@ -21,7 +21,8 @@ from ctxval.gp import kernels
 from ctxval.gp.cholesky import tenfold
 from ctxval.gp.regression import MultiOutputProcess, log_likelihood_of_outputs, most_likely
 from ctxval.gp.subset import pivoted_rows
-from ctxval.models.scaling import standard_deviations, standardised_pairs
+from ctxval.learning.residual_data import residual_data
+from ctxval.models.scaling import standardised_pairs
 
 _CENTRES = 450
 """Largest number of transitions that the residual is conditioned on."""
@@ -31,10 +32,6 @@ _START = 3.0
 """Length-scale, in standard deviations of the inputs, at which the search for the hyperparameters starts."""
 _MUCH_BETTER = 0.7
 """Dynamics learned without M are preferred if their error is below this share of the error with M."""
-_NEGLIGIBLE = 1e-7
-"""A residual below this share of the state's typical change is rounding."""
-_ABSURD = 1e100
-"""Transitions with larger numbers have diverged and are left out; the squares of such numbers would not be finite."""
 _REACH = 5.0
 """Predicted residuals are limited to this many times the largest one recorded."""
 _STEPS_SAMPLED = 12
@@ -166,32 +163,21 @@ def learn_residual(model: Model, transitions: Transitions, sources: Rows, centre
         sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
         centres: largest number of transitions that the residual is conditioned on.
     """
-    with np.errstate(all="ignore"):
-        residuals = transitions.x_next - model.step(transitions.x, transitions.u)
-        steps = transitions.x_next - transitions.x
-    pairs = np.concatenate([transitions.x, transitions.u], axis=1)
-    usable = (np.abs(np.concatenate([pairs, residuals, steps], axis=1)) < _ABSURD).all(axis=1)
-    if usable.sum() < 2:
+    data = residual_data(model, transitions, sources)
+    if data is None:
         return None
-    pairs, residuals, sources = pairs[usable], residuals[usable], sources[usable]
-    typical = standard_deviations(steps[usable])
-    sizes = np.sqrt((residuals**2).mean(axis=0))
-    learned = sizes > _NEGLIGIBLE * typical
-    if not learned.any():
-        return None
-    shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
-    Z, Y = (pairs - shift) / scale, residuals / np.where(learned, sizes, np.inf)
+    Z, Y, learned = data.pairs, data.outputs, data.learned
     with single_threaded():
         theta, noise = _most_likely(Z, Y[:, learned])
         chosen = pivoted_rows(_KERNEL, theta, Z, centres, least=_PIVOT * noise)
         others = np.setdiff1d(np.arange(len(Z)), chosen)
         spare = others[pivoted_rows(_KERNEL, theta, Z[others], centres // 3, least=_PIVOT * noise)]
     return Residual(
-        *(theta, noise, Z[chosen], Y[chosen], sources[chosen], shift, scale),
-        scale_out=np.where(learned, sizes, 0.0),
+        *(theta, noise, Z[chosen], Y[chosen], data.sources[chosen], data.shift, data.scale),
+        scale_out=data.units,
         limit=_REACH * np.abs(Y).max(axis=0),
-        unit=float(np.sqrt(((sizes / typical)[learned] ** 2).mean())),
-        spare=(Z[spare], Y[spare], sources[spare]),
+        unit=float(np.sqrt(((data.sizes / data.steps)[learned] ** 2).mean())),
+        spare=(Z[spare], Y[spare], data.sources[spare]),
     )
 
 

@@ -12,31 +12,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.cores import on_all_cores
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.rollout import rollout
-from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.dynamics import CorrectedModel, learn_corrected
+from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.vector import predict_composed
-from ctxval.models.scaling import standard_deviations
 from ctxval.searches import Prediction
 
 _CENTRES = (100, 450)
 """Least and largest number of transitions that the residual is conditioned on."""
 _WORK = 30_000
 """Number of these transitions times the horizon; it bounds the time of a closed loop."""
-_POOL = 3000
-"""Largest number of transitions that these are chosen from."""
-_DATA = 600
-"""Largest number of transitions of the model's own data in this pool: those nearest to the tasks."""
-_LOOPS = 64
-"""Number of closed loops on M that show which transitions the tasks need."""
-_SLOW_LOOPS = 3
-"""Number of tasks that are tried one by one, if loops cannot be computed in a batch."""
 _DESIGNS = 2000
 """Number of designs for one suggestion, if the synthesizer takes batches."""
 _SLOW_DESIGNS = 150
@@ -89,24 +80,15 @@ def _vector(validation: Validation, distance: ComposedDistance, point: Array, tr
 
 def _predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
     started = time.perf_counter()
-    loops = _closed_loops_on_model(validation)
+    loops = closed_loops_on_model(validation)
     seconds = time.perf_counter() - started
     if loops is None:
         return None
-    parts = [trajectory.transitions() for _, trajectory in executed]
-    sources = [np.full(len(part), k) for k, part in enumerate(parts)]
-    data = getattr(validation.model, "data", None)
-    if isinstance(data, Transitions) and len(data):
-        parts.append(_nearest(data, loops))
-        sources.append(np.full(len(parts[-1]), -1))
-    if not parts:
+    recorded = recorded_transitions(validation.model, [trajectory for _, trajectory in executed], loops)
+    if recorded is None:
         return None
-    together, of = Transitions.joined(parts), np.concatenate(sources)
-    if len(of) > _POOL:
-        kept = np.sort(np.random.default_rng(len(of)).permutation(len(of))[:_POOL])
-        together, of = Transitions(together.x[kept], together.u[kept], together.x_next[kept]), of[kept]
     centres = int(np.clip(_WORK // loops.horizon, *_CENTRES))
-    corrected = learn_corrected(validation.model, together, of, centres)
+    corrected = learn_corrected(validation.model, *recorded, centres)
     if corrected is None:
         return None
     batched = bool(loops.batch_shape)
@@ -114,40 +96,6 @@ def _predict_distance(validation: Validation, executed: Sequence[tuple[Array, Tr
         validation, corrected, batched, executed, in_parallel=not batched and seconds > _SLOW
     )
     return Prediction(predicted, predicted.left_out, _DESIGNS if batched else _SLOW_DESIGNS)
-
-
-def _closed_loops_on_model(validation: Validation) -> Trajectory | None:
-    """Return closed loops on M for random tasks: a batch, or one task if there can be no batch.
-
-    Returns None if no task can be planned.
-    """
-    space = validation.space
-    points = space.from_unit(np.random.default_rng(0).random((_LOOPS, space.dimension)))
-    batches = [points] if getattr(validation.synthesizer, "batched", False) else []
-    for rows in [*batches, *points[:_SLOW_LOOPS]]:
-        try:
-            task = validation.task(space.parameters(rows))
-            loops = rollout(validation.model.step, validation.synthesizer.design(task, validation.model), task)
-        except Exception:  # the user's own parts, on tasks that may never be executed
-            continue
-        if loops.batch_shape == rows.shape[:-1]:
-            return loops
-    return None
-
-
-def _nearest(data: Transitions, loops: Trajectory) -> Transitions:
-    """Return the transitions that are nearest to the closed loops of the tasks."""
-    if len(data) <= _DATA:
-        return data
-    needed = loops.transitions()
-    there = np.concatenate([needed.x, needed.u], axis=1)
-    there = there[np.isfinite(there).all(axis=1)][:: max(1, len(there) // _POOL)]
-    here = np.concatenate([data.x, data.u], axis=1)
-    if not len(there):
-        return data
-    scale = standard_deviations(here)
-    kept = np.sort(np.argsort(cdist(here / scale, there / scale).min(axis=1), kind="stable")[:_DATA])
-    return Transitions(data.x[kept], data.u[kept], data.x_next[kept])
 
 
 @dataclass(frozen=True, eq=False)

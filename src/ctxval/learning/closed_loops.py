@@ -1,0 +1,196 @@
+"""Closed loops of many drawn systems under controllers designed on M, whole batches of tasks and draws at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Rows
+from ctxval._util.representation import call
+from ctxval.core.controller import Controller
+from ctxval.core.rollout import rollout
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.validation import Validation
+from ctxval.learning.dynamics_posterior import DynamicsDraws
+
+_TASKS = 512
+"""Largest number of tasks whose controllers are designed in one call."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedTasks:
+    """Tasks with their controllers and the trajectories of M: a batch, or one task without batch axes.
+
+    Attributes:
+        rows: the rows of these tasks among all points that were planned, shape ``(q,)``.
+        task: the task, or a batch of q tasks.
+        controller: its controller.
+        promised: the trajectory of M.
+    """
+
+    rows: Rows
+    task: Task
+    controller: Controller
+    promised: Trajectory
+
+    def __repr__(self) -> str:
+        return call(self, len(self.rows), horizon=self.task.horizon)
+
+
+@dataclass(frozen=True, eq=False)
+class Loops:
+    """Closed loops of S drawn systems on q tasks.
+
+    Attributes:
+        distances: d, shape ``(S, q)``; NaN if a task cannot be planned, infinity if a loop diverges.
+        states: shape ``(S, q, H + 1, n)``; NaN if a task cannot be planned.
+        inputs: shape ``(S, q, H, m)``.
+    """
+
+    distances: Array
+    states: Array
+    inputs: Array
+
+
+class LoopPlanner:
+    """Designs controllers for points of the unit cube, and runs drawn systems in closed loop with them.
+
+    Args:
+        validation: the map p -> d(p); S is never executed.
+    """
+
+    def __init__(self, validation: Validation) -> None:
+        self.validation = validation
+        self._batched = bool(getattr(validation.synthesizer, "batched", False))
+        self._takes_draws: bool | None = None
+
+    def plan(self, points: Array, together: int = _TASKS) -> list[PlannedTasks]:
+        """Return the plans of points ``(q, d)``; tasks for which no controller can be designed are left out.
+
+        Args:
+            points: points of the unit cube.
+            together: largest number of tasks that are planned in one call, if the synthesizer takes batches.
+        """
+        size = together if self._batched else 1
+        rows = np.arange(len(points))
+        return [one for first in range(0, len(points), size) for one in self._planned(points, rows[first:][:size])]
+
+    def _planned(self, points: Array, rows: Rows) -> Iterator[PlannedTasks]:
+        """Yield the plans of some rows. A batch that fails is halved."""
+        parts = self.validation
+        try:
+            chosen = points[rows] if self._batched else points[rows[0]]
+            task = parts.task(parts.space.parameters(parts.space.from_unit(chosen)))
+            controller = parts.synthesizer.design(task, parts.model)
+            promised = rollout(parts.model.step, controller, task)
+            if promised.batch_shape != chosen.shape[:-1]:
+                raise ValueError("the task function did not return one task for each point")
+            yield PlannedTasks(rows, task, controller, promised)
+        except Exception:  # the user's own parts, on tasks that may never be executed
+            if len(rows) > 1:
+                half = len(rows) // 2
+                yield from self._planned(points, rows[:half])
+                yield from self._planned(points, rows[half:])
+
+    def run(self, draws: DynamicsDraws, planned: Sequence[PlannedTasks]) -> list[Loops]:
+        """Return the closed loops of all draws on the same tasks."""
+        return [self._run(draws, one) for one in planned]
+
+    def distances(self, draws: DynamicsDraws, planned: Sequence[PlannedTasks], tasks: int) -> Array:
+        """Return the distances ``(S, q)`` of all draws on the same q tasks; NaN for a task that was not planned."""
+        found = np.full((len(draws), tasks), np.nan)
+        for one, loops in zip(planned, self.run(draws, planned), strict=True):
+            found[:, one.rows] = loops.distances
+        return found
+
+    def own_distances(self, draws: DynamicsDraws, points: Array) -> Array:
+        """Return the distances ``(S, q)`` of each draw on tasks of its own, at points ``(S, q, d)``."""
+        S, q, d = points.shape
+        found = np.full(S * q, np.nan)
+        for one in self.plan(points.reshape(S * q, d), together=S * q):
+            if one.task.batch_shape:
+                step = _OwnStep(draws, q, one.rows)
+            else:
+                step = draws[int(one.rows[0]) // q].step
+            found[one.rows] = self._distances(one, rollout(step, one.controller, one.task))
+        return found.reshape(S, q)
+
+    def _run(self, draws: DynamicsDraws, planned: PlannedTasks) -> Loops:
+        task, S = planned.task, len(draws)
+        single = not task.batch_shape
+        start = np.repeat(task.initial_state[None], S, axis=0)
+
+        def step(x: Array, u: Array) -> Array:
+            return draws.step(x[:, None], u[:, None])[:, 0] if single else draws.step(x, u)
+
+        many = Task(start, horizon=task.horizon, dt=task.dt)
+        loops = rollout(step, self._for_draws(planned.controller, start), many)
+        each = (Trajectory(loops.times, loops.states[s], loops.inputs[s]) for s in range(S))
+        shape = (S, len(planned.rows))
+        return Loops(
+            np.array([self._distances(planned, one) for one in each]).reshape(shape),
+            loops.states.reshape(*shape, *loops.states.shape[-2:]),
+            loops.inputs.reshape(*shape, *loops.inputs.shape[-2:]),
+        )
+
+    def _distances(self, planned: PlannedTasks, loops: Trajectory) -> Array:
+        """Return the distances ``(q,)`` of loops; infinity if a loop diverges."""
+        with np.errstate(all="ignore"):
+            values = np.asarray(self.validation.distance(planned.promised, loops, planned.task), dtype=np.float64)
+        return np.where(np.isfinite(values) & loops.finite, values, np.inf).reshape(len(planned.rows))
+
+    def _for_draws(self, controller: Controller, start: Array) -> Controller:
+        """Return a controller that takes states with draws as another first axis."""
+        looped = _Looped(controller)
+        if self._takes_draws is None and len(start) > 1:
+            probe = start + 1e-3 * np.arange(len(start)).reshape(-1, *[1] * (start.ndim - 1))
+            self._takes_draws = _same(controller, looped, probe)
+        return controller if self._takes_draws else looped
+
+    def __repr__(self) -> str:
+        return call(self, self.validation)
+
+
+@dataclass(frozen=True, eq=False)
+class _Looped:
+    """A controller that is called for one draw after the other."""
+
+    controller: Controller
+
+    def __call__(self, t: int, x: Array) -> Array:
+        return np.stack([np.asarray(self.controller(t, row), dtype=np.float64) for row in x])
+
+
+@dataclass(frozen=True, eq=False)
+class _OwnStep:
+    """The step of draws on tasks of their own, in one flat batch.
+
+    Attributes:
+        draws: S draws of the dynamics.
+        tasks: the number q of tasks of each draw.
+        rows: the rows of this batch among all ``S q`` tasks.
+    """
+
+    draws: DynamicsDraws
+    tasks: int
+    rows: Rows
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        whole = [np.zeros((len(self.draws) * self.tasks, part.shape[-1])) for part in (x, u)]
+        for all_rows, part in zip(whole, (x, u), strict=True):
+            all_rows[self.rows] = part
+        states, inputs = (part.reshape(len(self.draws), self.tasks, -1) for part in whole)
+        return np.asarray(self.draws.step(states, inputs).reshape(-1, x.shape[-1])[self.rows])
+
+
+def _same(controller: Controller, looped: Controller, probe: Array) -> bool:
+    """Return whether a controller takes another first axis, with the same result as one call after the other."""
+    try:
+        with np.errstate(all="ignore"):
+            together, one_by_one = np.asarray(controller(0, probe)), looped(0, probe)
+    except Exception:  # the user's controller, which need not take another axis
+        return False
+    return together.shape == one_by_one.shape and np.allclose(together, one_by_one, equal_nan=True)

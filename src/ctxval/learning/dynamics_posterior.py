@@ -1,0 +1,295 @@
+"""The posterior of the dynamics: ``S(x, u) = M(x, u) + r(x, u)`` with a Gaussian process of unknown hyperparameters.
+
+Functions r_s are drawn from it; each makes a model ``M + r_s``. A draw is exact at pivots, which are state-input pairs
+that the closed loops of the tasks visit, and is interpolated between them. So it is a sum of covariances with centres
+that all draws of one set of hyperparameters share, and thousands of closed loops on it are cheap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.representation import call
+from ctxval.core.model import Model
+from ctxval.core.trajectory import Transitions
+from ctxval.errors import InputError
+from ctxval.gp.cholesky import CholeskyFactor, factorise, tenfold
+from ctxval.gp.subset import pivoted_rows
+from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters, draw_hyperparameters, learning_rows
+from ctxval.learning.kernel_expansion import KernelExpansion
+from ctxval.learning.residual_data import ResidualData, residual_data
+
+_PIVOT = 0.1
+"""Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
+_NEGLIGIBLE = 1e-3
+"""Share of the largest posterior variance below which a pivot adds nothing to those chosen before it."""
+_LARGEST = 1e6
+"""Standardised pairs are limited to this magnitude, so that a loop that diverges stays finite in its residual."""
+
+
+@dataclass(frozen=True)
+class PosteriorSettings:
+    """Numbers on which the accuracy and the cost of the posterior depend.
+
+    Attributes:
+        hyperparameters: number of draws of the hyperparameters.
+        functions: number of functions that are drawn for each of them.
+        learned_from: number of transitions that the hyperparameters are learned from.
+        centres: number of transitions that each process is conditioned on.
+        pivots: largest number of pairs at which a draw is exact.
+        families: smoothness and growth of each family of covariances.
+    """
+
+    hyperparameters: int = 20
+    functions: int = 2
+    learned_from: int = 120
+    centres: int = 130
+    pivots: int = 50
+    families: tuple[tuple[float, float], ...] = FAMILIES
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """The posterior of r for one draw of the hyperparameters.
+
+    Attributes:
+        hyperparameters: the covariance and its hyperparameters.
+        centres: standardised pairs that it is conditioned on, shape ``(M, k)``.
+        factor: Cholesky factor of their covariance with noise.
+        weights: weights of the mean, shape ``(M, n)``.
+        amplitudes: standard deviations of the states' residuals, relative to the covariance, shape ``(n,)``.
+    """
+
+    hyperparameters: Hyperparameters
+    centres: Array
+    factor: CholeskyFactor
+    weights: Array
+    amplitudes: Array
+
+    @classmethod
+    def conditioned(
+        cls, hyperparameters: Hyperparameters, Z: Array, Y: Array, centres: int, rng: np.random.Generator
+    ) -> Component:
+        """Return the process conditioned on well-spread pairs, with amplitudes drawn from their posterior."""
+        kernel, theta, noise = hyperparameters.kernel, hyperparameters.theta, hyperparameters.noise
+        rows = pivoted_rows(kernel, theta, Z, centres, least=_PIVOT * noise)
+        factor = factorise(kernel(theta, Z[rows], Z[rows]), tenfold(noise))
+        weights = factor.solve(Y[rows])
+        squares = (Y[rows] * weights).sum(axis=0)
+        amplitudes = np.sqrt(squares / rng.chisquare(len(rows), len(squares)))
+        return cls(hyperparameters, Z[rows], factor, weights, amplitudes)
+
+    @property
+    def mean(self) -> KernelExpansion:
+        """The posterior mean, as one function."""
+        return KernelExpansion(self.hyperparameters, self.centres, self.weights[None])
+
+    @property
+    def noise(self) -> Array:
+        """The standard deviation of the noise of each standardised residual, shape ``(n,)``."""
+        return np.asarray(np.sqrt(self.hyperparameters.noise) * self.amplitudes)
+
+    def variance(self, Z: Array) -> Array:
+        """Return the posterior variance at pairs ``(N, k)``, relative to the amplitudes, shape ``(N,)``."""
+        return self._halved(Z)[1]
+
+    def _halved(self, Z: Array) -> tuple[Array, Array]:
+        kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
+        half = self.factor.whiten(kernel(theta, self.centres, Z))
+        return half, np.maximum(kernel.diagonal(theta, Z) - (half**2).sum(axis=0), 0.0)
+
+    def draw(self, relevant: Array, count: int, pivots: int, rng: np.random.Generator) -> tuple[KernelExpansion, float]:
+        """Return draws that are exact at pivots, and the share of the variance that they leave out elsewhere.
+
+        Args:
+            relevant: pairs ``(R, k)`` that closed loops visit; the pivots are chosen from them.
+            count: number of draws.
+            pivots: largest number of pivots.
+            rng: the source of the draws.
+        """
+        chosen, L, left_out = self._pivots(relevant, pivots)
+        n = self.weights.shape[1]
+        if not len(chosen):
+            return KernelExpansion(self.hyperparameters, self.centres, np.repeat(self.weights[None], count, 0)), 0.0
+        kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
+        normal = rng.standard_normal((count, len(chosen), n)) * self.amplitudes
+        # The values L xi at the pivots are interpolated by the posterior covariance L L', with weights L'^-1 xi.
+        weights = np.linalg.solve(L.T, normal)
+        cross = self.factor.solve(kernel(theta, self.centres, relevant[chosen]))
+        at_centres = self.weights - np.matmul(cross, weights)
+        together = np.concatenate([at_centres, weights], axis=1)
+        return KernelExpansion(self.hyperparameters, np.concatenate([self.centres, relevant[chosen]]), together), left_out
+
+    def _pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
+        """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""
+        kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
+        half, left = self._halved(relevant)
+        least = max(_NEGLIGIBLE * float(left.max()), self.hyperparameters.noise)
+        first = float(left.max())
+        columns = np.zeros((min(count, len(relevant)), len(relevant)))
+        chosen: list[int] = []
+        for k in range(len(columns)):
+            pivot = int(np.argmax(left))
+            if left[pivot] <= least:
+                break
+            covariances = kernel(theta, relevant[pivot : pivot + 1], relevant)[0]
+            row = covariances - half[:, pivot] @ half - columns[:k, pivot] @ columns[:k]
+            columns[k] = row / np.sqrt(left[pivot])
+            left = np.maximum(left - columns[k] ** 2, 0.0)
+            left[pivot] = 0.0
+            chosen.append(pivot)
+        L = np.tril(columns[: len(chosen)][:, chosen].T)
+        return np.array(chosen, dtype=np.intp), L, float(left.max()) / first if first > 0 else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicsPosterior:
+    """The posterior of the dynamics of S, given recorded transitions.
+
+    Attributes:
+        model: the model to which residuals are added: M, or the identity if the steps of S are smoother without M.
+        data: the standardised residuals.
+        components: posteriors of the learned states, one for each draw of the hyperparameters; the first one has the
+            most probable hyperparameters.
+        settings: its settings.
+    """
+
+    model: Model
+    data: ResidualData
+    components: tuple[Component, ...]
+    settings: PosteriorSettings = field(default_factory=PosteriorSettings)
+
+    @property
+    def mean(self) -> DynamicsDraws:
+        """The model M plus the posterior mean of r for the most probable hyperparameters, as one draw."""
+        return DynamicsDraws(self.model, self.data, (self.components[0].mean,), (0.0,))
+
+    def draw(self, relevant: Array, rng: np.random.Generator) -> DynamicsDraws:
+        """Return draws of the dynamics.
+
+        Args:
+            relevant: standardised pairs ``(R, k)`` that closed loops visit.
+            rng: the source of the draws.
+        """
+        settings = self.settings
+        with single_threaded():
+            drawn = [one.draw(relevant, settings.functions, settings.pivots, rng) for one in self.components]
+        return DynamicsDraws(self.model, self.data, *(tuple(part) for part in zip(*drawn, strict=True)))
+
+    @property
+    def noise(self) -> float:
+        """The largest learned variance of noise, as a share of the mean square of a state's residual."""
+        return float(max((self.components[0].noise ** 2).max(), 0.0))
+
+    def __repr__(self) -> str:
+        return call(self, self.model, components=len(self.components), data=self.data)
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicsDraws:
+    """S models ``M + r_s``, run together: a draw is the first axis of states and inputs.
+
+    Attributes:
+        model: the model M.
+        data: constants that standardise pairs and residuals.
+        expansions: functions r_s, in groups that share their centres.
+        left_out: share of the posterior variance that the draws of each group leave out between pivots.
+    """
+
+    model: Model
+    data: ResidualData
+    expansions: tuple[KernelExpansion, ...]
+    left_out: tuple[float, ...]
+
+    def __len__(self) -> int:
+        return sum(len(one.weights) for one in self.expansions)
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
+        with np.errstate(all="ignore"):
+            z = self.data.standardised(x, u)
+            np.clip(np.nan_to_num(z, copy=False, posinf=_LARGEST, neginf=-_LARGEST), -_LARGEST, _LARGEST, out=z)
+            residuals, learned, first = np.zeros_like(x), self.data.learned, 0
+            for one in self.expansions:
+                last = first + len(one.weights)
+                residuals[first:last, :, learned] = one(z[first:last])
+                first = last
+            return self.model.step(x, u) + residuals * self.data.units
+
+    def __getitem__(self, index: int) -> DrawnModel:
+        """Return one draw as a model."""
+        for one in self.expansions:
+            if index < len(one.weights):
+                own = KernelExpansion(one.hyperparameters, one.centres, one.weights[index : index + 1])
+                return DrawnModel(DynamicsDraws(self.model, self.data, (own,), (0.0,)))
+            index -= len(one.weights)
+        raise IndexError(f"there are {len(self)} draws.")
+
+    def __repr__(self) -> str:
+        return call(self, self.model, draws=len(self))
+
+
+class DrawnModel:
+    """The model ``M + r_s`` of one draw.
+
+    Args:
+        draws: draws of the dynamics with one member.
+    """
+
+    def __init__(self, draws: DynamicsDraws) -> None:
+        self._draws = draws
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
+        states, inputs = x.reshape(1, -1, x.shape[-1]), u.reshape(1, -1, u.shape[-1])
+        return np.asarray(self._draws.step(states, inputs).reshape(x.shape))
+
+    def __repr__(self) -> str:
+        return call(self, self._draws.model)
+
+
+def learn_posterior(
+    model: Model,
+    transitions: Transitions,
+    sources: Rows,
+    rng: np.random.Generator,
+    settings: PosteriorSettings | None = None,
+) -> DynamicsPosterior | None:
+    """Return the posterior of the dynamics given recorded transitions.
+
+    Returns None if fewer than two transitions are usable, or if M explains all of them.
+
+    Args:
+        model: the model M.
+        transitions: N transitions of the system.
+        sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
+        rng: the source of the draws of the hyperparameters.
+        settings: numbers on which accuracy and cost depend; the defaults if None.
+    """
+    chosen = PosteriorSettings() if settings is None else settings
+    data = residual_data(model, transitions, sources)
+    if data is None:
+        return None
+    Z, Y = data.pairs, data.outputs[:, data.learned]
+    with single_threaded():
+        rows = learning_rows(Z, data.inputs, chosen.learned_from)
+        drawn = draw_hyperparameters(Z[rows], Y[rows], data.inputs, chosen.hyperparameters, rng, chosen.families)
+        components = tuple(_conditioned(drawn, Z, Y, chosen.centres, rng))
+    return DynamicsPosterior(model, data, components, chosen)
+
+
+def _conditioned(
+    drawn: Sequence[Hyperparameters], Z: Array, Y: Array, centres: int, rng: np.random.Generator
+) -> list[Component]:
+    """Return the processes of those hyperparameters whose covariance matrix is positive definite."""
+    found = []
+    for one in drawn:
+        try:
+            found.append(Component.conditioned(one, Z, Y, centres, rng))
+        except InputError:
+            continue
+    return found

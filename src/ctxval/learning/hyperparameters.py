@@ -1,0 +1,192 @@
+"""Draws of the hyperparameters of residual dynamics from their posterior.
+
+The residual of each state is ``sigma_i g_i``: all g_i have one covariance, and the prior is flat in each log sigma_i,
+so the amplitudes integrate out in closed form (Rasmussen and Williams 2006, Sec. 2.7). The posterior of the other
+hyperparameters is approximated around its mode (Laplace), for each family of covariances. Draws from a t distribution
+there are weighted by the ratio of the densities, with weights truncated as by Ionides (2008), and resampled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaln
+
+from ctxval._util.arrays import Array, Rows
+from ctxval.errors import InputError
+from ctxval.gp.cholesky import factorise
+from ctxval.gp.regression import most_likely
+from ctxval.gp.subset import pivoted_rows
+from ctxval.learning.residual_kernel import ResidualKernel
+
+FAMILIES = ((2.5, 0.0), (2.5, 1.0), (1.5, 0.0))
+"""Smoothness and growth of the covariances, equally likely a priori."""
+
+NOISE = (1e-7, 1.0)
+"""Bounds of the noise variance, relative to that of the Matern part."""
+
+_LENGTH = (3.0, 1.0)
+"""Median of the length-scales in standard deviations of the data, and the deviation of their logarithms."""
+_LINEAR_PART = (1.0, 5.0)
+"""The same for the variances of the constant and of the linear part, relative to that of the Matern part."""
+_NOISE_PRIOR = (1e-6, 4.0)
+"""The same for the noise variance."""
+_FREEDOM = 6.0
+"""Degrees of freedom of the t distribution of the proposals."""
+_PROPOSALS = 48
+"""Number of proposals for each family."""
+_LEAST_CURVATURE = 0.25
+"""No direction is less certain than a standard deviation of 2 in the logarithm."""
+_STEP = 0.05
+"""Step of the differences of gradients that give the curvature."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hyperparameters:
+    """One draw of the hyperparameters.
+
+    Attributes:
+        kernel: the family of covariances.
+        theta: logarithms of the kernel's hyperparameters.
+        noise: noise variance, relative to that of the Matern part.
+    """
+
+    kernel: ResidualKernel
+    theta: Array
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Mode:
+    """The posterior of one family around its mode.
+
+    Attributes:
+        kernel: the family.
+        mode: the most probable (theta, log noise).
+        scale: matrix ``(D, D)`` that maps standard normal draws to draws around the mode.
+    """
+
+    kernel: ResidualKernel
+    mode: Array
+    scale: Array
+
+    def proposals(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Return draws ``(count, D)`` of a t distribution, and the logarithms of their density ``(count,)``."""
+        D = len(self.mode)
+        normal = rng.standard_normal((count, D))
+        draws = normal / np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
+        constant = gammaln((_FREEDOM + D) / 2) - gammaln(_FREEDOM / 2) - 0.5 * D * np.log(_FREEDOM * np.pi)
+        _, log_volume = np.linalg.slogdet(self.scale)
+        density = constant - log_volume - 0.5 * (_FREEDOM + D) * np.log1p((draws**2).sum(axis=1) / _FREEDOM)
+        return self.mode + draws @ self.scale.T, density
+
+
+def draw_hyperparameters(
+    Z: Array, Y: Array, inputs: int, count: int, rng: np.random.Generator, families: Sequence[tuple[float, float]]
+) -> list[Hyperparameters]:
+    """Return draws from the posterior; the first one is the mode of the most probable family.
+
+    Args:
+        Z: standardised pairs ``(N, k)``.
+        Y: standardised residuals ``(N, n)``.
+        inputs: the number of inputs of the system.
+        count: the number of draws.
+        rng: the source of the draws.
+        families: smoothness and growth of each covariance.
+    """
+    modes = [_mode_of(ResidualKernel(nu, growth, inputs), Z, Y) for nu, growth in families]
+    found, weights = [], []
+    for mode in modes:
+        drawn, densities = mode.proposals(_PROPOSALS, rng)
+        found += [(mode.kernel, theta) for theta in drawn]
+        weights.append(np.array([_log_posterior_or_none(mode.kernel, theta, Z, Y) for theta in drawn]) - densities)
+    best = max(modes, key=lambda mode: log_posterior(mode.kernel, mode.mode, Z, Y)[0])
+    chosen = _resampled(np.concatenate(weights), count - 1, rng)
+    return [_of(best.kernel, best.mode), *(_of(*found[row]) for row in chosen)]
+
+
+def learning_rows(Z: Array, inputs: int, count: int) -> Rows:
+    """Return rows of well-spread pairs, from which the hyperparameters are learned."""
+    k = Z.shape[1]
+    theta = np.log([*[_LENGTH[0]] * k, 1.0, 1.0])
+    return pivoted_rows(ResidualKernel(2.5, 0.0, inputs), theta, Z, count, least=1e-8)
+
+
+def log_posterior(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array) -> tuple[float, Array]:
+    """Return the log density of (theta, log noise) up to a constant, and its gradient.
+
+    The likelihood is ``-n log det(K) / 2 - N / 2 sum_i log(y_i' K^-1 y_i)``, in which the amplitudes are integrated
+    out. It does not change beyond the bounds of the hyperparameters, where only the prior does.
+
+    Raises:
+        InputError: if the covariance matrix is not positive definite.
+    """
+    within = np.clip(parameters, *_box(kernel, Z.shape[1]))
+    theta, noise = within[:-1], float(np.exp(within[-1]))
+    N, n = Y.shape
+    factor = factorise(kernel(theta, Z, Z), noise)
+    weights = factor.solve(Y)
+    squares = np.maximum((Y * weights).sum(axis=0) / N, 1e-300)
+    value = -0.5 * N * np.log(squares).sum() - n * factor.half_log_determinant()
+    scaled = weights / np.sqrt(squares)
+    W = 0.5 * (scaled @ scaled.T - n * factor.inverse())
+    gradient = np.append(kernel.weighted_gradient(theta, Z, W), noise * np.trace(W))
+    prior, slope = _log_prior(parameters)
+    return float(value + prior), gradient + slope
+
+
+def _log_prior(parameters: Array) -> tuple[float, Array]:
+    centres = np.log([*[_LENGTH[0]] * (len(parameters) - 3), *[_LINEAR_PART[0]] * 2, _NOISE_PRIOR[0]])
+    deviations = np.array([*[_LENGTH[1]] * (len(parameters) - 3), *[_LINEAR_PART[1]] * 2, _NOISE_PRIOR[1]])
+    scaled = (parameters - centres) / deviations
+    return float(-0.5 * (scaled**2).sum()), -scaled / deviations
+
+
+def _box(kernel: ResidualKernel, dimension: int) -> tuple[Array, Array]:
+    """Return lower and upper bounds of (theta, log noise)."""
+    low, high = np.array([*kernel.bounds(dimension), np.log(NOISE)]).T
+    return low, high
+
+
+def _mode_of(kernel: ResidualKernel, Z: Array, Y: Array) -> _Mode:
+    low, high = _box(kernel, Z.shape[1])
+    start = np.log([*[_LENGTH[0]] * Z.shape[1], 1.0, 1.0, 1e-5])
+    mode = most_likely(lambda parameters: log_posterior(kernel, parameters, Z, Y), start[None], list(zip(low, high, strict=True)))
+    curvature = np.empty((len(mode), len(mode)))
+    for i, step in enumerate(np.eye(len(mode)) * _STEP):
+        up, down = np.minimum(mode + step, high), np.maximum(mode - step, low)
+        slopes = _gradient_or_zero(kernel, up, Z, Y) - _gradient_or_zero(kernel, down, Z, Y)
+        curvature[i] = -slopes / (up - down)[i]
+    values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
+    return _Mode(kernel, mode, vectors / np.sqrt(np.maximum(values, _LEAST_CURVATURE)))
+
+
+def _gradient_or_zero(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array) -> Array:
+    try:
+        return log_posterior(kernel, parameters, Z, Y)[1]
+    except InputError:
+        return np.zeros_like(parameters)
+
+
+def _log_posterior_or_none(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array) -> float:
+    """Return the log density; minus infinity if the covariance is not positive definite."""
+    try:
+        return log_posterior(kernel, parameters, Z, Y)[0]
+    except InputError:
+        return -np.inf
+
+
+def _resampled(log_weights: Array, count: int, rng: np.random.Generator) -> Rows:
+    """Return rows drawn in proportion to truncated weights, by systematic resampling."""
+    weights = np.exp(log_weights - log_weights.max())
+    weights = np.minimum(weights, weights.mean() * np.sqrt(len(weights)))
+    edges = np.cumsum(weights) / weights.sum()
+    places = (np.arange(count) + rng.random()) / count
+    return np.asarray(np.minimum(np.searchsorted(edges, places), len(weights) - 1), dtype=np.intp)
+
+
+def _of(kernel: ResidualKernel, parameters: Array) -> Hyperparameters:
+    within = np.clip(parameters, *_box(kernel, len(parameters) - 3))
+    return Hyperparameters(kernel, within[:-1], float(np.exp(within[-1])))

@@ -1,0 +1,87 @@
+"""Functions that are weighted sums of covariances with common centres, evaluated quickly for many arguments."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval.learning.hyperparameters import Hyperparameters
+
+_ROWS = 512
+"""Number of arguments that are evaluated together, so that intermediate results stay in the processor's cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class KernelExpansion:
+    """S functions ``f_s(z) = sum_j weights_sj k(z, centre_j)`` with n values each.
+
+    Attributes:
+        hyperparameters: the covariance k and its hyperparameters.
+        centres: standardised pairs, shape ``(M, k)``.
+        weights: shape ``(S, M, n)``.
+    """
+
+    hyperparameters: Hyperparameters
+    centres: Array
+    weights: Array
+
+    def __call__(self, z: Array) -> Array:
+        """Return the values ``(S, q, n)`` of each function at arguments of its own, ``(S, q, k)``."""
+        constants, slopes = self._linear
+        values = np.matmul(z, slopes) + constants[:, None, :]
+        for functions, rows in _blocks(*z.shape[:2]):
+            values[functions, rows] += np.matmul(self._matern(z[functions, rows]), self.weights[functions])
+        return np.asarray(values)
+
+    @functools.cached_property
+    def _linear(self) -> tuple[Array, Array]:
+        """The constants ``(S, n)`` and the slopes ``(S, k, n)`` of the linear part."""
+        constant, slope = np.exp(self.hyperparameters.theta[-2:])
+        return constant * self.weights.sum(axis=1), slope * np.matmul(self.centres.T, self.weights)
+
+    @functools.cached_property
+    def _scales(self) -> Array:
+        """Factors of z in which the argument of the Matern function has unit length."""
+        return np.asarray(np.sqrt(2 * self.hyperparameters.kernel.nu) / np.exp(self.hyperparameters.theta[:-2]))
+
+    @functools.cached_property
+    def _scaled(self) -> tuple[Array, Array]:
+        """``-2 centres'`` and the squared norms of the centres, both scaled."""
+        scaled = self.centres * self._scales
+        return np.ascontiguousarray(-2 * scaled.T), (scaled**2).sum(axis=1)
+
+    def _matern(self, z: Array) -> Array:
+        """Return the Matern part of the covariances ``(..., q, M)`` of arguments ``(..., q, k)``."""
+        kernel = self.hyperparameters.kernel
+        factors, squares = self._scaled
+        own = z * self._scales
+        r2 = own @ factors
+        r2 += squares
+        r2 += (own**2).sum(axis=-1)[..., None]
+        np.maximum(r2, 0.0, out=r2)
+        r = np.sqrt(r2)
+        decay = np.exp(-r)
+        if kernel.nu == 2.5:
+            r2 *= 1 / 3
+            r += r2
+        r += 1
+        decay *= r
+        if kernel.growth:
+            growth = z[..., -kernel.inputs :] @ (kernel.growth * self.centres[:, -kernel.inputs :].T)
+            growth += 1
+            decay *= growth
+        return np.asarray(decay)
+
+
+def _blocks(functions: int, arguments: int) -> Iterator[tuple[slice, slice]]:
+    """Yield blocks of functions and arguments that are evaluated together."""
+    if functions * arguments <= _ROWS:
+        yield slice(None), slice(None)
+        return
+    for one in range(functions):
+        for first in range(0, arguments, _ROWS):
+            yield slice(one, one + 1), slice(first, first + _ROWS)

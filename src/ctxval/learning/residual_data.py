@@ -1,0 +1,90 @@
+"""Residuals of recorded transitions, standardised for regression."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.representation import call
+from ctxval.core.model import Model
+from ctxval.core.trajectory import Transitions
+from ctxval.models.scaling import standard_deviations, standardised_pairs
+
+_NEGLIGIBLE = 1e-7
+"""A residual below this share of the state's typical change is rounding."""
+_ABSURD = 1e100
+"""Transitions with larger numbers have diverged and are left out; the squares of such numbers would not be finite."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualData:
+    """Residuals ``x' - M(x, u)`` of N transitions in units in which they are about 1.
+
+    Attributes:
+        pairs: standardised state-input pairs, shape ``(N, n + m)``.
+        outputs: standardised residuals, shape ``(N, n)``; 0 if the residual of a state is negligible.
+        sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
+        shift, scale: constants that standardise a state-input pair, shapes ``(n + m,)``.
+        sizes: root mean square of the residual of each state, shape ``(n,)``.
+        steps: standard deviation of the change of each state in one step, shape ``(n,)``.
+    """
+
+    pairs: Array
+    outputs: Array
+    sources: Rows
+    shift: Array
+    scale: Array
+    sizes: Array
+    steps: Array
+
+    @property
+    def learned(self) -> Mask:
+        """Which states have a residual that is not negligible, shape ``(n,)``."""
+        return np.asarray(self.sizes > _NEGLIGIBLE * self.steps)
+
+    @property
+    def inputs(self) -> int:
+        """The number m of inputs of the system."""
+        return len(self.shift) - len(self.sizes)
+
+    @property
+    def units(self) -> Array:
+        """The unit of each standardised residual, shape ``(n,)``; 0 if it is negligible."""
+        return np.where(self.learned, self.sizes, 0.0)
+
+    def standardised(self, x: Array, u: Array) -> Array:
+        """Return standardised pairs ``(..., n + m)`` of states and inputs."""
+        return standardised_pairs(x, u, self.shift, self.scale)
+
+    def __repr__(self) -> str:
+        return call(self, len(self.pairs), pairs=self.pairs, outputs=self.outputs)
+
+
+def residual_data(model: Model, transitions: Transitions, sources: Rows) -> ResidualData | None:
+    """Return the residuals of a model on recorded transitions.
+
+    Returns None if fewer than two transitions are usable, or if M explains all of them.
+
+    Args:
+        model: the model M.
+        transitions: N transitions of the system.
+        sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
+    """
+    with np.errstate(all="ignore"):
+        residuals = transitions.x_next - model.step(transitions.x, transitions.u)
+        steps = transitions.x_next - transitions.x
+    pairs = np.concatenate([transitions.x, transitions.u], axis=1)
+    usable = (np.abs(np.concatenate([pairs, residuals, steps], axis=1)) < _ABSURD).all(axis=1)
+    if usable.sum() < 2:
+        return None
+    pairs, residuals = pairs[usable], residuals[usable]
+    typical = standard_deviations(steps[usable])
+    sizes = np.sqrt((residuals**2).mean(axis=0))
+    learned = sizes > _NEGLIGIBLE * typical
+    if not learned.any():
+        return None
+    shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
+    outputs = residuals / np.where(learned, sizes, np.inf)
+    return ResidualData((pairs - shift) / scale, outputs, sources[usable], shift, scale, sizes, typical)
