@@ -65,16 +65,17 @@ def separated_rows(points: Array, reach: float, count: int) -> list[int]:
     Of points that are sorted by their values, these are the best ones that are not neighbours of a better one.
 
     Args:
-        points: only the first 200 are looked at.
+        points: what is chosen from.
         reach: the least distance.
         count: how many rows are wanted.
     """
     chosen: list[int] = []
-    for row, point in enumerate(points[:200]):
-        if len(chosen) == count:
-            break
-        if all(np.linalg.norm(point - points[other]) > reach for other in chosen):
-            chosen.append(row)
+    left = np.ones(len(points), dtype=bool)
+    while len(chosen) < count and left.any():
+        row = int(left.argmax())
+        chosen.append(row)
+        left &= np.linalg.norm(points - points[row], axis=1) > reach
+        left[: row + 1] = False
     return chosen
 
 

@@ -14,6 +14,7 @@ from ctxval.gp.acquisition import (
 )
 from ctxval.gp.ascent import Ascent
 from ctxval.gp.cholesky import CholeskyFactor, factorise
+from ctxval.gp.global_search import GlobalMaximum, search_globally
 from ctxval.gp.hyperposterior import Conditioned, Hyperparameters, Prior, draw_hyperparameters
 from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
 from ctxval.gp.regression import GaussianProcess, MultiOutputProcess, condition, fit
@@ -27,6 +28,7 @@ __all__ = [
     "CholeskyFactor",
     "Conditioned",
     "GaussianProcess",
+    "GlobalMaximum",
     "Hyperparameters",
     "Kernel",
     "Linear",
@@ -49,4 +51,5 @@ __all__ = [
     "maxima",
     "maximise",
     "pivoted_rows",
+    "search_globally",
 ]

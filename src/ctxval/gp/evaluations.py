@@ -1,0 +1,112 @@
+"""What the searches of functions without gradients have in common: a budget, samples, climbs and moves to bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.boxes import climb, moves_to_bounds
+
+Values = Callable[[Array], Array]
+"""Points ``(m, d)`` -> values ``(m,)``."""
+
+_POLISHED = 3
+"""Number of best points whose coordinates are moved to bounds, several at a time."""
+_STEP = 1e-4
+"""Step of the one-sided differences."""
+
+
+class Evaluations:
+    """The evaluations of a function over a box within the unit cube, no more of them than a budget.
+
+    Args:
+        function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
+        low, high: the bounds of the box, shapes ``(d,)``.
+        budget: number of points at which the function may be evaluated.
+    """
+
+    def __init__(self, function: Values, low: Array, high: Array, budget: int) -> None:
+        self.low, self.high = low, high
+        self.budget = budget
+        self._function = function
+        self._points: list[Array] = [np.empty((0, len(low)))]
+        self._values: list[Array] = [np.empty(0)]
+
+    @property
+    def dimension(self) -> int:
+        """The number of coordinates of a point."""
+        return len(self.low)
+
+    @property
+    def left(self) -> int:
+        """How many evaluations the budget still allows."""
+        return self.budget - sum(map(len, self._values))
+
+    def evaluate(self, points: Array) -> Array:
+        """Return the values ``(m,)`` at points ``(m, d)``; minus infinity if not finite or beyond the budget."""
+        asked = points[: self.left]
+        values = np.full(len(points), -np.inf)
+        if len(asked):
+            found = np.asarray(self._function(asked), dtype=np.float64)
+            values[: len(asked)] = np.where(np.isfinite(found), found, -np.inf)
+            self._points.append(asked)
+            self._values.append(values[: len(asked)])
+        return values
+
+    def found(self) -> tuple[Array, Array]:
+        """Return all points ``(m, d)`` and their values ``(m,)``, the largest first."""
+        points, values = np.concatenate(self._points), np.concatenate(self._values)
+        order = np.argsort(-values, kind="stable")
+        return points[order], values[order]
+
+    def samples(self, count: int, rng: np.random.Generator) -> Array:
+        """Return uniform points; in every second one, a random share of the coordinates is moved to bounds."""
+        points = self.low + rng.random((count, self.dimension)) * (self.high - self.low)
+        ends = np.where(rng.random(points.shape) < 0.5, self.low, self.high)
+        snapped = rng.random(points.shape) < np.where(np.arange(count) % 2, rng.random(count), 0.0)[:, None]
+        return np.where(snapped, ends, points)
+
+    def climb(self, starts: Array, budget: int) -> None:
+        """Climb from all starts at once along finite differences; the points reached are among those evaluated.
+
+        Args:
+            starts: points ``(s, d)``.
+            budget: number of evaluations, approximately.
+        """
+        if not len(starts):
+            return
+        scale = max(float(np.abs(self.found()[1][0])), 1e-300)
+        calls = max(2, budget // (len(starts) * (self.dimension + 1)))
+
+        def sloped(points: Array) -> tuple[Array, Array]:
+            return self._slopes(np.clip(points, self.low, self.high))
+
+        climb(sloped, starts, self.low, self.high, scale=scale, iterations=calls, evaluations=calls)
+
+    def _slopes(self, points: Array) -> tuple[Array, Array]:
+        """Return values and slopes by one-sided differences, which point inward if a bound is near."""
+        n, d = points.shape
+        steps = np.where(points + _STEP <= self.high, _STEP, -_STEP)
+        moved = points[:, None, :] + np.eye(d) * steps[:, None, :]
+        values = self.evaluate(np.concatenate([points, moved.reshape(-1, d)]))
+        here, there = values[:n], values[n:].reshape(n, d)
+        with np.errstate(invalid="ignore"):
+            slopes = (there - here[:, None]) / steps
+        here = np.where(np.isfinite(here), here, 0.0)
+        return here, np.where(np.isfinite(slopes), slopes, 0.0)
+
+    def move_to_bounds(self, rng: np.random.Generator) -> bool:
+        """Move coordinates of the best points to bounds, singly and several at a time; return whether that helped."""
+        points, values = self.found()
+        d = self.dimension
+        best = points[:_POLISHED]
+        ends = np.stack([self.low, self.high])
+        single = moves_to_bounds(best[0], self.low, self.high)
+        parents = best[rng.integers(len(best), size=2 * d)]
+        several = np.where(
+            rng.random(parents.shape) < 2 / d, ends[rng.integers(2, size=parents.shape), np.arange(d)], parents
+        )
+        gain = 1e-9 * abs(values[0]) if np.isfinite(values[0]) else 0.0
+        return bool(self.evaluate(np.concatenate([single, several])).max() > values[0] + gain)
