@@ -9,6 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.campaign import display
+from ctxval.campaign.learned import LearnedFromTrials
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import RESOLUTION, CertificateOptions, Provenance, Verdict, judge
 from ctxval.certificates.options import CONFIDENCE
@@ -115,8 +116,14 @@ class CampaignResults:
             CertificateError: if an option of the certificate is not valid.
         """
         chosen = CertificateOptions.or_posterior(certificate, confidence, stochastic, resolution)
+        return judge(self.trials, threshold, chosen, self.provenance)
+
+    @property
+    def provenance(self) -> Provenance:
+        """What a certificate needs besides the trials: the task space, the search, changes, and what M predicts."""
         known = Provenance.of(self.store.description(), self.store.history())
-        return judge(self.trials, threshold, chosen, replace(known, space=self.validation.space))
+        learned = LearnedFromTrials(self.validation, self.store, self.trials)
+        return replace(known, space=self.validation.space, learned=learned)
 
     def surrogate(self) -> Surrogate:
         """Return the Gaussian process of the distance over the task space, for every search.

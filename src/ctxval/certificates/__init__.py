@@ -17,6 +17,7 @@ from ctxval.certificates.covering import (
 )
 from ctxval.certificates.diagnostics import Diagnosis, diagnose
 from ctxval.certificates.forecast import Forecast, forecast
+from ctxval.certificates.learned import LearnedDistance, require_learned
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.posterior import Posterior, certify_posterior, instantaneous_bound
@@ -51,6 +52,7 @@ __all__ = [
     "Convergence",
     "Diagnosis",
     "Forecast",
+    "LearnedDistance",
     "MadeGood",
     "Maxima",
     "Options",
@@ -81,6 +83,7 @@ __all__ = [
     "judge_by",
     "most_contested",
     "rate",
+    "require_learned",
     "require_possible",
     "require_resolution",
     "require_use",

@@ -83,7 +83,7 @@ def assess(
 def _certificate(
     trials: Sequence[Trial], options: CertificateOptions, known: Provenance, threshold: float | None = None
 ) -> Certificate:
-    sample, kind = Sample.of(trials, known.search), options.kind
+    sample, kind = Sample.of(trials, known.search, known.learned), options.kind
     if threshold is not None and kind.needs_threshold:
         found, _ = kind.certify_against(sample, threshold, options.confidence)
     else:

@@ -133,6 +133,9 @@ class CertificateKind(ABC):
     needs_threshold: ClassVar[bool] = False
     """Whether its statement is about a threshold, so that there is none without one."""
 
+    needs_model: ClassVar[bool] = False
+    """Whether it uses what the experiment's model predicts, so that the experiment must be loaded."""
+
     @classmethod
     def options(cls) -> tuple[str, ...]:
         """Return the names of its options: its fields, and ``volume`` if it leaves out a share of the task space."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ctxval._util.representation import record
+from ctxval.certificates.learned import LearnedDistance
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Change
 from ctxval.errors import InputError
@@ -20,11 +21,13 @@ class Provenance:
         space: the task space, to state lengths in its units; None if it is not known.
         search: the type of the search that chose the tasks; None if it is not known.
         remarks: sentences that a certificate lists among its assumptions, such as what was changed on the system.
+        learned: what the experiment's model predicts, for kinds that need it; None if the experiment is not loaded.
     """
 
     space: TaskSpace | None = None
     search: str | None = None
     remarks: tuple[str, ...] = ()
+    learned: LearnedDistance | None = None
 
     @classmethod
     def of(cls, description: Mapping[str, Any], changes: Iterable[Change] = ()) -> Provenance:

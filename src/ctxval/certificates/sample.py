@@ -10,6 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, record
+from ctxval.certificates.learned import LearnedDistance
 from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
 
@@ -52,6 +53,7 @@ class Sample:
             were to end with the verdict, None if that is not known.
         made_good: failures that are left out, because their tasks were executed with success later.
         search: the type of the search that chose the tasks; None if it is not known.
+        learned: what the experiment's model predicts; None if the experiment is not loaded.
 
     Raises:
         CertificateError: if the lengths differ, or a trial is still open.
@@ -65,6 +67,7 @@ class Sample:
     planned: Sequence[int | None] = ()
     made_good: tuple[MadeGood, ...] = ()
     search: str | None = None
+    learned: LearnedDistance | None = None
 
     def __post_init__(self) -> None:
         if not len(self.numbers):
@@ -89,7 +92,7 @@ class Sample:
         return len(self.distances)
 
     @classmethod
-    def of(cls, trials: Sequence[Trial], search: str | None = None) -> Sample:
+    def of(cls, trials: Sequence[Trial], search: str | None = None, learned: LearnedDistance | None = None) -> Sample:
         """Return the sample of a campaign's trials; a task that failed before its execution has failed as well.
 
         A failure is left out if the same task was executed with success later, unless it is an independent draw. The
@@ -98,6 +101,7 @@ class Sample:
         Args:
             trials: all trials of a campaign.
             search: the type of the search that chose their tasks, if it is known.
+            learned: what the experiment's model predicts, if the experiment is loaded.
 
         Raises:
             CertificateError: if there is no trial, or one is still open.
@@ -116,6 +120,7 @@ class Sample:
             [_planned(trial) for trial in count],
             good,
             search,
+            learned,
         )
 
     def only(self, origin: Origin) -> Sample:
@@ -134,6 +139,7 @@ class Sample:
             [self.planned[row] for row in chosen],
             self.made_good,
             self.search,
+            self.learned,
         )
 
     @property

@@ -196,7 +196,7 @@ def judge(
     if found is not None:
         return found
     try:
-        sample = Sample.of(trials, known.search)
+        sample = Sample.of(trials, known.search, known.learned)
         certificate, expected = chosen.kind.certify_against(sample, threshold, chosen.confidence)
     except CertificateError as error:
         return Verdict("undecided", float(threshold), str(error))

@@ -98,12 +98,17 @@ def certify_store(
 ) -> Any:
     """Compute a certificate from the trials in a store. The system is executed only if --audit is given.
 
+    A kind that uses what the experiment's model predicts loads the experiment; other kinds run no code.
+
     Options that are not given have the values that the campaign was run with.
     """
     opened = Store.existing(store)
-    if audit is None and (trust or experiment is not None):
-        raise InputError("--trust and --experiment need --audit: without an audit, no code is imported or run.")
-    settings = planned_settings(opened, kind) if audit is None else settings_of(opened, experiment, trust)
+    loads = audit is not None or _needs_model(opened, kind)
+    if not loads and (trust or experiment is not None):
+        raise InputError(
+            "--trust and --experiment need --audit or a kind that uses the model: otherwise no code is imported or run."
+        )
+    settings = settings_of(opened, experiment, trust) if loads else planned_settings(opened, kind)
     constants = None if theorem is None else TheoremConstants.parse(theorem)
     own = {"discard": discard, "constant": constant, "theorem": constants, "volume": volume}
     given = named_values(option, **own, stochastic=stochastic, resolution=resolution)
@@ -116,14 +121,22 @@ def certify_store(
     )
     if audit is not None:
         options.kind.require_audit_helps([trial.origin for trial in opened.trials()])
-        _audit(open_store(opened, store, experiment, trust, accept_change).campaign, audit, show=not as_json)
-    found = assess(opened.trials(), options, limit, Provenance.of(opened.description(), opened.history()))
+    campaign = open_store(opened, store, experiment, trust, accept_change).campaign if loads else None
+    if campaign is not None and audit is not None:
+        _audit(campaign, audit, show=not as_json)
+    known = Provenance.of(opened.description(), opened.history()) if campaign is None else campaign.provenance
+    found = assess(opened.trials(), options, limit, known)
     others = [str(other) for other in other_stores(store)]
     if not as_json:
         _print_assessment(found)
         print_other_stores(others)
     report = {**found.to_json(), "store": str(store), "other_stores": others}
     return report, FALSIFIED if found.verdict is not None and found.verdict.answer == "falsified" else 0
+
+
+def _needs_model(store: Store, kind: str | None) -> bool:
+    """Return whether the kind of certificate uses what the experiment's model predicts."""
+    return KINDS.find(kind or planned_settings(store).certificate.kind).needs_model
 
 
 def _require_together(given: dict[str, Any], threshold: float | None) -> None:

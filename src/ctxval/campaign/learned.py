@@ -1,0 +1,57 @@
+"""Predictions of the distance for certificates, learned from the trials before a given one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import call
+from ctxval.campaign.history import predict_from
+from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
+from ctxval.searches import Prediction
+from ctxval.storage.store import Store
+
+_TASKS = 0x7461
+"""Identifies the random stream of tasks that are only predicted; it is none of the streams of trials."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LearnedFromTrials:
+    """The :class:`ctxval.certificates.LearnedDistance` of a campaign. The system is never executed.
+
+    Attributes:
+        validation: the map p -> d(p).
+        store: the store of the trajectories.
+        trials: all trials of the campaign.
+    """
+
+    validation: Validation
+    store: Store
+    trials: Sequence[Trial]
+    _predictions: dict[int, Prediction | None] = field(default_factory=dict, init=False)
+
+    def expected(self, points: Array, before: int) -> Array:
+        """Return predicted distances ``(m,)`` at points ``(m, d)``, learned from the trials with smaller numbers.
+
+        They are NaN if a task cannot be predicted, or if the trials teach nothing.
+        """
+        prediction = self._before(before)
+        return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
+
+    def tasks(self, count: int, seed: int) -> Array:
+        """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
+        return np.random.default_rng([seed, _TASKS]).random((count, self.validation.space.dimension))
+
+    def _before(self, before: int) -> Prediction | None:
+        """Return the prediction from the trials with smaller numbers; it is computed once."""
+        if before not in self._predictions:
+            earlier = [trial for trial in self.trials if trial.number < before]
+            self._predictions[before] = predict_from(self.validation, self.store, earlier)
+        return self._predictions[before]
+
+    def __repr__(self) -> str:
+        return call(self, trials=len(self.trials))

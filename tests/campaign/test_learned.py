@@ -1,0 +1,57 @@
+"""What a campaign's model predicts for a certificate: learned from the trials before a given one alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from conftest import make_validation
+from ctxval import Campaign, searches
+from ctxval.campaign.history import predict_from
+from ctxval.campaign.learned import LearnedFromTrials
+from ctxval.certificates import LearnedDistance, Sample, require_learned
+from ctxval.errors import CertificateError
+
+POINTS = np.linspace(0.05, 0.95, 7)[:, None]
+
+
+@pytest.mark.slow
+def test_only_earlier_trials_are_learned_from() -> None:
+    campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(8)
+    learned = LearnedFromTrials(campaign.validation, campaign.store, campaign.trials)
+    assert isinstance(learned, LearnedDistance)
+    expected = predict_from(campaign.validation, campaign.store, campaign.trials[:4])
+    assert expected is not None
+    np.testing.assert_array_equal(learned.expected(POINTS, 4), expected.expected(POINTS)[0])
+    assert not np.array_equal(learned.expected(POINTS, 4), learned.expected(POINTS, 8))
+    truth = campaign.validation.distances(campaign.validation.space.from_unit(POINTS))
+    assert np.abs(learned.expected(POINTS, 8) - truth).max() < 0.05 * np.ptp(truth)
+
+
+def test_nothing_is_predicted_without_trajectories_and_data() -> None:
+    validation = make_validation()
+    validation.model.data = None  # type: ignore[attr-defined]
+    campaign = Campaign(validation, search=searches.Random(), seed=3).run(1)
+    learned = campaign.provenance.learned
+    assert learned is not None
+    assert np.isnan(learned.expected(POINTS, 0)).all()
+
+
+def test_tasks_are_independent_of_trials_and_repeat() -> None:
+    campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(2)
+    learned = campaign.provenance.learned
+    assert learned is not None
+    tasks = learned.tasks(500, 3)
+    assert tasks.shape == (500, 1)
+    np.testing.assert_array_equal(tasks, learned.tasks(500, 3))
+    assert not np.array_equal(tasks, learned.tasks(500, 4))
+    assert not np.isin(tasks, np.random.default_rng(3).random(500)).any()
+
+
+def test_a_sample_keeps_the_predictions_and_a_kind_asks_for_them() -> None:
+    campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(3)
+    learned = campaign.provenance.learned
+    sample = Sample.of(campaign.trials, learned=learned)
+    assert require_learned(sample.only("iid").rows([0, 1]), "region") is learned
+    with pytest.raises(CertificateError, match="the region certificate uses what the experiment's model predicts"):
+        require_learned(Sample.of(campaign.trials), "region")
