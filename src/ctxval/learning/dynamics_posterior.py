@@ -27,6 +27,10 @@ _PIVOT = 0.1
 """Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
 _NEGLIGIBLE = 1e-3
 """Share of the largest posterior variance below which a pivot adds nothing to those chosen before it."""
+_WORK = 30_000
+"""Number of centres times the horizon; it bounds the time of a closed loop."""
+_CENTRES = (150, 400)
+"""Least and largest number of centres."""
 _LARGEST = 1e6
 """Standardised pairs are limited to this magnitude, so that a loop that diverges stays finite in its residual."""
 
@@ -39,7 +43,7 @@ class PosteriorSettings:
         hyperparameters: number of draws of the hyperparameters.
         functions: number of functions that are drawn for each of them.
         learned_from: number of transitions that the hyperparameters are learned from.
-        centres: number of transitions that each process is conditioned on.
+        centres: largest number of transitions that each process is conditioned on.
         pivots: largest number of pairs at which a draw is exact.
         families: smoothness and growth of each family of covariances.
     """
@@ -47,9 +51,14 @@ class PosteriorSettings:
     hyperparameters: int = 20
     functions: int = 2
     learned_from: int = 120
-    centres: int = 130
+    centres: int = 400
     pivots: int = 50
     families: tuple[tuple[float, float], ...] = FAMILIES
+
+    @classmethod
+    def for_horizon(cls, horizon: int) -> PosteriorSettings:
+        """Return settings in which a closed loop of many steps has fewer centres, so that it does not take longer."""
+        return cls(centres=int(np.clip(_WORK // horizon, *_CENTRES)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +131,9 @@ class Component:
         cross = self.factor.solve(kernel(theta, self.centres, relevant[chosen]))
         at_centres = self.weights - np.matmul(cross, weights)
         together = np.concatenate([at_centres, weights], axis=1)
-        return KernelExpansion(self.hyperparameters, np.concatenate([self.centres, relevant[chosen]]), together), left_out
+        return KernelExpansion(
+            self.hyperparameters, np.concatenate([self.centres, relevant[chosen]]), together
+        ), left_out
 
     def _pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
         """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""

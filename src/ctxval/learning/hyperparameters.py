@@ -153,7 +153,9 @@ def _box(kernel: ResidualKernel, dimension: int) -> tuple[Array, Array]:
 def _mode_of(kernel: ResidualKernel, Z: Array, Y: Array) -> _Mode:
     low, high = _box(kernel, Z.shape[1])
     start = np.log([*[_LENGTH[0]] * Z.shape[1], 1.0, 1.0, 1e-5])
-    mode = most_likely(lambda parameters: log_posterior(kernel, parameters, Z, Y), start[None], list(zip(low, high, strict=True)))
+    mode = most_likely(
+        lambda parameters: log_posterior(kernel, parameters, Z, Y), start[None], list(zip(low, high, strict=True))
+    )
     curvature = np.empty((len(mode), len(mode)))
     for i, step in enumerate(np.eye(len(mode)) * _STEP):
         up, down = np.minimum(mode + step, high), np.maximum(mode - step, low)

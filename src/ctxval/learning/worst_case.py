@@ -1,0 +1,207 @@
+"""The largest distance over all tasks, for each draw of the dynamics.
+
+First the distance on the posterior mean is searched globally, from a pool of tasks whose controllers are designed once
+for a whole campaign. Its elites, the tasks with known distances and some random tasks are then run on all draws.
+Around the best of these, each draw is searched on its own: coordinates are moved to bounds, one at a time and all that
+help together, and points are moved at random by ever smaller steps.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import qmc
+
+from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.boxes import moves_to_bounds
+from ctxval._util.representation import call
+from ctxval.gp.global_search import search_globally
+from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks
+from ctxval.learning.dynamics_posterior import DynamicsDraws, DynamicsPosterior
+
+_DIVERGED = 1e30
+"""The distance of a loop that diverges, in searches: larger than all others, and finite."""
+_EVALUATIONS = (0, 512, 2048, 4096)
+"""Number of tasks in the global search for 0, 1, 2 and 3 task parameters."""
+_SHARES = (0.1, 0.03, 0.01)
+"""Standard deviations of the random moves in successive rounds of the search on each draw."""
+
+
+@dataclass(frozen=True)
+class WorstCaseSettings:
+    """Numbers of closed loops in a search for the largest distance.
+
+    Attributes:
+        pool: number of tasks whose controllers are designed once.
+        evaluations: number of tasks in the global search on the mean, with those of the pool.
+        elites: largest number of tasks from the global search that are run on all draws.
+        shared: number of random tasks of the pool that are run on all draws.
+        moves: number of random moves in each round of the search on each draw.
+        relevant: number of state-input pairs, on the loops of elites and of random tasks, from which pivots are chosen.
+    """
+
+    pool: int = 1024
+    evaluations: int = 6000
+    elites: int = 24
+    shared: int = 24
+    moves: int = 10
+    relevant: int = 700
+
+    @classmethod
+    def for_dimension(cls, dimension: int) -> WorstCaseSettings:
+        """Return settings with as many tasks as a search of so many task parameters needs."""
+        if dimension >= len(_EVALUATIONS):
+            return cls()
+        return cls(pool=_EVALUATIONS[dimension] // 4, evaluations=_EVALUATIONS[dimension])
+
+
+@dataclass(frozen=True, eq=False)
+class WorstCase:
+    """The largest distances over all tasks that a search found, one for each draw of the dynamics.
+
+    Attributes:
+        maxima: the largest distance of each draw, shape ``(S,)``; infinity if its closed loop diverges.
+        points: where it lies, points of the unit cube ``(S, d)``.
+        of_mean: the largest distance on the posterior mean.
+        elites: tasks with large distances on the posterior mean, points ``(e, d)``, the largest first.
+        evaluations: number of closed loops that were run.
+        left_out: largest share of the posterior variance that a draw leaves out between its pivots.
+    """
+
+    maxima: Array
+    points: Array
+    of_mean: float
+    elites: Array
+    evaluations: int
+    left_out: float
+
+    def __repr__(self) -> str:
+        return call(self, draws=len(self.maxima), of_mean=self.of_mean, evaluations=self.evaluations)
+
+
+class WorstCaseSearch:
+    """Searches the tasks for the largest distance, for each draw of the dynamics.
+
+    Args:
+        planner: designs controllers and runs closed loops.
+        seed: seed of the tasks of the pool.
+        settings: numbers of closed loops; the defaults if None.
+    """
+
+    def __init__(self, planner: LoopPlanner, seed: int, settings: WorstCaseSettings | None = None) -> None:
+        self.planner = planner
+        self.settings = WorstCaseSettings() if settings is None else settings
+        self._seed = seed
+
+    @property
+    def dimension(self) -> int:
+        """The dimension d of the task space."""
+        return self.planner.validation.space.dimension
+
+    @functools.cached_property
+    def pool(self) -> Array:
+        """Tasks that are spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``."""
+        rng = np.random.default_rng([self._seed, 0])
+        points = qmc.Sobol(self.dimension, rng=rng).random(self.settings.pool)
+        ends = rng.random(points.shape) < rng.random((len(points), 1))
+        ends[::2] = False
+        return np.where(ends, np.round(points), points)
+
+    @functools.cached_property
+    def _plans(self) -> list[PlannedTasks]:
+        return self.planner.plan(self.pool)
+
+    def maxima(self, posterior: DynamicsPosterior, known: Array, rng: np.random.Generator) -> WorstCase:
+        """Return the largest distances of draws from a posterior.
+
+        Args:
+            posterior: the posterior of the dynamics.
+            known: tasks to look at in any case, such as those of earlier maxima, points ``(k, d)``.
+            rng: the source of the draws and of the moves.
+        """
+        with single_threaded():
+            of_mean, elites, evaluations = self._search_mean(posterior.mean, known, rng)
+            tasks = np.concatenate([elites, known, self.pool[rng.permutation(len(self.pool))[: self.settings.shared]]])
+            draws = posterior.draw(self._relevant(posterior, tasks, rng), rng)
+            points, maxima, more = self._search_draws(draws, tasks, rng)
+        return WorstCase(
+            np.where(maxima >= _DIVERGED, np.inf, maxima),
+            points,
+            of_mean,
+            elites,
+            evaluations + len(draws) * more,
+            max(draws.left_out),
+        )
+
+    def _search_mean(self, mean: DynamicsDraws, known: Array, rng: np.random.Generator) -> tuple[float, Array, int]:
+        """Return the largest distance on the posterior mean, tasks with large distances, and the number of loops."""
+        of_pool = _finite(self.planner.distances(mean, self._plans, len(self.pool)))[0]
+        best = self.pool[np.argsort(-of_pool, kind="stable")[: self.settings.elites * 4]]
+
+        def distance(points: Array) -> Array:
+            planned = self.planner.plan(points)
+            return np.asarray(_finite(self.planner.distances(mean, planned, len(points)))[0])
+
+        evaluations = max(len(best) + len(known) + 50, self.settings.evaluations - len(self.pool))
+        starts = np.concatenate([known, best])
+        found = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
+        elites = np.concatenate([found.points[:1], found.elites[: self.settings.elites]])
+        return float(found.values[0]), elites, len(self.pool) + found.evaluations
+
+    def _relevant(self, posterior: DynamicsPosterior, tasks: Array, rng: np.random.Generator) -> Array:
+        """Return standardised pairs on the mean's closed loops, from which pivots are chosen."""
+        pairs = loop_pairs(self.planner, posterior, tasks)
+        return pairs[rng.permutation(len(pairs))[: self.settings.relevant]]
+
+    def _search_draws(self, draws: DynamicsDraws, tasks: Array, rng: np.random.Generator) -> tuple[Array, Array, int]:
+        """Return the best points ``(S, d)`` of draws and their distances, and the number of loops of each draw."""
+        planned = self.planner.plan(tasks)
+        values = _finite(self.planner.distances(draws, planned, len(tasks)))
+        order = np.argsort(-values, axis=1, kind="stable")
+        best, points = np.take_along_axis(values, order[:, :1], 1)[:, 0], tasks[order[:, 0]]
+        second, loops = tasks[order[:, min(1, len(tasks) - 1)]], len(tasks)
+        for share in _SHARES:
+            moved = self._moves(points, second, share, rng)
+            found = _finite(self.planner.own_distances(draws, moved))
+            together = _together(points, best, moved, found)
+            tried = np.concatenate([moved, together[:, None]], axis=1)
+            found = np.concatenate([found, _finite(self.planner.own_distances(draws, together[:, None]))], axis=1)
+            row, at = np.arange(len(points)), found.argmax(axis=1)
+            better = found[row, at] > best
+            points = np.where(better[:, None], tried[row, at], points)
+            best = np.where(better, found[row, at], best)
+            loops += tried.shape[1]
+        return points, best, loops
+
+    def _moves(self, points: Array, others: Array, share: float, rng: np.random.Generator) -> Array:
+        """Return the moves of each point: to bounds, 2 d of them, and at random around it and around another one."""
+        to_bounds = moves_to_bounds(points, np.zeros(self.dimension), np.ones(self.dimension))
+        shape = (len(points), self.settings.moves, self.dimension)
+        around = np.where(rng.random((*shape[:2], 1)) < 0.7, points[:, None], others[:, None])
+        few = (rng.random(shape) < 0.5) | (rng.random((*shape[:2], 1)) < 0.5)
+        random = np.clip(around + share * few * rng.normal(size=shape), 0, 1)
+        return np.concatenate([to_bounds, random], axis=1)
+
+
+def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Array:
+    """Return the standardised state-input pairs ``(N, k)`` that the mean's closed loops on tasks visit."""
+    parts = []
+    for loops in planner.run(posterior.mean, planner.plan(tasks)):
+        parts.append(posterior.data.standardised(loops.states[..., :-1, :], loops.inputs))
+    pairs = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
+    return pairs[(np.abs(pairs) < _DIVERGED).all(axis=1)]
+
+
+def _finite(distances: Array) -> Array:
+    """Return distances for a search: very large if a loop diverges, minus infinity if a task cannot be planned."""
+    return np.where(np.isnan(distances), -np.inf, np.minimum(distances, _DIVERGED))
+
+
+def _together(points: Array, best: Array, moved: Array, found: Array) -> Array:
+    """Return each point ``(d,)`` after all moves to bounds that help; of two that help, the better one."""
+    d = points.shape[1]
+    down, up = found[:, :d], found[:, d : 2 * d]
+    at_bounds = np.where(down > up, 0.0, 1.0)
+    return np.where(np.maximum(down, up) > best[:, None], at_bounds, points)
