@@ -18,17 +18,21 @@ from ctxval.errors import InputError
 Bounds = list[tuple[float, float]]
 
 
-class Kernel(Protocol):
+class Covariance(Protocol):
     """A covariance function k(x, z; theta)."""
-
-    def bounds(self, dimension: int) -> Bounds:
-        """Return the bounds of each entry of theta, within which the hyperparameters are searched."""
 
     def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
         """Return the covariances ``(n, m)``."""
 
     def diagonal(self, theta: Array, X: Array) -> Array:
         """Return the variances k(x, x), shape ``(n,)``."""
+
+
+class Kernel(Covariance, Protocol):
+    """A covariance function with bounds of its hyperparameters and with gradients."""
+
+    def bounds(self, dimension: int) -> Bounds:
+        """Return the bounds of each entry of theta, within which the hyperparameters are searched."""
 
     def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
         """Return ``sum_ij W_ij dK_ij/dtheta`` for K = k(X, X) and a symmetric W, in the shape of theta."""

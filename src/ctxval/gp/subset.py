@@ -7,7 +7,7 @@ from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import farthest_rows
-from ctxval.gp.kernels import Kernel
+from ctxval.gp.kernels import Covariance
 
 LONG = 1000
 """Length of a history from which on only a subset is kept."""
@@ -31,7 +31,7 @@ def kept_rows(points: Array, values: Array, count: int) -> Rows:
     return np.sort(np.concatenate([chosen, np.array(others, dtype=np.intp)]))
 
 
-def pivoted_rows(kernel: Kernel, theta: Array, X: Array, count: int, least: float) -> Rows:
+def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: float) -> Rows:
     """Return rows by pivoted Cholesky: each has the largest variance given the rows before it.
 
     Args:

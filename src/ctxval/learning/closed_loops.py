@@ -10,6 +10,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
+from ctxval.core.model import Step
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -111,10 +112,8 @@ class LoopPlanner:
         S, q, d = points.shape
         found = np.full(S * q, np.nan)
         for one in self.plan(points.reshape(S * q, d), together=S * q):
-            if one.task.batch_shape:
-                step = _OwnStep(draws, q, one.rows)
-            else:
-                step = draws[int(one.rows[0]) // q].step
+            own = int(one.rows[0]) // q
+            step: Step = _OwnStep(draws, q, one.rows) if one.task.batch_shape else draws[own].step
             found[one.rows] = self._distances(one, rollout(step, one.controller, one.task))
         return found.reshape(S, q)
 

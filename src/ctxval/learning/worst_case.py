@@ -107,7 +107,7 @@ class WorstCaseSearch:
         points = qmc.Sobol(self.dimension, rng=rng).random(self.settings.pool)
         ends = rng.random(points.shape) < rng.random((len(points), 1))
         ends[::2] = False
-        return np.where(ends, np.round(points), points)
+        return np.asarray(np.where(ends, np.round(points), points))
 
     @functools.cached_property
     def _plans(self) -> list[PlannedTasks]:
@@ -191,7 +191,7 @@ def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array)
     for loops in planner.run(posterior.mean, planner.plan(tasks)):
         parts.append(posterior.data.standardised(loops.states[..., :-1, :], loops.inputs))
     pairs = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
-    return pairs[(np.abs(pairs) < _DIVERGED).all(axis=1)]
+    return np.asarray(pairs[(np.abs(pairs) < _DIVERGED).all(axis=1)])
 
 
 def _finite(distances: Array) -> Array:
