@@ -1,0 +1,257 @@
+r"""The bound from learned dynamics: the posterior of ``d* = max_p d(p)`` under a prior on the residual dynamics.
+
+The residual ``r(x, u) = x' - M(x, u)`` has a Gaussian-process prior with unknown hyperparameters. Each draw r_s from its
+posterior makes a system ``M + r_s``, whose largest distance d*_s is searched over all tasks. Under the prior, d* and
+these S maxima are exchangeable, so d* is at most the k-th smallest one with probability ``k / (S + 1)``. Draws that
+share hyperparameters make this approximate. Bayes' rule does not depend on how the tasks were chosen.
+
+The bound lies if the prior is wrong: if a state is not recorded, or the dynamics jump. So it is withdrawn unless
+predictions that were made before executions held, and unless the records cover what the closed loops visit. It is
+raised by half of the largest excess of the last executions over their predictions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ctxval._util.registry import part
+from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
+from ctxval.certificates.bounds import require_probability
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
+from ctxval.certificates.learned import require_learned
+from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
+from ctxval.core.space import TaskSpace
+from ctxval.errors import CertificateError
+
+FEWEST = 3
+"""The fewest executions for a bound: the data that M was made from are no executions."""
+
+PREDICTIONS = 3
+"""Number of the last predictions that must have held."""
+
+SURPRISING = 9.0
+"""Largest squared standardised error of a prediction that held."""
+
+NEGLIGIBLE = 0.02
+"""A distance that differs from its prediction by at most this share of the bound agrees with it in any case."""
+
+GAP = 0.25
+"""Largest gap of the records in a state or an input, as a share of the range that closed loops visit."""
+
+PAIR_GAP = 0.5
+"""The same for two of them together."""
+
+NOISE = 0.01
+"""Largest learned variance of noise, as a share of the mean square of the residual."""
+
+LEFT_OUT = 0.5
+"""Largest share of the posterior variance that the draws may leave out, if this variance matters."""
+
+_RAISE = 0.5
+"""Share of the largest excess over predictions by which the bound is raised."""
+
+
+@part("dynamics")
+@dataclass(frozen=True, repr=False)
+class Dynamics(CertificateKind):
+    """Bound on d* from posterior draws of the residual dynamics, which are learned from the executed trajectories."""
+
+    name: ClassVar[str] = "dynamics"
+    needs_model: ClassVar[bool] = True
+    evidence: ClassVar[str] = "by a prior on the dynamics"
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return :func:`certify_dynamics` of the trials and of what is learned from their trajectories.
+
+        Raises:
+            CertificateError: if the experiment is not loaded, an execution failed, or no dynamics can be learned.
+        """
+        learned = require_learned(sample, self.name)
+        require_executions(sample)
+        evidence = learned.dynamics()
+        if evidence is None:
+            raise CertificateError(
+                "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
+                "controller can be designed."
+            )
+        return certify_dynamics(sample, evidence, confidence)
+
+    @classmethod
+    def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
+        """Return what it assumes about the system."""
+        return [
+            "the recorded state being complete",
+            "the system being deterministic",
+            f"its dynamics being like what was seen, to a resolution of {_texts(certificate.details['resolution'])}",
+        ]
+
+    @classmethod
+    def support(cls, certificate: Certificate, threshold: float) -> str:
+        """Return what speaks for a threshold although the certificate is withdrawn; empty if nothing does."""
+        details = certificate.details
+        if not details["largest_draw"] <= threshold or details["executions"] < FEWEST:
+            return ""
+        checked = details["predictions"][-PREDICTIONS:]
+        held = sum(one["held"] for one in checked)
+        return (
+            f"supported by the model: no draw of the learned dynamics exceeds {threshold:.6g} in a search of "
+            f"{details['evaluations']} closed loops; {held} of the last {len(checked)} predictions held"
+        )
+
+
+def require_executions(sample: Sample) -> None:
+    """Check that the trials allow a bound from learned dynamics.
+
+    Raises:
+        CertificateError: if an execution failed or could not be measured.
+    """
+    failed = [number for number, distance in zip(sample.numbers, sample.distances, strict=True) if np.isnan(distance)]
+    if failed:
+        raise CertificateError(
+            f"{listed(failed)} failed or has no distance, so d* is not bounded there; execute the task again, or audit."
+            f"{advice_to_remeasure(sample)}"
+        )
+
+
+def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: float = 0.95) -> Certificate:
+    """Return the bound that d* stays below with the confidence, under the prior on the dynamics.
+
+    Args:
+        sample: trials of any origin.
+        evidence: what the learned dynamics say, from the same trials.
+        confidence: the probability with which the bound holds.
+
+    Raises:
+        CertificateError: if the confidence is too high for the number of draws.
+    """
+    require_probability("confidence", confidence)
+    draws = len(evidence.maxima)
+    if np.ceil((draws + 1) * confidence - 1e-9) > draws:
+        raise CertificateError(f"a confidence of {confidence:g} needs more than the {draws} draws of the dynamics.")
+    base = max(evidence.upper(confidence), sample.best)
+    raised = base + _RAISE * max((one.excess for one in evidence.predictions[-PREDICTIONS:]), default=0.0)
+    doubt = _doubt(evidence, raised)
+    return Certificate(
+        kind="dynamics",
+        statement=(
+            f"With probability {confidence} under the prior on the residual dynamics, d* is at most {raised:.6g}."
+        ),
+        upper_bound=raised,
+        confidence=confidence,
+        volume=0.0,
+        trials=len(sample),
+        assumptions=(*_assumptions(evidence), *sample.remarks, ONE_CAMPAIGN),
+        details=_details(sample, evidence, raised),
+        doubt=doubt,
+    )
+
+
+def held(prediction: CheckedPrediction, bound: float) -> bool:
+    """Return whether an execution agrees with its prediction, as far as it matters for a bound."""
+    near = abs(prediction.distance - prediction.median) <= NEGLIGIBLE * bound
+    return prediction.z2 <= SURPRISING or near
+
+
+def _doubt(evidence: DynamicsEvidence, bound: float) -> str | None:
+    """Return why the bound is withdrawn, and what would help; None if it is not."""
+    checked = evidence.predictions[-PREDICTIONS:]
+    failed = [one for one in checked if not held(one, bound)]
+    coverage = evidence.coverage
+    if evidence.executions < FEWEST:
+        return (
+            f"the dynamics are learned from {evidence.executions} executed trajectories, and the bound needs at least "
+            f"{FEWEST}; execute more tasks"
+        )
+    if not np.isfinite(bound):
+        return "the closed loops of some draws of the dynamics diverge; more executions narrow the draws"
+    if failed:
+        return _failed_predictions(failed)
+    if len(checked) < PREDICTIONS:
+        return (
+            f"{len(checked)} executions were predicted beforehand, and the bound needs {PREDICTIONS} predictions that "
+            "hold; execute more tasks"
+        )
+    if evidence.noise > NOISE:
+        return (
+            f"noise is learned with {100 * evidence.noise:.2g} % of the variance of the residual, and at most "
+            f"{100 * NOISE:g} % is allowed: the system is not deterministic in the recorded state and input; record "
+            "more states or reduce the noise, or use --kind posterior with --stochastic"
+        )
+    if coverage.marginal > GAP or (coverage.pair is not None and coverage.pair > PAIR_GAP):
+        return _uncovered(evidence)
+    return None
+
+
+def _failed_predictions(failed: Sequence[CheckedPrediction]) -> str:
+    worst = max(failed, key=lambda one: one.z2)
+    size = f"{np.sqrt(worst.z2):.2g} standard deviations" if np.isfinite(worst.z2) else "no prediction was possible"
+    return (
+        f"of the last {PREDICTIONS} predictions {len(failed)} failed (trial {worst.trial}: distance "
+        f"{worst.distance:.4g} where {worst.median:.4g} was predicted, {size}): until more predictions hold, a state "
+        "that is not recorded, a jump such as a contact or dry friction, or noise is the likely cause; execute more "
+        "tasks, record more states, or use --kind posterior or an audit"
+    )
+
+
+def _uncovered(evidence: DynamicsEvidence) -> str:
+    coverage = evidence.coverage
+    place = _texts(coverage.place)
+    if coverage.marginal > GAP:
+        what = f"{100 * coverage.marginal:.0f} % of its range away from every record in {coverage.coordinate}"
+    else:
+        what = f"{100 * (coverage.pair or 0):.0f} % of the ranges away from every record in two coordinates together"
+    return (
+        f"closed loops of the tasks lead {what}, such as to {place}; an execution of a task that leads there helps "
+        "(--until-decided executes it)"
+    )
+
+
+def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
+    coordinates = len(evidence.coverage.resolution)
+    joint = (
+        f"with {coordinates} coordinates of state and input, the records cover each one alone and not all combinations: "
+        "what happens only at a combination that was never visited, such as a contact in a corner, is not covered"
+        if evidence.coverage.pair is None
+        else "what happens only at a combination of three or more coordinates that was never visited is not covered"
+    )
+    return (
+        "the recorded state is complete: the next state depends on it and on the input alone",
+        "the system is deterministic",
+        "the residual x' - M(x, u) is a draw from a Gaussian process: a Matern kernel of smoothness 3/2 or 5/2 that may "
+        "grow with the inputs, plus a linear function; its hyperparameters are unknown and integrated over",
+        "the residual is like what was seen, to a resolution in state and input of "
+        f"{_texts(evidence.coverage.resolution)} (in the units of the system)",
+        joint,
+        f"the search of {evidence.evaluations} closed loops on the learned dynamics found the largest distance of each "
+        "draw",
+        "how the tasks were chosen and when the campaign stopped does not matter",
+    )
+
+
+def _details(sample: Sample, evidence: DynamicsEvidence, bound: float) -> dict[str, Any]:
+    finite = evidence.maxima[np.isfinite(evidence.maxima)]
+    return {
+        "best": sample.best,
+        "gap": bound - sample.best,
+        "executions": evidence.executions,
+        "draws": len(evidence.maxima),
+        "largest_draw": float(evidence.maxima.max()),
+        "median_draw": float(np.median(finite)) if len(finite) else None,
+        "evaluations": evidence.evaluations,
+        "predictions": [{**one.to_json(), "held": bool(held(one, bound))} for one in evidence.predictions],
+        "coverage_gap": evidence.coverage.marginal,
+        "coverage_gap_of_pairs": evidence.coverage.pair,
+        "largest_gap_at": evidence.coverage.place,
+        "resolution": evidence.coverage.resolution,
+        "noise": evidence.noise,
+        "left_out": evidence.left_out,
+        "failures": sample.failures,
+    }
+
+
+def _texts(values: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.2g}" for name, value in values.items())

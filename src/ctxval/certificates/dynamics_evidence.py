@@ -1,0 +1,115 @@
+"""What learned dynamics say about the largest distance, as numbers: the input of the certificate ``dynamics``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import call, record
+
+
+@dataclass(frozen=True)
+class CheckedPrediction:
+    """A prediction from earlier executions only, compared with the execution.
+
+    Attributes:
+        trial: the number of the trial.
+        z2: squared standardised error, the larger one of the trajectory and of the distance; infinity if nothing was
+            predicted, because most draws diverged.
+        rank: share of the predicted distances that are below the executed one.
+        median: median of the predicted distances; infinity if nothing was predicted.
+        distance: the executed distance.
+        stored: whether the prediction was stored before the execution; if not, it was computed afterwards.
+    """
+
+    trial: int
+    z2: float
+    rank: float
+    median: float
+    distance: float
+    stored: bool
+
+    @property
+    def excess(self) -> float:
+        """How far the distance exceeds the prediction's median; infinity if nothing was predicted."""
+        return max(self.distance - self.median, 0.0) if np.isfinite(self.median) else np.inf
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all attributes, ready for JSON: infinity is None."""
+        return {name: None if value in (np.inf, -np.inf) else value for name, value in asdict(self).items()}
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True, eq=False)
+class StateInputCoverage:
+    """The largest gaps between the states and inputs that closed loops visit and those that are recorded.
+
+    Attributes:
+        marginal: the largest gap in a single coordinate, as a share of the visited range.
+        pair: the largest gap in two coordinates together; None if there are too many coordinates to compare pairs.
+        coordinate: the coordinate with the largest gap, such as ``x[1]`` or ``u[0]``.
+        place: state and input where this gap is, by coordinate, in the units of the system.
+        resolution: the largest gap of each coordinate, in its unit.
+        task: the task whose closed loop leads farthest from the records, a point of the unit cube ``(d,)``.
+        tasks: the number of tasks that were compared.
+    """
+
+    marginal: float
+    pair: float | None
+    coordinate: str
+    place: dict[str, float]
+    resolution: dict[str, float]
+    task: Array
+    tasks: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all attributes, ready for JSON."""
+        return {**asdict(self), "task": self.task.tolist()}
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicsEvidence:
+    """What draws of the learned dynamics say about the largest distance.
+
+    Attributes:
+        maxima: the largest distance over all tasks of each draw, shape ``(S,)``; infinity if its loop diverges.
+        points: where it lies, points of the unit cube ``(S, d)``.
+        highest: the largest distance on the posterior mean, and below it those of other tasks.
+        elites: tasks with large distances on the posterior mean, points ``(e, d)``, the largest first.
+        evaluations: number of closed loops on learned dynamics that were run to find the maxima.
+        executions: number of executions with a trajectory, from which the dynamics were learned.
+        left_out: share of the posterior variance that a draw leaves out between its pivots.
+        noise: learned variance of noise, as a share of the mean square of the residual.
+        predictions: predictions and executions, in the order of the trials.
+        coverage: how well the records cover the closed loops of the tasks.
+    """
+
+    maxima: Array
+    points: Array
+    highest: float
+    elites: Array
+    evaluations: int
+    executions: int
+    left_out: float
+    noise: float
+    predictions: tuple[CheckedPrediction, ...]
+    coverage: StateInputCoverage
+
+    def rank(self, confidence: float) -> int:
+        """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
+        return min(int(np.ceil((len(self.maxima) + 1) * confidence - 1e-9)), len(self.maxima)) - 1
+
+    def upper(self, confidence: float) -> float:
+        """Return the maximum that d* stays below with this probability."""
+        return float(np.sort(self.maxima)[self.rank(confidence)])
+
+    def __repr__(self) -> str:
+        return call(self, draws=len(self.maxima), executions=self.executions, evaluations=self.evaluations)
