@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +59,22 @@ def make_validation(
         synthesizer=controllers.LQR([1.0, 0.1], [1e-2], [10.0, 1.0]),
         distance=distance or distances.FinalState(norm=1),
     )
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """A prediction that is a function of points; it learns nothing from trials, and remembers which it might use."""
+
+    function: Callable[[np.ndarray], np.ndarray]
+    dimension: int = 1
+    asked: list[int] = field(default_factory=list)
+
+    def expected(self, points: np.ndarray, before: int) -> np.ndarray:
+        self.asked.append(before)
+        return self.function(points)
+
+    def tasks(self, count: int, seed: int) -> np.ndarray:
+        return np.random.default_rng([seed, 9]).random((count, self.dimension))
 
 
 def interrupt_at_once() -> None:

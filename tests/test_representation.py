@@ -21,6 +21,7 @@ from conftest import make_validation
 from ctxval import (
     Campaign,
     Experiment,
+    Normal,
     Store,
     Task,
     TaskSpace,
@@ -148,6 +149,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "Parameters": lambda: SPACE.parameters([1, 2, 3, 4]),
     "Plan": lambda: make_validation().plan([0.5]),
     "Store": lambda: campaign().store,
+    "Normal": lambda: Normal(0.0, [0.3, 0.5]),
     "Task": lambda: TASK,
     "TaskSpace": lambda: SPACE,
     "Trajectory": lambda: TRAJECTORY,
@@ -214,9 +216,11 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.StoppingRule": lambda: certificates.StoppingRule(0.5, BY_POSTERIOR),
     "certificates.Diagnosis": diagnosis,
     "certificates.Forecast": lambda: certificates.Forecast(12, 0.75, 0.25),
+    "certificates.Mean": lambda: certificates.Mean(quantile=0.9),
     "certificates.MadeGood": lambda: certificates.MadeGood(3, 7, "fuse replaced"),
     "certificates.Maxima": lambda: certificates.draw_maxima(sample(), draws=12, paths=4),
     "certificates.Options": certificates.Options,
+    "certificates.Region": certificates.Region,
     "certificates.Sample": sample,
     "certificates.Verdict": lambda: certificates.judge(
         campaign().trials, 0.01, certificates.CertificateOptions.posterior()

@@ -18,6 +18,7 @@ from ctxval.core.plan import Outcome, Plan
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.task import Task
+from ctxval.core.task_distribution import Normal
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.trial import Trial
 from ctxval.core.truth import Truth, cached_truth, grid_truth, search_truth
@@ -45,6 +46,7 @@ __all__ = [
     "Array",
     "Campaign",
     "Experiment",
+    "Normal",
     "OpenTrial",
     "Outcome",
     "Parameters",

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from conftest import Predicted
 from ctxval import certificates
 from ctxval.certificates import (
     KINDS,
@@ -31,7 +32,8 @@ confidences = st.floats(0.01, 0.999)
 
 def sample(n: int = 9, origin: str = "acquisition") -> Sample:
     X = np.linspace(0.0, 1.0, n)[:, None]
-    return Sample(X, 1.0 + np.sin(4 * X[:, 0]), [origin] * n, ["completed"] * n)  # type: ignore[list-item]
+    learned = Predicted(lambda points: 0.9 + np.sin(4 * points[:, 0]))
+    return Sample(X, 1.0 + np.sin(4 * X[:, 0]), [origin] * n, ["completed"] * n, learned=learned)  # type: ignore[list-item]
 
 
 # The kinds of this package
@@ -92,8 +94,9 @@ def test_proposition_1_is_refused_where_another_search_chose_the_tasks() -> None
 
 
 def test_the_kinds_of_this_package_are_listed_by_name() -> None:
-    assert list(KINDS) == ["anytime", "audit", "convergence", "posterior", "sampling-discarding", "scenario"]
-    assert len(KINDS) == 6
+    own = ["anytime", "audit", "convergence", "mean", "posterior", "region", "sampling-discarding", "scenario"]
+    assert list(KINDS) == own
+    assert len(KINDS) == 8
     assert "posteriour" not in KINDS
     assert KINDS["posterior"] is Posterior
 
@@ -102,8 +105,11 @@ def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> Non
     assert certificates.USES == {
         "stochastic": ("posterior",),
         "resolution": ("posterior",),
-        "volume": ("anytime", "audit", "sampling-discarding", "scenario"),
-        "discard": ("sampling-discarding",),
+        "volume": ("anytime", "audit", "region", "sampling-discarding", "scenario"),
+        "discard": ("region", "sampling-discarding"),
+        "predictions": ("mean", "region"),
+        "quantile": ("mean",),
+        "largest_possible": ("mean",),
         "constant": ("convergence",),
         "theorem": ("convergence",),
     }
@@ -111,7 +117,7 @@ def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> Non
         _ = certificates.USED
     with pytest.raises(UnknownNameError, match="did you mean 'resolution'"):
         require_use("posterior", ["resolutoin"])
-    with pytest.raises(CertificateError, match="for certificates of the kind sampling-discarding; the kind here is"):
+    with pytest.raises(CertificateError, match="of the kind region or sampling-discarding; the kind here is posterior"):
         require_use("posterior", ["discard"])
 
 

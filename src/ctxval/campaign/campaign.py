@@ -183,7 +183,7 @@ class Campaign(CampaignResults):
         executor: cf.Executor | None = None,
         timeout: float | None = None,
     ) -> Campaign:
-        """Execute independent uniform draws of tasks until the trials contain this number of them.
+        """Execute independent draws from the distribution of tasks until the trials contain this number of them.
 
         The search does not choose these tasks.
 
@@ -246,11 +246,11 @@ class Campaign(CampaignResults):
         because: str | None = None,
         wait: float = 0.0,
     ) -> OpenTrial:
-        """Open the next trial: the search's choice, the task with these parameters, or an independent uniform draw.
+        """Open the next trial: the search's choice, the task with these parameters, or an independent draw.
 
         Args:
             parameters: the parameters of a task that you chose yourself.
-            draw: choose the task by an independent uniform draw, for an audit.
+            draw: draw the task from the distribution of tasks, for an audit.
             because: the change that was made to the system since the task with these parameters was executed before.
             wait: seconds to wait while another process chooses a task.
 

@@ -44,7 +44,7 @@ class LearnedFromTrials:
 
     def tasks(self, count: int, seed: int) -> Array:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
-        return np.random.default_rng([seed, _TASKS]).random((count, self.validation.space.dimension))
+        return self.validation.space.unit_draws(count, np.random.default_rng([seed, _TASKS]))
 
     def _before(self, before: int) -> Prediction | None:
         """Return the prediction from the trials with smaller numbers; it is computed once."""

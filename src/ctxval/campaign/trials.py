@@ -138,7 +138,7 @@ class TrialRecorder:
         return self.validation.plan(self.validation.space.from_unit(trial.unit_point))
 
     def draw(self) -> Array:
-        """Return the next independent draw of an audit, a point of the unit cube ``(d,)``."""
+        """Return the next independent draw of a task, a point of the unit cube ``(d,)``."""
         return self.draws.point(self._trials)
 
     # Consistency with the store
@@ -232,6 +232,9 @@ class TrialRecorder:
     def _next_trial(self, choice: Choice, attempts: int) -> Trial:
         """Return the trial of a choice, and tell the search that its point has no value yet."""
         note = None
+        if choice.unit_point is None and self.search.iid and self.validation.space.distribution is not None:
+            # The points of such a search are uniform, and the tasks are not.
+            choice = replace(choice, unit_point=self.draw(), origin="iid")
         if choice.unit_point is None:
             unit_point, origin = self._proposal(), self._origin()
             note = _plain_note(self.search.note())

@@ -19,9 +19,11 @@ from ctxval.certificates.diagnostics import Diagnosis, diagnose
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.learned import LearnedDistance, require_learned
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
+from ctxval.certificates.mean import Mean, certify_mean
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.posterior import Posterior, certify_posterior, instantaneous_bound
 from ctxval.certificates.provenance import Provenance
+from ctxval.certificates.region import Region, certify_region
 from ctxval.certificates.registry import KINDS, Options, certify, require_possible, require_use
 from ctxval.certificates.sample import PLANNED, MadeGood, Sample
 from ctxval.certificates.scenario import (
@@ -55,9 +57,11 @@ __all__ = [
     "LearnedDistance",
     "MadeGood",
     "Maxima",
+    "Mean",
     "Options",
     "Posterior",
     "Provenance",
+    "Region",
     "Sample",
     "SamplingDiscarding",
     "Scenario",
@@ -71,7 +75,9 @@ __all__ = [
     "certify_anytime",
     "certify_audit",
     "certify_convergence",
+    "certify_mean",
     "certify_posterior",
+    "certify_region",
     "certify_scenario",
     "covering",
     "diagnose",

@@ -27,7 +27,7 @@ from scipy.special import betainc, betaln
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import at_most, require_probability
+from ctxval.certificates.bounds import at_most, drawn_from, of_tasks, require_probability
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.scenario import ABOUT_DRAWS, rests_on_draws
@@ -92,15 +92,16 @@ def certify_anytime(sample: Sample, threshold: float, confidence: float = 0.95) 
     return Certificate(
         kind="anytime",
         statement=(
-            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % of the task space has a distance "
-            f"above {threshold:.6g} or fails, however often this was looked at and continued."
+            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % "
+            f"{of_tasks(sample.distribution)} has a distance above {threshold:.6g} or fails, however often this "
+            "was looked at and continued."
         ),
         upper_bound=float(threshold),
         confidence=confidence,
         volume=volume,
         trials=len(drawn),
         assumptions=(
-            "the audited tasks are independent and uniform over the task space",
+            f"the audited tasks are independent and {drawn_from(sample.distribution)}",
             f"the threshold {threshold:.6g} was fixed before any of them was known",
             *ABOUT_DRAWS,
             *sample.remarks,
@@ -112,6 +113,7 @@ def certify_anytime(sample: Sample, threshold: float, confidence: float = 0.95) 
             "failed": drawn.failed,
             "failures": sample.failures,
         },
+        distribution=sample.distribution,
     )
 
 

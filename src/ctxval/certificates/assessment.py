@@ -10,7 +10,6 @@ from ctxval._util.representation import record
 from ctxval.certificates.base import Certificate
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.provenance import Provenance
-from ctxval.certificates.sample import Sample
 from ctxval.certificates.verdict import Verdict, counterexample, judge, judge_by
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError
@@ -83,7 +82,7 @@ def assess(
 def _certificate(
     trials: Sequence[Trial], options: CertificateOptions, known: Provenance, threshold: float | None = None
 ) -> Certificate:
-    sample, kind = Sample.of(trials, known.search, known.learned), options.kind
+    sample, kind = known.sample(trials), options.kind
     if threshold is not None and kind.needs_threshold:
         found, _ = kind.certify_against(sample, threshold, options.confidence)
     else:

@@ -12,9 +12,10 @@ import numpy as np
 
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import at_most, require_probability
+from ctxval.certificates.bounds import at_most, of_tasks, require_probability
+from ctxval.certificates.draws import countable_draws, draws_left_out, how_drawn, not_counted
 from ctxval.certificates.sample import Sample, advice_to_remeasure
-from ctxval.certificates.scenario import ABOUT_DRAWS, rests_on_draws, violations, volume_bound, when_planned
+from ctxval.certificates.scenario import ABOUT_DRAWS, rests_on_draws, violations, volume_bound
 from ctxval.core.space import TaskSpace
 from ctxval.errors import CertificateError
 
@@ -39,8 +40,7 @@ class Audit(CertificateKind):
     @classmethod
     def shortfall(cls, certificate: Certificate) -> str:
         """Return how many draws do not count; empty if all count."""
-        missing = certificate.details.get("not_counted")
-        return f"; {missing} draws do not count, as their number was changed after they were known" if missing else ""
+        return draws_left_out(certificate)
 
 
 def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
@@ -60,71 +60,44 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
             the execution of a draw failed.
     """
     beta = 1 - require_probability("confidence", confidence)
-    everything = sample.only("iid")
-    drawn = _countable(everything)
+    drawn = countable_draws(sample, "an audit")
+    _require_distances(drawn)
     volume, h = volume_bound(len(drawn), 0, beta), sample.best
     return Certificate(
         kind="audit",
         statement=(
-            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % of the task space "
-            f"has a distance above {at_most(h)}, the largest one found."
+            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % "
+            f"{of_tasks(sample.distribution)} has a distance above {at_most(h)}, the largest one found."
         ),
         upper_bound=h,
         confidence=confidence,
         volume=volume,
         trials=len(drawn),
         assumptions=(
-            "the audited tasks are independent and uniform over the task space, and "
-            f"{when_planned(drawn, len(everything))}",
-            *_not_counted(everything, drawn),
+            *how_drawn(sample, drawn),
             *ABOUT_DRAWS,
             *sample.remarks,
             ONE_CAMPAIGN,
         ),
         details={
             **{"largest_found": h, **_against_the_search(sample, drawn)},
-            **{"not_counted": len(everything) - len(drawn), "failed": sample.failed, "failures": sample.failures},
+            **{"not_counted": not_counted(sample, drawn), "failed": sample.failed, "failures": sample.failures},
         },
+        distribution=sample.distribution,
     )
 
 
-def _countable(everything: Sample) -> Sample:
-    """Return the draws whose number was chosen before they were executed.
+def _require_distances(drawn: Sample) -> None:
+    """Refuse draws without a distance.
 
     Raises:
-        CertificateError: if there are no such draws, or one of them has no distance.
+        CertificateError: if there is one.
     """
-    if not len(everything):
-        raise CertificateError("an audit needs independent draws of tasks, but there is none; run certify --audit N.")
-    drawn = _last_decided_on(everything)
-    if not len(drawn):
-        raise CertificateError(
-            f"the {len(everything)} independent draws ended with the verdict (--until-decided), so their number "
-            f"depended on their distances and none counts; certify --audit N draws until there are N in all, and "
-            f"counts only those after the first {len(everything)}."
-        )
     if drawn.failed:
         raise CertificateError(
             f"{violations(drawn)}; to audit the other tasks, start a new store whose task space excludes these tasks."
             f"{advice_to_remeasure(drawn)}"
         )
-    return drawn
-
-
-def _last_decided_on(drawn: Sample) -> Sample:
-    """Return the draws of the last decision on their number, without draws that stop when the verdict is reached."""
-    plans = [planned for planned in drawn.planned if planned != 0]
-    return drawn.rows([row for row, planned in enumerate(drawn.planned) if plans and planned == plans[-1]])
-
-
-def _not_counted(everything: Sample, drawn: Sample) -> tuple[str, ...]:
-    missing = len(everything) - len(drawn)
-    if not missing:
-        return ()
-    return (
-        f"{missing} other independent draws do not count: the number of draws was changed, or the verdict ended them, "
-        "after they were known",
-    )
 
 
 def _against_the_search(sample: Sample, drawn: Sample) -> dict[str, float | int | None]:

@@ -44,6 +44,8 @@ class Certificate:
             statement of a withdrawn certificate must not be used.
         error: standard error of ``upper_bound`` in the distance's units, if it is computed from random draws; else 0.
         version: the version of ctxval that computed it.
+        distribution: the distribution of tasks as a text, under which ``volume`` is a probability; None if it is
+            uniform.
     """
 
     kind: str
@@ -57,6 +59,7 @@ class Certificate:
     doubt: str | None = None
     error: float = 0.0
     version: str = VERSION
+    distribution: str | None = None
 
     def covers(self, threshold: float, volume: float = 0.0) -> bool:
         """Return whether it bounds the distance by the threshold, except on at most this share of the task space.
@@ -109,6 +112,7 @@ class Certificate:
                 ("volume left out", at_most(self.volume, 3)),
                 ("trials", self.trials),
                 *(("assumes", assumption) for assumption in self.assumptions),
+                ("distribution of tasks", self.distribution),
                 ("version", self.version),
             ],
         )
@@ -136,11 +140,14 @@ class CertificateKind(ABC):
     needs_model: ClassVar[bool] = False
     """Whether it uses what the experiment's model predicts, so that the experiment must be loaded."""
 
+    never_validates: ClassVar[str] = ""
+    """Why it validates no threshold, whatever its numbers are: a sentence without its full stop; empty if it can."""
+
     @classmethod
     def options(cls) -> tuple[str, ...]:
-        """Return the names of its options: its fields, and ``volume`` if it leaves out a share of the task space."""
+        """Return the names of its options: its fields, and ``volume`` if it validates but for a share of the tasks."""
         own = tuple(one.name for one in fields(cls))
-        return own if cls.bounds_maximum else (*own, "volume")
+        return own if cls.bounds_maximum or cls.never_validates else (*own, "volume")
 
     @classmethod
     def of(cls, stated: Mapping[str, Any]) -> Self:

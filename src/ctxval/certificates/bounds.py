@@ -35,6 +35,28 @@ def at_most(value: float, digits: int = 4) -> str:
     return f"{value + 10.0 ** (np.floor(np.log10(abs(value))) - digits + 1):.{digits}g}"
 
 
+def at_least(value: float, digits: int = 4) -> str:
+    """Return a lower limit as text, rounded down."""
+    rounded = at_most(-value, digits)
+    return rounded.removeprefix("-") if rounded.startswith("-") else ("0" if value == 0 else f"-{rounded}")
+
+
+def of_tasks(distribution: str | None) -> str:
+    """Return of what a share is a share: of the task space, or of the probability under a distribution of tasks.
+
+    Args:
+        distribution: the distribution of tasks as a text; None if it is uniform.
+    """
+    return "of the task space" if distribution is None else "of the probability under the stated distribution of tasks"
+
+
+def drawn_from(distribution: str | None) -> str:
+    """Return how independent draws are distributed, as the end of a clause "the tasks are independent and ..."."""
+    if distribution is None:
+        return "uniform over the task space"
+    return f"follow the stated distribution of tasks ({distribution})"
+
+
 def require_probability(name: str, value: float) -> float:
     """Return a probability, which must be strictly between 0 and 1.
 
@@ -70,3 +92,14 @@ def require_number(name: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise InputError(f"{name} must be a number, got {value!r}.")
     return float(value)
+
+
+def require_count(name: str, value: object, least: int) -> int:
+    """Return an integer that is not below the least one allowed.
+
+    Raises:
+        CertificateError: if it is no integer, or too small.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise CertificateError(f"{name} must be an integer of at least {least}, got {value!r}.")
+    return int(value)

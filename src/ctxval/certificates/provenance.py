@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ctxval._util.representation import record
 from ctxval.certificates.learned import LearnedDistance
-from ctxval.core.space import TaskSpace
-from ctxval.core.trial import Change
+from ctxval.certificates.sample import Sample
+from ctxval.core.space import DISTRIBUTION, TaskSpace
+from ctxval.core.task_distribution import distribution_text
+from ctxval.core.trial import Change, Trial
 from ctxval.errors import InputError
 
 
@@ -22,12 +24,14 @@ class Provenance:
         search: the type of the search that chose the tasks; None if it is not known.
         remarks: sentences that a certificate lists among its assumptions, such as what was changed on the system.
         learned: what the experiment's model predicts, for kinds that need it; None if the experiment is not loaded.
+        distribution: the distribution of tasks as a text; None if it is uniform.
     """
 
     space: TaskSpace | None = None
     search: str | None = None
     remarks: tuple[str, ...] = ()
     learned: LearnedDistance | None = None
+    distribution: str | None = None
 
     @classmethod
     def of(cls, description: Mapping[str, Any], changes: Iterable[Change] = ()) -> Provenance:
@@ -37,7 +41,16 @@ class Provenance:
             space=_space_of(description),
             search=search.get("type") if isinstance(search, dict) else None,
             remarks=remarks_on(changes),
+            distribution=_distribution_of(description),
         )
+
+    def sample(self, trials: Sequence[Trial]) -> Sample:
+        """Return trials as a certificate sees them, with what is known here.
+
+        Raises:
+            CertificateError: if there is no trial, or one is still open.
+        """
+        return replace(Sample.of(trials, self.search, self.learned), distribution=self.distribution)
 
     def __repr__(self) -> str:
         return record(self)
@@ -58,11 +71,21 @@ def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
     return tuple(found)
 
 
+def _distribution_of(description: Mapping[str, Any]) -> str | None:
+    """Return the distribution of tasks in a description as a text; None if tasks are uniform."""
+    try:
+        described = description["validation"]["space"].get(DISTRIBUTION)
+    except (KeyError, TypeError, AttributeError):
+        return None
+    return None if described is None else distribution_text(described)
+
+
 def _space_of(description: Mapping[str, Any]) -> TaskSpace | None:
     """Return the task space of a description; None if it has none that can be read."""
     try:
         described = dict(description["validation"]["space"])
         described.pop("type", None)
+        described.pop(DISTRIBUTION, None)
         bounds: dict[str, tuple[Any, ...]] = {}
         for name, (low, high, *unit) in described.items():
             vector = name.partition("[")[0]

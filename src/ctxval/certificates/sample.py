@@ -54,6 +54,7 @@ class Sample:
         made_good: failures that are left out, because their tasks were executed with success later.
         search: the type of the search that chose the tasks; None if it is not known.
         learned: what the experiment's model predicts; None if the experiment is not loaded.
+        distribution: the distribution of tasks as a text; None if it is uniform.
 
     Raises:
         CertificateError: if the lengths differ, or a trial is still open.
@@ -68,6 +69,7 @@ class Sample:
     made_good: tuple[MadeGood, ...] = ()
     search: str | None = None
     learned: LearnedDistance | None = None
+    distribution: str | None = None
 
     def __post_init__(self) -> None:
         if not len(self.numbers):
@@ -140,6 +142,7 @@ class Sample:
             self.made_good,
             self.search,
             self.learned,
+            self.distribution,
         )
 
     @property

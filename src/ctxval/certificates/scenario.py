@@ -21,7 +21,7 @@ from scipy.special import bdtr, betaincinv
 
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import at_most, require_probability
+from ctxval.certificates.bounds import at_most, drawn_from, of_tasks, require_probability
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Origin
@@ -194,15 +194,16 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
     return Certificate(
         kind=_name(discarded),
         statement=(
-            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % of the task space "
-            f"has a distance above {at_most(h)}."
+            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % "
+            f"{of_tasks(sample.distribution)} has a distance above {at_most(h)}."
         ),
         upper_bound=h,
         confidence=confidence,
         volume=volume,
         trials=len(sample),
         assumptions=(
-            f"the trials are independent and uniform over the task space, and {when_planned(sample, len(sample))}",
+            f"the trials are independent and {drawn_from(sample.distribution)}, and "
+            f"{when_planned(sample, len(sample))}",
             "the number discarded was chosen before the distances were known",
             UNSEEN,
             "each task has one distance: the system is deterministic",
@@ -211,6 +212,7 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
             ONE_CAMPAIGN,
         ),
         details={"discarded": discarded, "failed": sample.failed, "failures": sample.failures},
+        distribution=sample.distribution,
     )
 
 

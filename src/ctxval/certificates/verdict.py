@@ -10,12 +10,11 @@ import numpy as np
 
 from ctxval._util.representation import call, line, lines, shown
 from ctxval.certificates.base import Certificate
-from ctxval.certificates.bounds import at_most, with_error
+from ctxval.certificates.bounds import at_most, of_tasks, with_error
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CertificateOptions, require_confidence, require_volume
 from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.registry import KINDS
-from ctxval.certificates.sample import Sample
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
@@ -128,7 +127,11 @@ def judge_by(
     if found is not None:
         return Verdict("falsified", tau, found.reason, found.witness, certificate)
     if certificate.covers(tau, require_volume(volume)):
-        but = f", but for {at_most(100 * certificate.volume, 3)} % of the task space" if certificate.volume else ""
+        but = (
+            f", but for {at_most(100 * certificate.volume, 3)} % {of_tasks(certificate.distribution)}"
+            if certificate.volume
+            else ""
+        )
         upper, limit = _bound_and_limit(certificate, tau)
         kind = KINDS.of(certificate)
         reason = (
@@ -148,6 +151,8 @@ def _bound_and_limit(certificate: Certificate, tau: float) -> tuple[str, str]:
 def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
     if certificate.doubt is not None:
         return f"{certificate.doubt}."
+    if KINDS.of(certificate).never_validates:
+        return f"{KINDS.of(certificate).never_validates}."
     upper, limit = _bound_and_limit(certificate, tau)
     if certificate.upper_bound > tau:
         return f"no distance above {limit} was executed, but d* may be up to {upper}."
@@ -158,8 +163,9 @@ def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
         )
     return (
         f"the {certificate.kind} bound of {certificate.trials} trials leaves out "
-        f"{at_most(100 * certificate.volume, 3)} % of the task space, more than the {100 * volume:.3g} % that are "
-        f"acceptable{KINDS.of(certificate).shortfall(certificate)}; it is no bound on d*."
+        f"{at_most(100 * certificate.volume, 3)} % {of_tasks(certificate.distribution)}, more than "
+        f"the {100 * volume:.3g} % that are acceptable{KINDS.of(certificate).shortfall(certificate)}; it is no bound "
+        "on d*."
     )
 
 
@@ -196,7 +202,7 @@ def judge(
     if found is not None:
         return found
     try:
-        sample = Sample.of(trials, known.search, known.learned)
+        sample = known.sample(trials)
         certificate, expected = chosen.kind.certify_against(sample, threshold, chosen.confidence)
     except CertificateError as error:
         return Verdict("undecided", float(threshold), str(error))

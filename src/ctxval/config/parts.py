@@ -23,6 +23,7 @@ from ctxval.config.references import accepts, is_function, reference, require_fu
 from ctxval.core.model import Model
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.task import Task
+from ctxval.core.task_distribution import Normal
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
 
@@ -277,3 +278,33 @@ def space_of(bounds: Mapping[str, Sequence[Any]]) -> TaskSpace:
         InputError: if bounds are not valid.
     """
     return TaskSpace(**{name: tuple(bound) for name, bound in bounds.items()})
+
+
+def with_distribution(space: TaskSpace, tables: Mapping[str, Mapping[str, Any]]) -> TaskSpace:
+    """Return a task space with the distribution of tasks of an experiment file.
+
+    Args:
+        space: the task space.
+        tables: for each parameter, ``{type = "normal", mean = ..., deviation = ...}`` or ``{type = "uniform"}``.
+
+    Raises:
+        UnknownNameError: if there is no such parameter, no such distribution, or it takes no such argument.
+        InputError: if an argument is missing or cannot be used.
+    """
+    found = {name: _distribution(name, table) for name, table in tables.items() if table.get("type") != "uniform"}
+    for name in tables:
+        space.columns(name)
+    return space.distributed(**found) if found else space
+
+
+def _distribution(name: str, table: Mapping[str, Any]) -> Normal:
+    given = dict(table)
+    kind = given.pop("type", None)
+    if kind != "normal":
+        raise UnknownNameError.among(f"distribution of {name}", str(kind), ("normal", "uniform"))
+    for key in given:
+        if key not in ("mean", "deviation"):
+            raise UnknownNameError.among(f"argument of the distribution of {name}", key, ("mean", "deviation"))
+    if len(given) < 2:
+        raise InputError(f"the normal distribution of {name} needs a mean and a deviation, got {given!r}.")
+    return Normal(given["mean"], given["deviation"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from ctxval.certificates import KINDS, CertificateOptions
 from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE
 from ctxval.config.certificate_table import CertificateTable
 from ctxval.config.experiments import named_experiment
-from ctxval.config.parts import argument, part, require_types, space_of, task_function
+from ctxval.config.parts import argument, part, require_types, space_of, task_function, with_distribution
 from ctxval.config.signatures import code_named, signed, unsigned, verifies
 from ctxval.core.experiment import Experiment, labels_of
 from ctxval.core.validation import Validation
@@ -69,6 +70,8 @@ class Settings(BaseModel):
         options: the options of the case or of the function.
         name: the name of the experiment.
         space: ``name = [low, high, "unit"]`` for each task parameter.
+        distribution: the distribution of a task parameter by its name, such as ``{type = "normal", mean = 0.0,
+            deviation = 0.3}``; all others are uniform. A named experiment may have one too.
         task: ``module:attr`` of a function, or a table with an initial state, a goal, a horizon and a time step.
         system, model, synthesizer, distance: ``module:attr``, or a table with a type and its arguments.
         states, inputs: the unit of each state and of each input, by name.
@@ -89,6 +92,7 @@ class Settings(BaseModel):
     options: dict[str, Any] = Field(default_factory=dict)
     name: str | None = None
     space: dict[str, list[Any]] | None = None
+    distribution: dict[str, dict[str, Any]] | None = None
     task: Part | None = None
     system: Part | None = None
     model: Part | None = None
@@ -112,6 +116,13 @@ class Settings(BaseModel):
         Raises:
             InputError: if it cannot be found or made.
         """
+        made = self._made()
+        if self.distribution is None:
+            return made
+        space = with_distribution(made.validation.space, self.distribution)
+        return replace(made, validation=made.validation.with_space(space))
+
+    def _made(self) -> Experiment:
         if self.experiment is None:
             return self._described()
         given = [name for name in (*_WHOLE, "distance", "name") if getattr(self, name) is not None]

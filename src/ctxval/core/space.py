@@ -1,7 +1,8 @@
-"""The task space P: a named box of parameters, and its map to the unit cube."""
+"""The task space P: a named box of parameters, its map to the unit cube, and the distribution of tasks over it."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -9,9 +10,13 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats, require_shape
 from ctxval._util.representation import call, named
+from ctxval.core.task_distribution import ByParameter, BySampler, Continuous, Sampler, TaskDistribution
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 
 Point = float | list[float]
+
+DISTRIBUTION = "_distribution"
+"""Key of the distribution of tasks in the description of a space; no parameter can have this name."""
 
 
 class Parameters:
@@ -49,7 +54,7 @@ class TaskSpace:
     """A named box of task parameters.
 
     Each keyword is ``name=(low, high)`` or ``name=(low, high, "unit")``. Bounds that are arrays define a vector
-    parameter.
+    parameter. Tasks are distributed uniformly, unless :meth:`distributed` or :meth:`sampled` says otherwise.
 
     >>> space = TaskSpace(goal=(-3.14, 3.14, "rad"), offset=([0, 0], [1, 2]))
     >>> space.names
@@ -86,6 +91,7 @@ class TaskSpace:
         self.low: Array = np.concatenate(lows)
         self.high: Array = np.concatenate(highs)
         self._decimals = _decimals(self.low, self.high)
+        self._distribution: TaskDistribution | None = None
 
     @property
     def dimension(self) -> int:
@@ -105,12 +111,17 @@ class TaskSpace:
 
     def __repr__(self) -> str:
         bounds = {name: (self.low[at], self.high[at]) for name, at in self._columns.items()}
-        return call(self, named({name: (*ends, *filter(None, [self._units[name]])) for name, ends in bounds.items()}))
+        ends = named({name: (*ends, *filter(None, [self._units[name]])) for name, ends in bounds.items()})
+        return call(self, ends, distribution=self._distribution)
 
-    def describe(self) -> dict[str, list[float | str]]:
-        """Return ``{scalar name: [low, high]}``, and the unit if it has one: what identifies this space in a store."""
+    def describe(self) -> dict[str, Any]:
+        """Return ``{scalar name: [low, high]}``, and the unit if it has one: what identifies this space in a store.
+
+        A distribution of tasks is part of it only if there is one.
+        """
         units = (self._units[name.partition("[")[0]] for name in self.names)
-        return {
+        set_one = {} if self._distribution is None else {DISTRIBUTION: self._distribution.describe()}
+        return set_one | {
             name: [float(low), float(high), *([unit] if unit else [])]
             for name, low, high, unit in zip(self.names, self.low, self.high, units, strict=True)
         }
@@ -193,11 +204,63 @@ class TaskSpace:
 
         return of_points
 
+    # The distribution of tasks
+
+    @property
+    def distribution(self) -> TaskDistribution | None:
+        """The distribution of tasks; None if it is uniform."""
+        return self._distribution
+
+    def distributed(self, **by_name: Continuous) -> TaskSpace:
+        """Return this space with a distribution of tasks: independent parameters, all others uniform.
+
+        Independent draws of tasks follow it, and a volume is then the probability under it. Searches are not affected.
+
+        >>> space = TaskSpace(goal=(-1, 1), load=(0, 5)).distributed(goal=Normal(0.0, 0.3))
+
+        Args:
+            by_name: for each parameter, a :class:`Normal` or a frozen continuous distribution of ``scipy.stats``. It
+                is truncated to the parameter's bounds. The components of a vector are independent.
+
+        Raises:
+            UnknownNameError: if the space has no such parameter.
+            InputError: if a distribution cannot be used.
+        """
+        if not by_name:
+            raise InputError("distributed needs the distribution of at least one parameter, such as goal=Normal(0, 1).")
+        columns = {name: self.columns(name) for name in by_name}
+        slices = {name: at if isinstance(at, slice) else slice(at, at + 1) for name, at in columns.items()}
+        return self._with(ByParameter(self.low, self.high, slices, by_name))
+
+    def sampled(self, sampler: Sampler) -> TaskSpace:
+        """Return this space with a distribution of tasks that a function draws from.
+
+        Args:
+            sampler: ``(rng, n)`` -> n independent tasks, rows ``(n, d)`` within the bounds, in the space's own units.
+
+        Raises:
+            InputError: if it is not a function.
+        """
+        if not callable(sampler):
+            raise InputError(f"sampler must be a function (rng, n) -> rows (n, d), got {sampler!r}.")
+        return self._with(BySampler(self.low, self.high, sampler))
+
+    def unit_draws(self, n: int, rng: np.random.Generator) -> Array:
+        """Return n independent draws from the distribution of tasks, points of the unit cube ``(n, d)``."""
+        if self._distribution is None:
+            return rng.random((n, self.dimension))
+        return np.clip(self.to_unit(self._distribution.draw(n, rng)), 0.0, 1.0)
+
+    def _with(self, distribution: TaskDistribution) -> TaskSpace:
+        found = copy.copy(self)
+        found._distribution = distribution
+        return found
+
     # Sets of points
 
     def iid(self, n: int, rng: np.random.Generator) -> Array:
-        """Return n points drawn independently and uniformly, shape ``(n, d)``."""
-        return self.from_unit(rng.random((n, self.dimension)))
+        """Return n points drawn independently from the distribution of tasks, shape ``(n, d)``."""
+        return self.from_unit(self.unit_draws(n, rng))
 
     def sobol(self, n: int, seed: int) -> Array:
         """Return n points of a scrambled Sobol sequence, shape ``(n, d)``."""

@@ -109,6 +109,22 @@ class Validation:
             start_tolerance=self.start_tolerance,
         )
 
+    def with_space(self, space: TaskSpace) -> Validation:
+        """Return this validation with another task space of the same parameters, for example with a distribution.
+
+        Raises:
+            InputError: if it is not a task space.
+        """
+        return Validation(
+            space=space,
+            task=self.task,
+            system=self.system,
+            model=self.model,
+            synthesizer=self.synthesizer,
+            distance=self.distance,
+            start_tolerance=self.start_tolerance,
+        )
+
     # One task, step by step
 
     def plan(self, point: ArrayLike) -> Plan:

@@ -1,0 +1,264 @@
+r"""A region bound: the distance is at most a prediction plus a margin q, but for a share of the tasks.
+
+Let d_hat be a prediction of the distance that is fixed before N independent tasks are drawn, and let q be the
+(k+1)-th largest of d(p_i) - d_hat(p_i). The scenario bound holds for any function of the task, so also for the excess
+d - d_hat: with V = Pr(d(p) > d_hat(p) + q),
+
+    Pr(V > eps) <= sum_{i=0}^{k} binom(N, i) eps^i (1 - eps)^(N - i).
+
+A task whose distance is not known, or cannot be predicted, has an infinite excess. Split conformal prediction computes
+the same margin (Vovk 2012, "training-conditional" validity; Campi and Garatti 2011 for k > 0).
+
+The tasks with d_hat(p) + q <= tau are a map of where tau is kept. Its share is estimated from predicted tasks, which
+need no execution: of M tasks, j lie outside the map, and the Clopper-Pearson bound of their share is the same function
+of M, j and the confidence. The volume above tau is at most eps and this bound together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.registry import part
+from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
+from ctxval.certificates.bounds import at_most, of_tasks, require_count, require_probability
+from ctxval.certificates.draws import countable_draws, draws_left_out, how_drawn, not_counted
+from ctxval.certificates.forecast import Forecast
+from ctxval.certificates.learned import LearnedDistance, require_learned
+from ctxval.certificates.sample import Sample, advice_to_remeasure
+from ctxval.certificates.scenario import ABOUT_DRAWS, rests_on_draws, volume_bound
+from ctxval.core.space import TaskSpace
+from ctxval.errors import CertificateError
+
+_OF_MAP = 0.05
+"""Share of beta for the volume of the map; the rest is for the draws. Predictions cost no execution, draws do."""
+
+FROZEN = (
+    "the prediction was learned only from the model's own data and from trials before the first of these draws, and M "
+    "and the way of predicting were not changed after the draws were known"
+)
+"""The assumption that the prediction was fixed before the draws."""
+
+
+@part("region")
+@dataclass(frozen=True, repr=False)
+class Region(CertificateKind):
+    """Bound on the distance by a prediction and a margin, but for a share of the tasks; a map of where tau is kept.
+
+    Attributes:
+        discard: how many of the largest excesses are discarded; it must be chosen before the draws are known.
+        predictions: number M of tasks that are predicted to estimate the share of the tasks that keep the threshold.
+    """
+
+    name: ClassVar[str] = "region"
+    bounds_maximum: ClassVar[bool] = False
+    needs_model: ClassVar[bool] = True
+
+    discard: int = 0
+    predictions: int = 1000
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return :func:`certify_region` of the trials, without a threshold."""
+        return certify_region(sample, None, confidence, self)
+
+    def certify_against(
+        self, sample: Sample, threshold: float, confidence: float = 0.95
+    ) -> tuple[Certificate, Forecast | None]:
+        """Return :func:`certify_region` of the trials; nothing is forecast."""
+        return certify_region(sample, threshold, confidence, self), None
+
+    @classmethod
+    def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
+        """Return what it needs of the draws and of the prediction."""
+        return [*rests_on_draws(certificate), "a prediction that was fixed before these tasks were drawn"]
+
+    @classmethod
+    def shortfall(cls, certificate: Certificate) -> str:
+        """Return why the volume left out is not smaller: the map, and draws that do not count."""
+        return f"{_outside_the_map(certificate)}{draws_left_out(certificate)}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Margin:
+    """The margin of a prediction, from independent draws.
+
+    Attributes:
+        drawn: the draws that count.
+        before: number of the first of them; the prediction is learned from the trials below it.
+        value: q, the (k+1)-th largest excess d - d_hat, in the distance's units.
+        unpredicted: number of draws whose distance cannot be predicted.
+    """
+
+    drawn: Sample
+    before: int
+    value: float
+    unpredicted: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Map:
+    """Predicted bounds d_hat + q of independent tasks, against a limit.
+
+    Attributes:
+        limit: the limit; a threshold, or the largest bound that was predicted.
+        count: number M of tasks.
+        outside: number of the tasks whose bound exceeds the limit or cannot be predicted.
+        unpredicted: number of the tasks that cannot be predicted.
+    """
+
+    limit: float
+    count: int
+    outside: int
+    unpredicted: int
+
+    @property
+    def share(self) -> float:
+        """The estimated share of the tasks inside."""
+        return 1 - self.outside / self.count
+
+    @property
+    def error(self) -> float:
+        """The standard error of the share, with one more task on either side, so that it is never zero."""
+        smoothed = (self.outside + 1) / (self.count + 2)
+        return float(np.sqrt(smoothed * (1 - smoothed) / self.count))
+
+    def volume_outside(self, beta: float) -> float:
+        """Return an upper bound on the share outside, which is wrong with probability at most beta."""
+        return 1.0 if self.outside == self.count else volume_bound(self.count, self.outside, beta)
+
+
+def certify_region(
+    sample: Sample, threshold: float | None = None, confidence: float = 0.95, options: Region | None = None
+) -> Certificate:
+    """Bound the distance by a prediction plus a margin from independent draws, but for a share of the tasks.
+
+    With a threshold, the bound is the threshold, and the volume left out is that of the draws plus that of the tasks at
+    which the prediction plus the margin exceeds the threshold. Without one, the bound is the largest predicted one.
+
+    Args:
+        sample: trials of any origin, some of them independent draws, with what the experiment's model predicts.
+        threshold: tau, in the distance's units; None if there is none.
+        confidence: 1 - beta, the probability with which all of the statement holds.
+        options: the number of excesses to discard and the number of predicted tasks.
+
+    Raises:
+        CertificateError: if the experiment is not loaded, nothing can be predicted, there is no independent draw, the
+            number of draws depended on their distances, or more draws lack a distance or a prediction than are
+            discarded.
+    """
+    chosen = options or Region()
+    discard = require_count("discard", chosen.discard, 0)
+    require_count("predictions", chosen.predictions, 1)
+    beta = 1 - require_probability("confidence", confidence)
+    learned = require_learned(sample, "region")
+    margin = _margin_of(sample, learned, discard)
+    volume = volume_bound(len(margin.drawn), discard, (1 - _OF_MAP) * beta)
+    tasks = learned.tasks(chosen.predictions, margin.before)
+    mapped = _map_of(learned.expected(tasks, margin.before) + margin.value, threshold)
+    total = min(1.0, volume + mapped.volume_outside(_OF_MAP * beta))
+    return Certificate(
+        kind="region",
+        statement=_statement(sample, margin, volume, mapped, total, confidence, threshold is not None),
+        upper_bound=mapped.limit,
+        confidence=confidence,
+        volume=total,
+        trials=len(margin.drawn),
+        assumptions=(
+            *how_drawn(sample, margin.drawn),
+            "the number discarded was chosen before the draws were known",
+            FROZEN,
+            *ABOUT_DRAWS,
+            *sample.remarks,
+            ONE_CAMPAIGN,
+        ),
+        details=_details(sample, margin, volume, mapped, discard),
+        distribution=sample.distribution,
+    )
+
+
+def _margin_of(sample: Sample, learned: LearnedDistance, discard: int) -> _Margin:
+    """Return the margin of the prediction from the trials before the draws that count.
+
+    Raises:
+        CertificateError: under the conditions of :func:`certify_region`.
+    """
+    drawn = countable_draws(sample, "a region bound")
+    before = min(drawn.numbers)
+    predicted = learned.expected(drawn.points, before)
+    if np.isnan(predicted).all():
+        raise CertificateError(
+            f"nothing can be predicted from the trials before trial {before}, the first of these draws: execute tasks "
+            "of a search before the audit, or say --kind audit, which needs no prediction."
+        )
+    if discard >= len(drawn):
+        raise CertificateError(f"of {len(drawn)} draws, from 0 to {len(drawn) - 1} can be discarded, not {discard}.")
+    excess = np.sort(np.nan_to_num(drawn.distances - predicted, nan=np.inf))
+    unpredicted = int((np.isnan(predicted) & ~np.isnan(drawn.distances)).sum())
+    if not np.isfinite(excess[-1 - discard]):
+        raise CertificateError(
+            f"{drawn.failed} of {len(drawn)} draws have no distance and {unpredicted} have no prediction, more than "
+            f"the {discard} discarded; nothing bounds the distance there.{advice_to_remeasure(drawn)}"
+        )
+    return _Margin(drawn, before, float(excess[-1 - discard]), unpredicted)
+
+
+def _map_of(bounds: Array, threshold: float | None) -> _Map:
+    """Return the map of predicted bounds ``(M,)``, which are NaN if a task cannot be predicted."""
+    known = bounds[~np.isnan(bounds)]
+    limit = float(known.max(initial=-np.inf)) if threshold is None else float(threshold)
+    return _Map(limit, len(bounds), int((~(bounds <= limit)).sum()), len(bounds) - len(known))
+
+
+def _statement(
+    sample: Sample, margin: _Margin, volume: float, mapped: _Map, total: float, confidence: float, against: bool
+) -> str:
+    tasks, q = of_tasks(sample.distribution), margin.value
+    excess = (
+        f"exceeds the predicted one by at most {at_most(q)}"
+        if q >= 0
+        else (f"is below the predicted one by at least {at_most(q).removeprefix('-')}")
+    )
+    held = (
+        f"With confidence {confidence}, the distance {excess}, except on at most {at_most(100 * volume, 3)} % {tasks}; "
+    )
+    share, error = f"{100 * mapped.share:.4g} ± {at_most(100 * mapped.error, 2)} %", f"{mapped.count} predicted tasks"
+    if against:
+        kept = f"this prediction keeps {mapped.limit:.6g} on {share} {tasks} (an estimate from {error})"
+    else:
+        kept = f"this prediction is at most {at_most(mapped.limit)} on each of {error} that it covers"
+    return (
+        f"{held}{kept}, so that the distance exceeds {at_most(mapped.limit)} on at most {at_most(100 * total, 3)} % in "
+        "all."
+    )
+
+
+def _details(sample: Sample, margin: _Margin, volume: float, mapped: _Map, discard: int) -> dict[str, Any]:
+    return {
+        "margin": margin.value,
+        "discarded": discard,
+        "draws": len(margin.drawn),
+        "volume_of_draws": volume,
+        "learned_before": margin.before,
+        "predictions": mapped.count,
+        "share_kept": mapped.share,
+        "share_error": mapped.error,
+        "unpredicted_draws": margin.unpredicted,
+        "unpredicted_tasks": mapped.unpredicted,
+        "largest_drawn": margin.drawn.best if np.isfinite(margin.drawn.best) else None,
+        "not_counted": not_counted(sample, margin.drawn),
+        "failed": sample.failed,
+        "failures": sample.failures,
+    }
+
+
+def _outside_the_map(certificate: Certificate) -> str:
+    details = certificate.details
+    if "share_kept" not in details:
+        return ""
+    return (
+        f" ({at_most(100 * details['volume_of_draws'], 3)} % because of the number of draws, and the rest because the "
+        "prediction plus its margin exceeds the threshold there)"
+    )

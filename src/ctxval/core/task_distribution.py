@@ -1,0 +1,245 @@
+"""The distribution of the tasks over a task space, if it is not the uniform one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats
+from ctxval._util.describe import describe
+from ctxval._util.representation import record
+from ctxval._util.texts import shortened
+from ctxval.errors import InputError
+
+Sampler = Callable[[np.random.Generator, int], ArrayLike]
+"""``(rng, n)`` -> n independent tasks, rows ``(n, d)`` in the units of the task space."""
+
+_LEAST_MASS = 1e-12
+"""Least probability that a distribution must have within the bounds of its parameter."""
+
+_LONGEST = 400
+"""Characters of the text of a distribution."""
+
+
+@runtime_checkable
+class Continuous(Protocol):
+    """A distribution of one parameter, such as a frozen distribution of ``scipy.stats``; arrays broadcast."""
+
+    def cdf(self, x: Any) -> Any:
+        """Return the probability of values up to x."""
+
+    def sf(self, x: Any) -> Any:
+        """Return the probability of values above x."""
+
+    def ppf(self, q: Any) -> Any:
+        """Return the inverse of ``cdf``."""
+
+    def isf(self, q: Any) -> Any:
+        """Return the inverse of ``sf``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """The normal distribution of a task parameter; a task space truncates it to the parameter's bounds.
+
+    Args:
+        mean: the mean, before the truncation, in the parameter's units; one number, or one for each component.
+        deviation: the standard deviation, before the truncation, in the same form.
+
+    Raises:
+        InputError: if they are not finite, or if a standard deviation is not positive.
+    """
+
+    mean: ArrayLike
+    deviation: ArrayLike
+
+    def __post_init__(self) -> None:
+        as_finite("the mean of a normal distribution", self.mean)
+        if not (as_finite("the deviation of a normal distribution", self.deviation) > 0).all():
+            raise InputError(f"the deviation of a normal distribution must be positive, got {self.deviation!r}.")
+
+    def cdf(self, x: ArrayLike) -> Array:
+        """Return the probability of values up to x."""
+        return np.asarray(ndtr(self._standard(x)))
+
+    def sf(self, x: ArrayLike) -> Array:
+        """Return the probability of values above x."""
+        return np.asarray(ndtr(-self._standard(x)))
+
+    def ppf(self, q: ArrayLike) -> Array:
+        """Return the value that is exceeded with probability 1 - q."""
+        return np.asarray(self._floats[0] + self._floats[1] * ndtri(q))
+
+    def isf(self, q: ArrayLike) -> Array:
+        """Return the value that is exceeded with probability q."""
+        return np.asarray(self._floats[0] - self._floats[1] * ndtri(q))
+
+    @property
+    def _floats(self) -> tuple[Array, Array]:
+        return as_floats("mean", self.mean), as_floats("deviation", self.deviation)
+
+    def _standard(self, x: ArrayLike) -> Array:
+        mean, deviation = self._floats
+        return np.asarray((as_floats("x", x) - mean) / deviation)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies the distribution in a store."""
+        mean, deviation = self._floats
+        return {"mean": mean.tolist(), "deviation": deviation.tolist()}
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+class TaskDistribution(Protocol):
+    """A distribution of tasks over a box."""
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """Return n independent tasks, rows ``(n, d)`` in the units of the task space."""
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies the distribution in a store, ready for JSON."""
+
+
+@dataclass(frozen=True, eq=False)
+class ByParameter:
+    """Independent task parameters: some with a distribution that is truncated to its bounds, all others uniform.
+
+    Attributes:
+        low, high: the bounds of the task space, shape ``(d,)``.
+        columns: the columns of each parameter that has a distribution.
+        distributions: the distribution of each of these parameters.
+
+    Raises:
+        InputError: if a distribution is none of a continuous variable, does not fit the shape of its parameter, or has
+            no probability within its bounds.
+    """
+
+    low: Array
+    high: Array
+    columns: Mapping[str, slice]
+    distributions: Mapping[str, Continuous]
+
+    def __post_init__(self) -> None:
+        for name, one in self.distributions.items():
+            if not _is_continuous(one):
+                raise InputError(
+                    f"the distribution of {name} must be a Normal or a frozen continuous distribution of scipy.stats, "
+                    f"such as scipy.stats.expon(scale=2.0), got {one!r}."
+                )
+            self._require_mass(name, one)
+
+    def _require_mass(self, name: str, one: Continuous) -> None:
+        low, high = self.low[self.columns[name]], self.high[self.columns[name]]
+        try:
+            mass = np.maximum(one.cdf(high) - one.cdf(low), one.sf(low) - one.sf(high)) * np.ones(len(low))
+            fits = np.shape(mass) == np.shape(low)
+        except ValueError:
+            fits = False
+        if not fits:
+            raise InputError(f"the distribution of {name} must have one component or {len(low)}, got {one!r}.")
+        if not (mass > _LEAST_MASS).all():
+            raise InputError(f"the distribution of {name} has no probability within its bounds.")
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """Return n independent tasks, rows ``(n, d)`` in the units of the task space."""
+        shares = rng.random((n, len(self.low)))
+        points = self.low + shares * (self.high - self.low)
+        for name, one in self.distributions.items():
+            at = self.columns[name]
+            points[:, at] = _quantiles(one, shares[:, at], self.low[at], self.high[at])
+        return points
+
+    def describe(self) -> dict[str, Any]:
+        """Return the distribution of each parameter that has one, by name."""
+        return {name: _described(one) for name, one in self.distributions.items()}
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True, eq=False)
+class BySampler:
+    """Tasks that a function draws.
+
+    Attributes:
+        low, high: the bounds of the task space, shape ``(d,)``.
+        sampler: ``(rng, n)`` -> n independent tasks, rows ``(n, d)`` in the units of the task space.
+    """
+
+    low: Array
+    high: Array
+    sampler: Sampler
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """Return n independent tasks, rows ``(n, d)`` in the units of the task space.
+
+        Raises:
+            InputError: if the sampler returns something else.
+        """
+        points = as_finite("what the sampler of tasks returns", self.sampler(rng, n))
+        if points.shape != (n, len(self.low)):
+            raise InputError(f"the sampler of tasks must return the shape ({n}, {len(self.low)}), got {points.shape}.")
+        if ((points < self.low) | (points > self.high)).any():
+            raise InputError("the sampler of tasks returned a task outside the bounds of the task space.")
+        return points
+
+    def describe(self) -> dict[str, Any]:
+        """Return the description of the sampler's code."""
+        return {"sampler": describe(self.sampler)}
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def distribution_text(described: object) -> str:
+    """Return a distribution of tasks as a text for a person, from its description in a store."""
+    if not isinstance(described, Mapping):
+        return shortened(str(described), _LONGEST)
+    if "sampler" in described:
+        sampler = described["sampler"]
+        name = sampler.get("function", sampler.get("type")) if isinstance(sampler, Mapping) else sampler
+        return shortened(f"tasks from the sampler {name}", _LONGEST)
+    found = [f"{name} {_marginal_text(one)}" for name, one in described.items()]
+    return shortened(", ".join([*found, "all else uniform"]), _LONGEST)
+
+
+def _marginal_text(described: Any) -> str:
+    if not isinstance(described, Mapping):
+        return str(described)
+    numbers = ", ".join(f"{key} {value}" for key, value in described.items() if key != "type" and value not in ([], {}))
+    return f"{described.get('type')} ({numbers})"
+
+
+def _described(one: Any) -> dict[str, Any]:
+    if isinstance(one, Normal):
+        return {"type": "normal", **one.describe()}
+    if not _of_scipy(one):
+        return dict(describe(one))
+    plain = describe({"arguments": list(one.args), "options": dict(one.kwds)})
+    return {"type": f"scipy.stats.{one.dist.name}", **plain}
+
+
+def _is_continuous(one: object) -> bool:
+    return isinstance(one, Continuous) and (not _of_scipy(one) or hasattr(getattr(one, "dist", None), "pdf"))
+
+
+def _of_scipy(one: object) -> bool:
+    """Return whether an object is a frozen distribution of ``scipy.stats``."""
+    return hasattr(one, "dist") and hasattr(one, "kwds")
+
+
+def _quantiles(one: Continuous, shares: Array, low: Array, high: Array) -> Array:
+    """Return the quantiles of a distribution that is truncated to its bounds.
+
+    Above the median they are computed from the upper tail, because ``cdf`` is rounded to 1 there.
+    """
+    below, above = one.cdf(low), one.sf(high)
+    from_below = one.ppf(below + shares * (one.cdf(high) - below))
+    from_above = one.isf(above + (1 - shares) * (one.sf(low) - above))
+    found = as_floats("a task", np.where(below > 0.5, from_above, from_below))
+    return np.clip(found, low, high)
