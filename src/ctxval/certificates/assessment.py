@@ -83,7 +83,7 @@ def _certificate(
     trials: Sequence[Trial], options: CertificateOptions, known: Provenance, threshold: float | None = None
 ) -> Certificate:
     sample, kind = known.sample(trials), options.kind
-    if threshold is not None and kind.needs_threshold:
+    if threshold is not None and (kind.needs_threshold or kind.uses_threshold):
         found, _ = kind.certify_against(sample, threshold, options.confidence)
     else:
         found = kind.certify(sample, options.confidence)

@@ -137,6 +137,9 @@ class CertificateKind(ABC):
     needs_threshold: ClassVar[bool] = False
     """Whether its statement is about a threshold, so that there is none without one."""
 
+    uses_threshold: ClassVar[bool] = False
+    """Whether its statement is about a threshold if there is one, and about the distance alone if there is none."""
+
     needs_model: ClassVar[bool] = False
     """Whether it uses what the experiment's model predicts, so that the experiment must be loaded."""
 

@@ -55,6 +55,7 @@ class Region(CertificateKind):
 
     name: ClassVar[str] = "region"
     bounds_maximum: ClassVar[bool] = False
+    uses_threshold: ClassVar[bool] = True
     needs_model: ClassVar[bool] = True
 
     discard: int = 0

@@ -40,14 +40,14 @@ Volume = Annotated[
     float | None,
     typer.Option(
         help="Share of the task space, from 0 to 0.5, that may exceed the threshold (default: 0). Only for "
-        "--kind audit, scenario and sampling-discarding."
+        "--kind anytime, audit, region, scenario and sampling-discarding."
     ),
 ]
 Discard = Annotated[
     int | None,
     typer.Option(
-        help="Number of largest distances to discard. Choose it before the distances are known. Only for --kind "
-        "sampling-discarding, which needs it."
+        help="Number of largest distances to discard, or for --kind region of largest errors of the prediction. Choose "
+        "it before the distances are known. Only for --kind region and sampling-discarding, which needs it."
     ),
 ]
 Constant = Annotated[

@@ -1,0 +1,139 @@
+"""Independent draws follow the distribution of tasks, and every text says what a volume then is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from conftest import make_validation
+from ctxval import Campaign, Normal, Validation, searches
+from ctxval.certificates import AnytimeAudit, Audit, CertificateKind, CertificateOptions, Region, Scenario
+from ctxval.cli import app
+from ctxval.config.settings import read_settings
+from ctxval.core.space import DISTRIBUTION
+from ctxval.errors import CtxvalError, InputError, StoreMismatchError, UnknownNameError
+
+NARROW = Normal(1.0, 0.05)
+"""The bounds of the goal are -3 and 3."""
+
+
+def narrow() -> Validation:
+    whole = make_validation()
+    return whole.with_space(whole.space.distributed(goal=NARROW))
+
+
+def goals(campaign: Campaign) -> np.ndarray:
+    return np.array([trial.parameters["goal"] for trial in campaign.trials if trial.origin == "iid"])
+
+
+def test_audits_asked_draws_and_a_random_search_follow_it_and_searches_do_not() -> None:
+    audited = Campaign(narrow(), search=searches.CMAES(), seed=2).run(4).audit(6)
+    asked = audited.ask(draw=True)
+    drawn = Campaign(narrow(), search=searches.Random(), seed=2).run(10)
+    assert len(goals(audited)) == 7
+    assert len(goals(drawn)) == 10
+    for found in (goals(audited), goals(drawn), np.array([asked.trial.parameters["goal"]])):
+        assert (np.abs(found - 1.0) < 0.3).all()
+    assert len(np.unique(goals(drawn))) == 10
+    searched = np.array([trial.parameters["goal"] for trial in audited.trials if trial.origin != "iid"])
+    assert np.abs(searched - 1.0).max() > 0.3
+
+
+def test_a_resumed_random_search_draws_the_same_tasks(tmp_path: Path) -> None:
+    whole = Campaign(narrow(), search=searches.Random(), seed=2).run(6)
+    Campaign(narrow(), search=searches.Random(), seed=2, store=tmp_path / "a.sqlite").run(3)
+    resumed = Campaign(narrow(), search=searches.Random(), seed=2, store=tmp_path / "a.sqlite").run(6)
+    np.testing.assert_array_equal(goals(resumed), goals(whole))
+    assert [trial.note for trial in resumed.trials[3:]] == [{"draws": 6}] * 3
+
+
+def test_a_store_keeps_it_and_refuses_another_one(tmp_path: Path) -> None:
+    made = Campaign(narrow(), search=searches.Random(), seed=2, store=tmp_path / "a.sqlite").run(2)
+    assert made.store.description()["validation"]["space"][DISTRIBUTION]["goal"]["deviation"] == 0.05
+    plain = Campaign(make_validation(), search=searches.Random(), seed=2).run(1)
+    assert DISTRIBUTION not in plain.store.description()["validation"]["space"]
+    with pytest.raises(StoreMismatchError, match="space"):
+        Campaign(make_validation(), search=searches.Random(), seed=2, store=tmp_path / "a.sqlite")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [Audit(), AnytimeAudit(), Scenario(), Region()])
+def test_every_text_says_that_a_volume_is_a_probability_under_it(kind: CertificateKind) -> None:
+    campaign = Campaign(narrow(), search=searches.Random(), seed=2).run(40)
+    accepted = campaign.verdict(1e3, certificate=CertificateOptions(kind, volume=0.4))
+    refused = campaign.verdict(1e3, certificate=CertificateOptions(kind, volume=0.01))
+    assert accepted.answer == "validated"
+    assert accepted.certificate is not None
+    for text in (accepted.reason, refused.reason, accepted.certificate.statement):
+        assert "of the probability under the stated distribution of tasks" in text
+        assert "of the task space" not in text
+    stated = " ".join(accepted.certificate.assumptions)
+    assert "follow the stated distribution of tasks (goal normal (mean 1.0, deviation 0.05), all else" in stated
+    assert "uniform over the task space" not in stated
+    assert accepted.certificate.to_json()["distribution"].startswith("goal normal")
+
+
+@pytest.mark.slow
+def test_predicted_tasks_follow_it_too() -> None:
+    campaign = Campaign(narrow(), search=searches.Auto(), seed=2).run(6).audit(30)
+    learned = campaign.provenance.learned
+    assert learned is not None
+    tasks = campaign.validation.space.from_unit(learned.tasks(2000, 6))[:, 0]
+    assert np.abs(tasks.mean() - 1.0) < 0.01
+    assert tasks.std() == pytest.approx(0.05, rel=0.1)
+
+
+FILE = """
+experiment = "pendulum"
+[search]
+name = "random"
+[distribution]
+goal = { type = "normal", mean = 0.5, deviation = 0.1 }
+"""
+
+
+@pytest.mark.slow
+def test_an_experiment_file_states_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("p.toml").write_text(FILE)
+    invoke = CliRunner().invoke
+    assert invoke(app, ["run", "p.toml", "--budget", "5", "--store", "p.sqlite"]).exit_code == 0
+    shown = invoke(app, ["certify", "p.sqlite", "--kind", "scenario"])
+    assert shown.exit_code == 0, shown.output
+    text = " ".join(shown.output.split())
+    assert "of the probability under the stated distribution of tasks has a distance above" in text
+    assert "(goal normal (mean 0.5, deviation 0.1), all else uniform)" in text
+    space = read_settings("p.toml", {}).load().validation.space
+    assert np.abs(space.iid(200, np.random.default_rng(0)) - 0.5).max() < 0.6
+
+
+@pytest.mark.parametrize(
+    ("table", "error", "message"),
+    [
+        ('goal = { type = "normal", mean = 0.5 }', InputError, "needs a mean and a deviation"),
+        ('goal = { type = "norml", mean = 0.5, deviation = 1 }', UnknownNameError, "did you mean 'normal'"),
+        (
+            'goal = { type = "normal", mean = 0.5, sigma = 1 }',
+            UnknownNameError,
+            "no argument of the distribution of goal",
+        ),
+        ('gaol = { type = "uniform" }', UnknownNameError, "did you mean 'goal'"),
+        ('goal = { type = "normal", mean = "x", deviation = 1 }', InputError, "the mean of a normal distribution"),
+    ],
+)
+def test_a_wrong_distribution_in_a_file_is_named(
+    tmp_path: Path, table: str, error: type[CtxvalError], message: str
+) -> None:
+    file = tmp_path / "p.toml"
+    file.write_text(FILE.partition("goal")[0] + table)
+    with pytest.raises(error, match=message):
+        read_settings(str(file), {}).load()
+
+
+def test_uniform_may_be_stated(tmp_path: Path) -> None:
+    file = tmp_path / "p.toml"
+    file.write_text(FILE.partition("goal")[0] + 'goal = { type = "uniform" }')
+    assert read_settings(str(file), {}).load().validation.space.distribution is None
