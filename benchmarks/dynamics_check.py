@@ -20,7 +20,7 @@ COUNT = 20000
 
 
 def sample(entry: Entry, seed: int, count: int = COUNT) -> tuple[Array, Array]:
-    """Return distances ``(N,)`` at random tasks, with and without the mechanism; the second are NaN if there is none."""
+    """Return distances ``(N,)`` at random tasks, with and without the mechanism; NaN if there is none."""
     validation = entry(seed).validation
     points = validation.space.iid(count, np.random.default_rng(0))
     values = validation.distances(points)

@@ -1,12 +1,11 @@
 """The systems on which a certificate from learned dynamics is developed: thresholds may be chosen on these.
 
-Nothing may be chosen on those of ``dynamics_reporting.py``. The three systems of ``misleading.py`` and the paper's cases
-belong to the development too. What the docstrings say of shares of tasks is measured by ``dynamics_check.py``.
+Nothing may be chosen on those of ``dynamics_reporting.py``. The systems of ``misleading.py`` and the paper's cases belong
+to the development too. What the docstrings say of shares of tasks is measured by ``dynamics_check.py``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -93,9 +92,7 @@ def cart_pole(seed: int) -> Experiment:
         space=TaskSpace(
             position=(-1, 1, "m"), angle=(-0.35, 0.35, "rad"), rate=(-0.6, 0.6, "rad/s"), goal=(-1, 1, "m")
         ),
-        task=lambda p: Task(
-            [p.position, p.angle, 0.0, p.rate], goal=[p.goal, 0.0, 0.0, 0.0], horizon=horizon, dt=dt
-        ),
+        task=lambda p: Task([p.position, p.angle, 0.0, p.rate], goal=[p.goal, 0.0, 0.0, 0.0], horizon=horizon, dt=dt),
         system=system,
         model=models.Linear.fit(record(system, [-1, -0.1, -0.3, -0.1], [1, 0.1, 0.3, 0.1], [2.0], dt, seed, steps=8)),
         synthesizer=controllers.LQR([3.0, 1.0, 0.3, 0.3], [0.05]),
@@ -262,9 +259,7 @@ def gust_zone(seed: int, push: float = 6.0) -> Experiment:
     return experiment(
         "gust-zone",
         "m",
-        space=TaskSpace(
-            start=(-1, 1, "m"), speed=(-1.5, 1.5, "m/s"), goal=(-1, 1.2, "m"), weight=(0.5, 1.0)
-        ),
+        space=TaskSpace(start=(-1, 1, "m"), speed=(-1.5, 1.5, "m/s"), goal=(-1, 1.2, "m"), weight=(0.5, 1.0)),
         task=lambda p: Task([p.start, p.speed], goal=[p.goal * p.weight, 0.0], horizon=horizon, dt=dt),
         system=system,
         model=models.Linear.fit(record(system, [-1, -0.5], [0, 0.5], [1.0], dt, seed)),
@@ -314,9 +309,7 @@ def weak_motor(seed: int, limit: float = 3.5) -> Experiment:
     return experiment(
         "weak-motor",
         "m",
-        space=TaskSpace(
-            start=(-1, 1, "m"), speed=(-1, 1, "m/s"), goal=(-1.5, 1.5, "m"), amplitude=(0, 0.5, "m")
-        ),
+        space=TaskSpace(start=(-1, 1, "m"), speed=(-1, 1, "m/s"), goal=(-1.5, 1.5, "m"), amplitude=(0, 0.5, "m")),
         task=lift,
         system=system,
         model=models.Linear.fit(record(system, [-1, -0.5], [1, 0.5], [2.0], dt, seed)),
@@ -325,29 +318,16 @@ def weak_motor(seed: int, limit: float = 3.5) -> Experiment:
     )
 
 
-@dataclass(frozen=True)
-class Gate:
-    """A gate in the wind, which turns against a post.
-
-    Attributes:
-        post: rad; where it stands.
-        stiffness: of the post over the gate's inertia, 1/s^2.
-    """
-
-    post: float = 1.15
-    stiffness: float = 900.0
-
-    def derivative(self, x: Array, u: Array) -> Array:
-        """Return the rates of (angle, rate)."""
-        angle, rate = x[..., 0], x[..., 1]
-        depth = np.maximum(angle - self.post, 0.0)
-        return np.stack([rate, u[..., 0] - rate + 0.6 * np.cos(2 * angle) - self.stiffness * depth], axis=-1)
-
-
-def gate_at_post(seed: int, gate: Gate = Gate()) -> Experiment:  # noqa: B008
+def gate_at_post(seed: int, stiffness: float = 900.0) -> Experiment:
     """Return a gate that a few tasks bring to a post beyond their goals. 3-D."""
-    dt, horizon = 0.05, 40
-    system = simulated(gate.derivative, dt, substeps=2)
+    dt, horizon, post = 0.05, 40, 1.15
+
+    def derivative(x: Array, u: Array) -> Array:
+        angle, rate = x[..., 0], x[..., 1]
+        depth = np.maximum(angle - post, 0.0)
+        return np.stack([rate, u[..., 0] - rate + 0.6 * np.cos(2 * angle) - stiffness * depth], axis=-1)
+
+    system = simulated(derivative, dt, substeps=2)
     return experiment(
         "gate-at-post",
         "rad",
@@ -403,20 +383,20 @@ PAPER = listed(
 DEVELOPMENT = listed(
     Entry("hanging-pendulum", "smooth", hanging_pendulum),
     Entry("two-tanks", "smooth", two_tanks),
-    Entry("cart-pole", "smooth", cart_pole),
-    Entry("hard-springs", "smooth", hard_springs),
+    Entry("cart-pole", "smooth", cart_pole, seeds=5),
+    Entry("hard-springs", "smooth", hard_springs, seeds=5),
     Entry("trailer", "smooth", trailer),
     Entry("wavy-field", "prior", wavy_field),
-    Entry("lagging-valve", "hidden", lagging_valve, True, partial(lagging_valve, lag=0.02)),
+    Entry("lagging-valve", "hidden", lagging_valve, True, partial(lagging_valve, lag=0.02), seeds=5),
     Entry("sticky-slide", "stick-slip", sticky_slide, True, partial(sticky_slide, dry=0.0, extra=0.0)),
     Entry("gust-zone", "switch", gust_zone, True, partial(gust_zone, push=0.0)),
     Entry("balance-at-limit", "cliff", balance_at_limit, True, partial(balance_at_limit, heavier=1.0)),
     Entry("weak-motor", "saturation", weak_motor, True, partial(weak_motor, limit=np.inf)),
-    Entry("gate-at-post", "contact", gate_at_post, True, partial(gate_at_post, gate=Gate(stiffness=0.0))),
+    Entry("gate-at-post", "contact", gate_at_post, True, partial(gate_at_post, stiffness=0.0)),
     Entry(
         "noisy-oven", "noise", noisy_oven, without=partial(noisy_oven, deviation=(0.0, 0.0)), noise=OVEN_NOISE, seeds=5
     ),
-    Entry("hidden-heat", "hidden", misleading.hidden_heat, True),
-    Entry("hidden-load", "hidden", misleading.hidden_load, True),
-    Entry("corner-stop", "contact", misleading.corner_stop, True),
+    Entry("hidden-heat", "hidden", misleading.hidden_heat, True, seeds=5),
+    Entry("hidden-load", "hidden", misleading.hidden_load, True, seeds=5),
+    Entry("corner-stop", "contact", misleading.corner_stop, True, seeds=5),
 )

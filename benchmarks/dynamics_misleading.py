@@ -190,7 +190,7 @@ def icy_corner(seed: int, hold: float = 0.15) -> Experiment:
     )
 
 
-def over_the_hill(seed: int, height: float = 1.03, engine: float = 1.2) -> Experiment:
+def over_the_hill(seed: int, height: float = 1.03, engine: float = 1.21) -> Experiment:
     """Return a truck that takes a hill by its run-up; M takes it in all tasks, S rolls back in a few. 3-D."""
     dt, horizon = 0.1, 60
     known = float(np.random.default_rng([seed, 37]).uniform(0.99, 1.0))
@@ -231,9 +231,7 @@ def gravel_rover(seed: int, deviation: tuple[float, ...] = ROVER_NOISE) -> Exper
     return experiment(
         "gravel-rover",
         "m",
-        space=TaskSpace(
-            y=(-1, 1, "m"), heading=(-1.2, 1.2, "rad"), goal_x=(5, 7, "m"), goal_y=(-1.5, 1.5, "m")
-        ),
+        space=TaskSpace(y=(-1, 1, "m"), heading=(-1.2, 1.2, "rad"), goal_x=(5, 7, "m"), goal_y=(-1.5, 1.5, "m")),
         task=lambda p: Task([0.0, p.y, p.heading], goal=[p.goal_x, p.goal_y, 0.0], horizon=horizon, dt=dt),
         system=Noisy(systems.rk4(partial(derivative, 0.3, 0.9), dt), deviation, seed),
         model=simulated(partial(derivative, 0.0, gain), dt).model,
@@ -271,12 +269,12 @@ def windy_vane(seed: int, deviation: tuple[float, ...] = (0.0, 0.12)) -> Experim
 
 
 MISLEADING = (
-    Entry("crane", "hidden", crane, True, partial(crane, payload=0.0)),
+    Entry("crane", "hidden", crane, True, partial(crane, payload=0.0), seeds=5),
     Entry("backlash", "hidden", backlash, True, partial(backlash, play=0.0)),
     Entry("oblique-wall", "contact", oblique_wall, True, partial(oblique_wall, stiffness=0.0), seeds=5),
-    Entry("dry-sled", "stick-slip", dry_sled, True, partial(dry_sled, grip=0.0)),
+    Entry("dry-sled", "stick-slip", dry_sled, True, partial(dry_sled, grip=0.0), seeds=5),
     Entry("full-wheel", "saturation", full_wheel, True, partial(full_wheel, limit=np.inf)),
-    Entry("icy-corner", "switch", icy_corner, True, partial(icy_corner, hold=1.0)),
+    Entry("icy-corner", "switch", icy_corner, True, partial(icy_corner, hold=1.0), seeds=5),
     Entry("over-the-hill", "cliff", over_the_hill, True, partial(over_the_hill, height=1.0)),
     Entry(
         "gravel-rover",

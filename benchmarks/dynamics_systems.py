@@ -28,7 +28,7 @@ class Entry:
 
     Attributes:
         name: of the entry, in files and tables.
-        family: one of ``FAMILIES``; paper's cases are ``smooth``.
+        family: one of ``FAMILIES``; the paper's cases are ``smooth``.
         make: the experiment of a seed, which draws the data of M; in the family ``prior`` also the system.
         misleading: whether an assumption of a certificate from learned dynamics does not hold.
         without: the experiment without the mechanism that misleads; None if there is none.
@@ -124,7 +124,7 @@ def record(
     rollouts: int = 30,
     steps: int = 20,
 ) -> Transitions:
-    """Return short runs from seeded random states in a box, under seeded random inputs within plus and minus a limit."""
+    """Return short runs from seeded random states in a box, under seeded random inputs within their limits."""
     rng = np.random.default_rng(seed)
     start = rng.uniform(low, high, (rollouts, len(low)))
     forces = rng.uniform(-1, 1, (steps, rollouts, len(inputs))) * np.asarray(inputs)

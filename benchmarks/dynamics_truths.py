@@ -34,7 +34,7 @@ ENTRIES = {**DEVELOPMENT, **REPORTING}
 REALISATIONS = 8
 AGREEMENT, LEAST, MOST = 2e-3, 3, 8
 """Relative difference of the repeats that ends the search, and the fewest and the most repeats."""
-SAMPLES, NICHES, GENERATIONS = 60000, 20, 20
+SAMPLES, NICHES, GENERATIONS = 66000, 20, 20
 STEP = 1e-6
 """Of central differences, in widths of the unit cube."""
 
