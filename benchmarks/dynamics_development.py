@@ -1,7 +1,8 @@
 """The systems on which a certificate from learned dynamics is developed: thresholds may be chosen on these.
 
-Nothing may be chosen on those of ``dynamics_reporting.py``. The systems of ``misleading.py`` and the paper's cases belong
-to the development too. What the docstrings say of shares of tasks is measured by ``dynamics_check.py``.
+Nothing may be chosen on those of ``dynamics_reporting.py``. The systems of ``misleading.py`` and the paper's cases are
+development systems too. Shares of tasks in docstrings are those of 20,000 random tasks in ``dynamics_check.py``: the
+mechanism changes their distance by more than a quarter of the median distance without it.
 """
 
 from __future__ import annotations
@@ -195,7 +196,10 @@ def wavy_field(seed: int) -> Experiment:
 
 
 def lagging_valve(seed: int, lag: float = 0.12) -> Experiment:
-    """Return a boom moved by a valve whose opening lags behind the command and is not recorded. 4-D."""
+    """Return a boom moved by a valve whose opening lags behind the command and is not recorded. 4-D.
+
+    The lag changes 75 % of the tasks, and the largest distance 1.5 times.
+    """
     dt, horizon = 0.05, 50
 
     def derivative(x: Array, u: Array) -> Array:
@@ -223,7 +227,10 @@ def lagging_valve(seed: int, lag: float = 0.12) -> Experiment:
 
 
 def sticky_slide(seed: int, dry: float = 0.6, extra: float = 1.2) -> Experiment:
-    """Return a slide with dry friction that is larger at rest than in motion; M is learned in motion. 3-D."""
+    """Return a slide with dry friction that is larger at rest than in motion; M is learned in motion. 3-D.
+
+    The friction changes 96 % of the tasks, and the largest distance hardly.
+    """
     dt, horizon, substeps = 0.05, 40, 4
     h = dt / substeps
 
@@ -247,7 +254,10 @@ def sticky_slide(seed: int, dry: float = 0.6, extra: float = 1.2) -> Experiment:
 
 
 def gust_zone(seed: int, push: float = 6.0) -> Experiment:
-    """Return a trolley that meets a gust where it is far out and fast at once, 1 task in 200. 4-D."""
+    """Return a trolley that meets a gust where it is far out and fast at once. 4-D.
+
+    The gust changes 2 % of the tasks, and the largest distance 17 times.
+    """
     dt, horizon = 0.05, 40
 
     def derivative(x: Array, u: Array) -> Array:
@@ -269,7 +279,10 @@ def gust_zone(seed: int, push: float = 6.0) -> Experiment:
 
 
 def balance_at_limit(seed: int, heavier: float = 1.03) -> Experiment:
-    """Return an inverted pendulum with little torque; M saves all tasks, S, a little heavier, not all. 3-D."""
+    """Return an inverted pendulum with little torque; M saves nearly all tasks, S, a little heavier, fewer. 3-D.
+
+    Distances are above 0.5 rad in 8 of 10,000 tasks, and 0.0005 rad in the median.
+    """
     dt, horizon = 0.05, 50
 
     def derivative(weight: float, x: Array, u: Array) -> Array:
@@ -295,7 +308,10 @@ def _balance(t: int, x: Array, task: Task) -> Array:
 
 
 def weak_motor(seed: int, limit: float = 3.5) -> Experiment:
-    """Return a hoist whose motor gives no more than 3.5 m/s^2, which M does not know. 4-D."""
+    """Return a hoist whose motor gives no more than 3.5 m/s^2, which M does not know. 4-D.
+
+    The limit changes 8 % of the tasks, and the largest distance 3 times.
+    """
     dt, horizon = 0.05, 40
 
     def derivative(x: Array, u: Array) -> Array:
@@ -319,7 +335,10 @@ def weak_motor(seed: int, limit: float = 3.5) -> Experiment:
 
 
 def gate_at_post(seed: int, stiffness: float = 900.0) -> Experiment:
-    """Return a gate that a few tasks bring to a post beyond their goals. 3-D."""
+    """Return a gate that a few tasks bring to a post beyond their goals. 3-D.
+
+    The post changes 0.4 % of the tasks, and the largest distance twice.
+    """
     dt, horizon, post = 0.05, 40, 1.15
 
     def derivative(x: Array, u: Array) -> Array:

@@ -1,7 +1,8 @@
 """The systems to report on that violate an assumption of a certificate from learned dynamics, and one with noise.
 
 Listed with the others in ``dynamics_reporting.py``. Each takes the mechanism that misleads as an option, so that
-``dynamics_check.py`` can measure what it changes.
+``dynamics_check.py`` can measure what it changes. Shares of tasks in docstrings are those of 20,000 random tasks whose
+distance it changes by more than a quarter of the median distance without it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ from dynamics_systems import Entry, Noisy, PartlySeen, experiment, friction, pat
 
 
 def crane(seed: int, payload: float = 0.3) -> Experiment:
-    """Return a crane's trolley whose payload swings, which is not recorded. 5-D."""
+    """Return a crane's trolley whose payload swings, which is not recorded. 5-D.
+
+    The payload changes nearly all tasks, and the largest distance 4 times.
+    """
     dt, horizon = 0.08, 60
 
     def derivative(x: Array, u: Array) -> Array:
@@ -50,7 +54,10 @@ def crane(seed: int, payload: float = 0.3) -> Experiment:
 
 
 def backlash(seed: int, play: float = 0.08) -> Experiment:
-    """Return a turntable behind a gear with play; the motor's angle, which takes the play up, is not recorded. 3-D."""
+    """Return a turntable behind a gear with play; the motor's angle, which takes the play up, is not recorded. 3-D.
+
+    The play changes 81 % of the tasks, and the largest distance 1.2 times.
+    """
     dt, horizon = 0.05, 50
 
     def derivative(x: Array, u: Array) -> Array:
@@ -77,7 +84,10 @@ def backlash(seed: int, play: float = 0.08) -> Experiment:
 
 
 def oblique_wall(seed: int, stiffness: float = 600.0) -> Experiment:
-    """Return a gripper that moves in a plane, with a slanting wall behind one corner of its goals. 6-D."""
+    """Return a gripper that moves in a plane, with a slanting wall behind one corner of its goals. 6-D.
+
+    The wall changes 0.2 % of the tasks, and the largest distance 1.3 times.
+    """
     dt, horizon, normal = 0.05, 40, np.array([0.8, 0.6])
 
     def derivative(x: Array, u: Array) -> Array:
@@ -108,7 +118,10 @@ def oblique_wall(seed: int, stiffness: float = 600.0) -> Experiment:
 
 
 def dry_sled(seed: int, grip: float = 1.0) -> Experiment:
-    """Return a sled in a plane with dry friction, which stops it short; M is learned while it moves. 4-D."""
+    """Return a sled in a plane with dry friction, which stops it short; M is learned while it moves. 4-D.
+
+    The friction changes 90 % of the tasks, and the largest distance twice.
+    """
     dt, horizon, substeps = 0.06, 40, 3
     h = dt / substeps
 
@@ -135,7 +148,10 @@ def dry_sled(seed: int, grip: float = 1.0) -> Experiment:
 
 
 def full_wheel(seed: int, limit: float = 2.3) -> Experiment:
-    """Return a satellite whose reaction wheel gives no more torque beyond a speed that few tasks reach. 4-D."""
+    """Return a satellite whose reaction wheel gives no more torque beyond a speed that few tasks reach. 4-D.
+
+    The limit changes 3 % of the tasks, and the largest distance 38 times.
+    """
     dt, horizon = 0.1, 50
 
     def step(x: Array, u: Array) -> Array:
@@ -160,7 +176,10 @@ def full_wheel(seed: int, limit: float = 2.3) -> Experiment:
 
 
 def icy_corner(seed: int, hold: float = 0.15) -> Experiment:
-    """Return a vehicle in a plane that loses its grip where a corner is icy, if it comes there fast. 5-D."""
+    """Return a vehicle in a plane that loses its grip where a corner is icy, if it comes there fast. 5-D.
+
+    The ice changes 0.3 % of the tasks, and the largest distance 2.5 times.
+    """
     dt, horizon = 0.05, 50
 
     def derivative(x: Array, u: Array) -> Array:
@@ -191,7 +210,10 @@ def icy_corner(seed: int, hold: float = 0.15) -> Experiment:
 
 
 def over_the_hill(seed: int, height: float = 1.03, engine: float = 1.21) -> Experiment:
-    """Return a truck that takes a hill by its run-up; M takes it in all tasks, S rolls back in a few. 3-D."""
+    """Return a truck that takes a hill by its run-up; M takes it in all tasks, S rolls back in a few. 3-D.
+
+    Distances are above 0.5 m in 8 of 10,000 tasks, and 0.003 m in the median.
+    """
     dt, horizon = 0.1, 60
     known = float(np.random.default_rng([seed, 37]).uniform(0.99, 1.0))
 
@@ -220,7 +242,10 @@ ROVER_NOISE = (0.01, 0.01, 0.005)
 
 
 def gravel_rover(seed: int, deviation: tuple[float, ...] = ROVER_NOISE) -> Experiment:
-    """Return a rover on gravel, pushed about at random by a declared amount; M steers without slip. 4-D."""
+    """Return a rover on gravel, pushed about at random by a declared amount; M steers without slip. 4-D.
+
+    The noise changes 55 % of the tasks, and the largest distance 1.3 times.
+    """
     dt, horizon = 0.2, 40
     gain = float(np.random.default_rng([seed, 41]).uniform(0.97, 1.03))
 
@@ -248,7 +273,10 @@ def _aim(t: int, x: Array, task: Task) -> Array:
 
 
 def windy_vane(seed: int, deviation: tuple[float, ...] = (0.0, 0.12)) -> Experiment:
-    """Return a vane in turbulent wind, the noise of which is not declared; M is linear, from its data. 3-D."""
+    """Return a vane in turbulent wind, the noise of which is not declared; M is linear, from its data. 3-D.
+
+    The noise changes 92 % of the tasks, and the largest distance 1.4 times.
+    """
     dt, horizon = 0.05, 40
 
     def derivative(x: Array, u: Array) -> Array:
