@@ -39,6 +39,7 @@ STORED = dynamics_truths.TRUTHS
 def test_no_system_is_in_both_lists_and_every_family_is_reported() -> None:
     assert len(ENTRIES) == len(DEVELOPMENT) + len(REPORTING)
     assert not set(PAPER) & set(ENTRIES)
+    assert PAPER["linear-5"](0).validation.space.dimension == 10
     assert {entry.family for entry in REPORTING.values()} == set(FAMILIES)
     dimensions = [entry(0).validation.space.dimension for entry in REPORTING.values()]
     assert len(dimensions) >= 16
