@@ -9,7 +9,9 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call
+from ctxval.campaign.dynamics import CampaignDynamics
 from ctxval.campaign.history import predict_from
+from ctxval.certificates import DynamicsEvidence
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.searches import Prediction
@@ -27,11 +29,13 @@ class LearnedFromTrials:
         validation: the map p -> d(p).
         store: the store of the trajectories.
         trials: all trials of the campaign.
+        study: what the trajectories teach of the dynamics.
     """
 
     validation: Validation
     store: Store
     trials: Sequence[Trial]
+    study: CampaignDynamics
     _predictions: dict[int, Prediction | None] = field(default_factory=dict, init=False)
 
     def expected(self, points: Array, before: int) -> Array:
@@ -41,6 +45,10 @@ class LearnedFromTrials:
         """
         prediction = self._before(before)
         return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
+
+    def dynamics(self) -> DynamicsEvidence | None:
+        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
+        return self.study.evidence(self.trials)
 
     def tasks(self, count: int, seed: int) -> Array:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""

@@ -122,7 +122,7 @@ class CampaignResults:
     def provenance(self) -> Provenance:
         """What a certificate needs besides the trials: the task space, the search, changes, and what M predicts."""
         known = Provenance.of(self.store.description(), self.store.history())
-        learned = LearnedFromTrials(self.validation, self.store, self.trials)
+        learned = LearnedFromTrials(self.validation, self.store, self.trials, self._recorder.dynamics)
         return replace(known, space=self.validation.space, learned=learned)
 
     def surrogate(self) -> Surrogate:

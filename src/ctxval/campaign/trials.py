@@ -13,6 +13,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, lines
 from ctxval._util.texts import shortened, text_of
+from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
 from ctxval.campaign.fallback import error_with_fallback
 from ctxval.campaign.history import history_of, predict_from
 from ctxval.campaign.identity import identify
@@ -84,6 +85,8 @@ class TrialRecorder:
         validation, store, description: as above; :meth:`redefine` replaces validation and description.
         search: with the optional methods of :class:`ctxval.searches.BaseSearch`.
         draws: chooses the points of an audit.
+        dynamics: what the trajectories teach of the dynamics.
+        predicts: whether executions are predicted, and the predictions stored, before they are made.
     """
 
     def __init__(
@@ -94,6 +97,8 @@ class TrialRecorder:
         self.store = store
         self.description = description
         self.draws = IndependentDraws(store, validation, seed)
+        self.dynamics = CampaignDynamics(validation, store, seed)
+        self.predicts = False
         self._seed = seed
         self._executing: set[int] = set()
         self.replay()
@@ -171,6 +176,7 @@ class TrialRecorder:
     def redefine(self, validation: Validation, description: dict[str, Any]) -> None:
         """Continue with another distance, after its values were stored."""
         self.validation, self.description = validation, description
+        self.dynamics = CampaignDynamics(validation, self.store, self._seed)
         self.replay()
 
     # Opening
@@ -243,6 +249,8 @@ class TrialRecorder:
             self.search.tell(unit_point[None], [np.nan])
         if origin == "iid" and choice.planned_draws is not None:
             note = {**(note or {}), PLANNED: choice.planned_draws}
+        if self.predicts and (predicted := self.dynamics.predict(self._trials, unit_point)) is not None:
+            note = {**(note or {}), PREDICTION: predicted.to_json()}
         parameters = self.validation.space.describe_point(self.validation.space.from_unit(unit_point))
         number = len(self._trials)
         return Trial(number, origin, "open", unit_point, parameters, attempts, note=note, because=choice.because)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from ctxval.certificates.anytime import AnytimeAudit, certify_anytime
 from ctxval.certificates.assessment import Assessment, assess
 from ctxval.certificates.audit import Audit, certify_audit
+from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.convergence import Convergence, TheoremConstants, certify_convergence, rate
 from ctxval.certificates.covering import (
@@ -16,6 +17,8 @@ from ctxval.certificates.covering import (
     require_resolution,
 )
 from ctxval.certificates.diagnostics import Diagnosis, diagnose
+from ctxval.certificates.dynamics import Dynamics, certify_dynamics
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputCoverage
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.learned import LearnedDistance, require_learned
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
@@ -48,11 +51,15 @@ __all__ = [
     "AnytimeAudit",
     "Assessment",
     "Audit",
+    "Automatic",
     "Certificate",
     "CertificateKind",
     "CertificateOptions",
+    "CheckedPrediction",
     "Convergence",
     "Diagnosis",
+    "Dynamics",
+    "DynamicsEvidence",
     "Forecast",
     "LearnedDistance",
     "MadeGood",
@@ -65,6 +72,7 @@ __all__ = [
     "Sample",
     "SamplingDiscarding",
     "Scenario",
+    "StateInputCoverage",
     "StoppingDecision",
     "StoppingRule",
     "TheoremConstants",
@@ -75,6 +83,7 @@ __all__ = [
     "certify_anytime",
     "certify_audit",
     "certify_convergence",
+    "certify_dynamics",
     "certify_mean",
     "certify_posterior",
     "certify_region",

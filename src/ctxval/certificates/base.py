@@ -134,6 +134,9 @@ class CertificateKind(ABC):
     bounds_maximum: ClassVar[bool] = True
     """Whether it bounds d* itself. If not, it leaves out a share of the task space, which the user must accept."""
 
+    evidence: ClassVar[str] = "by its assumptions"
+    """What a validation by it rests on, in the sentence of the verdict, if it bounds d*."""
+
     needs_threshold: ClassVar[bool] = False
     """Whether its statement is about a threshold, so that there is none without one."""
 
@@ -204,6 +207,11 @@ class CertificateKind(ABC):
     @classmethod
     def qualification(cls, certificate: Certificate, space: TaskSpace | None = None) -> str:
         """Return the end of a sentence that names options other than the defaults; empty if all are defaults."""
+        return ""
+
+    @classmethod
+    def support(cls, certificate: Certificate, threshold: float) -> str:
+        """Return what speaks for a threshold although the certificate is withdrawn; empty if nothing does."""
         return ""
 
     @classmethod

@@ -1,9 +1,9 @@
 r"""The bound from learned dynamics: the posterior of ``d* = max_p d(p)`` under a prior on the residual dynamics.
 
-The residual ``r(x, u) = x' - M(x, u)`` has a Gaussian-process prior with unknown hyperparameters. Each draw r_s from its
-posterior makes a system ``M + r_s``, whose largest distance d*_s is searched over all tasks. Under the prior, d* and
-these S maxima are exchangeable, so d* is at most the k-th smallest one with probability ``k / (S + 1)``. Draws that
-share hyperparameters make this approximate. Bayes' rule does not depend on how the tasks were chosen.
+The residual ``r(x, u) = x' - M(x, u)`` has a Gaussian-process prior with unknown hyperparameters. Each draw r_s from
+its posterior makes a system ``M + r_s``, whose largest distance d*_s is searched over all tasks. Under the prior, d*
+and these S maxima are exchangeable, so d* is at most the k-th smallest one with probability ``k / (S + 1)``. Draws
+that share hyperparameters make this approximate. Bayes' rule does not depend on how the tasks were chosen.
 
 The bound lies if the prior is wrong: if a state is not recorded, or the dynamics jump. So it is withdrawn unless
 predictions that were made before executions held, and unless the records cover what the closed loops visit. It is
@@ -93,7 +93,8 @@ class Dynamics(CertificateKind):
     def support(cls, certificate: Certificate, threshold: float) -> str:
         """Return what speaks for a threshold although the certificate is withdrawn; empty if nothing does."""
         details = certificate.details
-        if not details["largest_draw"] <= threshold or details["executions"] < FEWEST:
+        largest = details["largest_draw"]
+        if largest is None or largest > threshold or details["executions"] < FEWEST:
             return ""
         checked = details["predictions"][-PREDICTIONS:]
         held = sum(one["held"] for one in checked)
@@ -126,15 +127,19 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: flo
         confidence: the probability with which the bound holds.
 
     Raises:
-        CertificateError: if the confidence is too high for the number of draws.
+        CertificateError: if the confidence is too high for the number of draws, or draws diverge.
     """
     require_probability("confidence", confidence)
     draws = len(evidence.maxima)
     if np.ceil((draws + 1) * confidence - 1e-9) > draws:
         raise CertificateError(f"a confidence of {confidence:g} needs more than the {draws} draws of the dynamics.")
-    base = max(evidence.upper(confidence), sample.best)
-    raised = base + _RAISE * max((one.excess for one in evidence.predictions[-PREDICTIONS:]), default=0.0)
-    doubt = _doubt(evidence, raised)
+    raised = bound_of(evidence, sample.best, confidence)
+    if not np.isfinite(raised):
+        raise CertificateError(
+            "the dynamics give no bound: the closed loops of some draws diverge, or an execution could not be "
+            "predicted. More executions narrow the draws."
+        )
+    doubt = doubt_of(evidence, raised)
     return Certificate(
         kind="dynamics",
         statement=(
@@ -150,13 +155,25 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: flo
     )
 
 
+def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> float:
+    """Return the bound: the order statistic of the maxima, raised by what executions exceeded their predictions.
+
+    Args:
+        evidence: what the learned dynamics say.
+        best: the largest executed distance.
+        confidence: the probability with which the bound holds.
+    """
+    excess = max((one.excess for one in evidence.predictions[-PREDICTIONS:]), default=0.0)
+    return max(evidence.upper(confidence), best) + _RAISE * excess
+
+
 def held(prediction: CheckedPrediction, bound: float) -> bool:
     """Return whether an execution agrees with its prediction, as far as it matters for a bound."""
     near = abs(prediction.distance - prediction.median) <= NEGLIGIBLE * bound
     return prediction.z2 <= SURPRISING or near
 
 
-def _doubt(evidence: DynamicsEvidence, bound: float) -> str | None:
+def doubt_of(evidence: DynamicsEvidence, bound: float) -> str | None:
     """Return why the bound is withdrawn, and what would help; None if it is not."""
     checked = evidence.predictions[-PREDICTIONS:]
     failed = [one for one in checked if not held(one, bound)]
@@ -166,8 +183,6 @@ def _doubt(evidence: DynamicsEvidence, bound: float) -> str | None:
             f"the dynamics are learned from {evidence.executions} executed trajectories, and the bound needs at least "
             f"{FEWEST}; execute more tasks"
         )
-    if not np.isfinite(bound):
-        return "the closed loops of some draws of the dynamics diverge; more executions narrow the draws"
     if failed:
         return _failed_predictions(failed)
     if len(checked) < PREDICTIONS:
@@ -213,16 +228,16 @@ def _uncovered(evidence: DynamicsEvidence) -> str:
 def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
     coordinates = len(evidence.coverage.resolution)
     joint = (
-        f"with {coordinates} coordinates of state and input, the records cover each one alone and not all combinations: "
-        "what happens only at a combination that was never visited, such as a contact in a corner, is not covered"
+        f"with {coordinates} coordinates of state and input, the records cover each one alone and not all "
+        "combinations: what happens only at a combination that was never visited, such as a contact in a corner, is not covered"
         if evidence.coverage.pair is None
         else "what happens only at a combination of three or more coordinates that was never visited is not covered"
     )
     return (
         "the recorded state is complete: the next state depends on it and on the input alone",
         "the system is deterministic",
-        "the residual x' - M(x, u) is a draw from a Gaussian process: a Matern kernel of smoothness 3/2 or 5/2 that may "
-        "grow with the inputs, plus a linear function; its hyperparameters are unknown and integrated over",
+        "the residual x' - M(x, u) is a draw from a Gaussian process: a Matern kernel of smoothness 3/2 or 5/2 that "
+        "may grow with the inputs, plus a linear function; its hyperparameters are unknown and integrated over",
         "the residual is like what was seen, to a resolution in state and input of "
         f"{_texts(evidence.coverage.resolution)} (in the units of the system)",
         joint,
@@ -239,7 +254,7 @@ def _details(sample: Sample, evidence: DynamicsEvidence, bound: float) -> dict[s
         "gap": bound - sample.best,
         "executions": evidence.executions,
         "draws": len(evidence.maxima),
-        "largest_draw": float(evidence.maxima.max()),
+        "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
         "median_draw": float(np.median(finite)) if len(finite) else None,
         "evaluations": evidence.evaluations,
         "predictions": [{**one.to_json(), "held": bool(held(one, bound))} for one in evidence.predictions],

@@ -8,6 +8,7 @@ from ctxval._util.arrays import Array
 from ctxval.errors import CertificateError
 
 if TYPE_CHECKING:
+    from ctxval.certificates.dynamics_evidence import DynamicsEvidence
     from ctxval.certificates.sample import Sample
 
 
@@ -22,6 +23,9 @@ class LearnedDistance(Protocol):
             points: points of the unit cube.
             before: a number of a trial; only trials with smaller numbers are learned from.
         """
+
+    def dynamics(self) -> DynamicsEvidence | None:
+        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
 
     def tasks(self, count: int, seed: int) -> Array:
         """Return independent draws from the distribution of tasks: points of the unit cube ``(count, d)``.

@@ -48,6 +48,7 @@ class Posterior(CertificateKind):
     """
 
     name: ClassVar[str] = "posterior"
+    evidence: ClassVar[str] = "by a prior on the distance"
 
     stochastic: bool = False
     resolution: float = RESOLUTION

@@ -135,8 +135,9 @@ def judge_by(
         upper, limit = _bound_and_limit(certificate, tau)
         kind = KINDS.of(certificate)
         reason = (
-            f"the {certificate.kind} bound of {certificate.trials} trials is {upper}, at most {limit}, with confidence "
-            f"{certificate.confidence}{but}{kind.qualification(certificate, space)}."
+            f"{'audited' if certificate.volume else kind.evidence}, the {certificate.kind} bound of "
+            f"{certificate.trials} trials is {upper}, at most {limit}, with confidence {certificate.confidence}{but}"
+            f"{kind.qualification(certificate, space)}."
         )
         return Verdict("validated", tau, reason, certificate=certificate, rests_on=_rests_on(certificate, space))
     return Verdict("undecided", tau, _why_not(certificate, tau, volume), certificate=certificate)
@@ -150,7 +151,8 @@ def _bound_and_limit(certificate: Certificate, tau: float) -> tuple[str, str]:
 
 def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
     if certificate.doubt is not None:
-        return f"{certificate.doubt}."
+        support = KINDS.of(certificate).support(certificate, tau)
+        return f"{support}; but {certificate.doubt}." if support else f"{certificate.doubt}."
     if KINDS.of(certificate).never_validates:
         return f"{KINDS.of(certificate).never_validates}."
     upper, limit = _bound_and_limit(certificate, tau)

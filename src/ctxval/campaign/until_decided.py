@@ -1,0 +1,146 @@
+"""The choices of a campaign that runs until its verdict is reached, by the certificate that is expected to decide first.
+
+If trajectories teach the dynamics, this is the bound from learned dynamics. It needs executions where a draw of the
+dynamics exceeds the threshold, where the states and inputs are not covered by records, and where predictions are
+tested. If no dynamics can be learned, or if predictions fail again and again, it is the posterior bound of the distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import record
+from ctxval.campaign.learned import LearnedFromTrials
+from ctxval.campaign.trials import Choice, TrialRecorder
+from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
+from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.dynamics import FEWEST, PREDICTIONS, Dynamics, bound_of, certify_dynamics, held
+from ctxval.certificates.verdict import counterexample
+from ctxval.core.trial import Trial
+from ctxval.errors import CertificateError
+
+_NEAR = 0.02
+"""A task that differs from an executed one by less than this in every coordinate teaches little."""
+_FAILING = 6
+"""Number of the last predictions, of which more than half must hold."""
+_EXPLORE = 3
+"""Every so many executions, the one that leads farthest from the records is made even if a draw exceeds the threshold."""
+
+
+@dataclass(frozen=True, eq=False)
+class UntilDecided:
+    """Chooses the next task until the verdict is reached.
+
+    Attributes:
+        recorder: the recorder of the trials.
+        threshold: tau, in the distance's units.
+        options: the certificate of the verdict: ``auto``, ``dynamics`` or ``posterior``.
+        budget: the largest total number of executions.
+    """
+
+    recorder: TrialRecorder
+    threshold: float
+    options: CertificateOptions
+    budget: int
+
+    def choose(self) -> Choice | None:
+        """Return the next task; None if the verdict is reached."""
+        trials = self.recorder.trials
+        if counterexample(trials, self.threshold) is not None:
+            return None
+        evidence = self._evidence(trials)
+        if evidence is None or self._fails(evidence):
+            return self._by_distance(trials)
+        if self._decides(trials, evidence):
+            return None
+        point = next_task(evidence, _points(trials, self._dimension), self.threshold, self.options.confidence)
+        # The results decide when the campaign ends, so the number of independent draws is not planned.
+        return Choice(point, "covering", planned_draws=0)
+
+    @property
+    def _dimension(self) -> int:
+        return self.recorder.validation.space.dimension
+
+    def _evidence(self, trials: Sequence[Trial]) -> DynamicsEvidence | None:
+        """Return what the learned dynamics say; None if the certificate does not use them."""
+        kind = self.options.kind
+        if not isinstance(kind, Dynamics) and not (isinstance(kind, Automatic) and not kind.stochastic):
+            return None
+        if any(trial.state == "failed" for trial in trials):
+            return None
+        return self.recorder.dynamics.evidence(trials)
+
+    def _fails(self, evidence: DynamicsEvidence) -> bool:
+        """Return whether predictions fail so often that the dynamics cannot be learned."""
+        if isinstance(self.options.kind, Dynamics):
+            return False
+        last = evidence.predictions[-_FAILING:]
+        bound = min(evidence.upper(self.options.confidence), self.threshold)
+        return len(last) == _FAILING and 2 * sum(held(one, bound) for one in last) < _FAILING
+
+    def _decides(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> bool:
+        ended = [trial for trial in trials if trial.state != "open"]
+        if len(ended) < FEWEST:
+            return False
+        try:
+            found = certify_dynamics(Sample.of(ended), evidence, self.options.confidence)
+        except CertificateError:
+            return False
+        return found.covers(self.threshold)
+
+    def _by_distance(self, trials: Sequence[Trial]) -> Choice | None:
+        kind = self.options.kind
+        if isinstance(kind, Dynamics):
+            return Choice(planned_draws=0)
+        posterior = kind.posterior if isinstance(kind, Automatic) else kind
+        rule = StoppingRule(self.threshold, replace(self.options, kind=posterior))
+        now = rule.decide(trials, self.budget - self.recorder.executions)
+        return None if now.decided else Choice(now.next_point, "covering", planned_draws=0)
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def next_task(evidence: DynamicsEvidence, known: Array, threshold: float, confidence: float) -> Array | None:
+    """Return the task to execute next, a point ``(d,)``; None if the search is to choose it.
+
+    These come first: a task whose predicted distance exceeds the threshold; the task of the draw that sets the bound,
+    while the bound exceeds the threshold; the task that leads farthest from the records, while they leave gaps; and
+    tasks at which the largest draws lie, to test the predictions.
+
+    Args:
+        evidence: what the learned dynamics say.
+        known: executed and open tasks, points ``(n, d)``.
+        threshold: tau, in the distance's units.
+        confidence: the probability with which the bound holds.
+    """
+    order = np.argsort(evidence.maxima, kind="stable")
+    rank = evidence.rank(confidence)
+    highest = evidence.points[[*order[rank::-1], *order[:rank:-1]]]
+    farthest = evidence.coverage.task[None]
+    exceeds = evidence.upper(confidence) > threshold
+    if exceeds and len(known) % _EXPLORE == _EXPLORE - 1:
+        candidates = [farthest, highest]
+    elif evidence.highest > threshold:
+        candidates = [evidence.elites, highest, farthest]
+    elif exceeds:
+        candidates = [highest, farthest]
+    else:
+        candidates = [farthest, highest, evidence.elites]
+    return _first_new(np.concatenate(candidates), known)
+
+
+def _first_new(points: Array, known: Array) -> Array | None:
+    """Return the first of some points that is not near a known one; None if all are."""
+    for point in points:
+        if not len(known) or np.abs(known - point).max(axis=1).min() > _NEAR:
+            return np.asarray(point)
+    return None
+
+
+def _points(trials: Sequence[Trial], dimension: int) -> Array:
+    return np.array([trial.unit_point for trial in trials]).reshape(-1, dimension)

@@ -1,0 +1,105 @@
+"""The certificate of a verdict if none is named: a bound on d* by a prior on the distance, or by one on the dynamics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ctxval._util.registry import part
+from ctxval.certificates.base import Certificate, CertificateKind
+from ctxval.certificates.covering import RESOLUTION
+from ctxval.certificates.dynamics import FEWEST, Dynamics
+from ctxval.certificates.forecast import Forecast
+from ctxval.certificates.posterior import Posterior
+from ctxval.certificates.sample import Sample
+from ctxval.errors import CertificateError
+
+Found = tuple[Certificate, Forecast | None]
+
+
+@part("auto")
+@dataclass(frozen=True, repr=False)
+class Automatic(CertificateKind):
+    """The posterior bound if it keeps the threshold, otherwise the dynamics bound if that one does.
+
+    The dynamics bound is tried only if the experiment is loaded and the system is declared deterministic. If neither
+    keeps the threshold, the certificate is the one that is nearer to a decision.
+
+    Attributes:
+        stochastic, resolution: as for the posterior bound.
+
+    Raises:
+        CertificateError: if the resolution is not positive.
+        InputError: if an option has another type.
+    """
+
+    name: ClassVar[str] = "auto"
+
+    stochastic: bool = False
+    resolution: float = RESOLUTION
+
+    def __post_init__(self) -> None:
+        self.posterior  # noqa: B018 (it checks the options)
+
+    @property
+    def posterior(self) -> Posterior:
+        """The posterior bound with these options."""
+        return Posterior(self.stochastic, self.resolution)
+
+    def uses_dynamics(self, sample: Sample) -> bool:
+        """Return whether the dynamics bound can be tried."""
+        return sample.learned is not None and not self.stochastic and len(sample) >= FEWEST and not sample.failed
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return the posterior bound or, if it is withdrawn or refused, the dynamics bound, if that one is neither.
+
+        Raises:
+            CertificateError: if both are refused.
+        """
+        return self._first(sample, None, confidence)[0]
+
+    def certify_against(
+        self, sample: Sample, threshold: float, confidence: float = 0.95
+    ) -> tuple[Certificate, Forecast | None]:
+        """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision.
+
+        Raises:
+            CertificateError: if both are refused.
+        """
+        return self._first(sample, threshold, confidence)
+
+    def _first(self, sample: Sample, threshold: float | None, confidence: float) -> Found:
+        by_distance = _tried(self.posterior, sample, threshold, confidence)
+        if isinstance(by_distance, tuple) and _decides(by_distance[0], threshold):
+            return by_distance
+        if not self.uses_dynamics(sample):
+            return _required(by_distance)
+        by_dynamics = _tried(Dynamics(), sample, threshold, confidence)
+        if not isinstance(by_dynamics, tuple):
+            return _required(by_distance)
+        if not isinstance(by_distance, tuple) or _decides(by_dynamics[0], threshold):
+            return by_dynamics
+        supported = threshold is not None and Dynamics.support(by_dynamics[0], threshold)
+        return by_dynamics if supported else by_distance
+
+
+def _tried(
+    kind: CertificateKind, sample: Sample, threshold: float | None, confidence: float
+) -> Found | CertificateError:
+    try:
+        if threshold is None:
+            return kind.certify(sample, confidence), None
+        return kind.certify_against(sample, threshold, confidence)
+    except CertificateError as error:
+        return error
+
+
+def _decides(certificate: Certificate, threshold: float | None) -> bool:
+    """Return whether a certificate keeps a threshold; if there is none, whether it is not withdrawn."""
+    return certificate.doubt is None if threshold is None else certificate.covers(threshold)
+
+
+def _required(found: Found | CertificateError) -> Found:
+    if isinstance(found, CertificateError):
+        raise found
+    return found
