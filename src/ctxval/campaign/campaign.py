@@ -16,8 +16,9 @@ from ctxval.campaign.identity import description_of, identify, search_of
 from ctxval.campaign.known import KnownExecution, TrialResult, check_known, measurement_of
 from ctxval.campaign.results import CampaignResults
 from ctxval.campaign.trials import Choice, OpenTrial, TrialRecorder
+from ctxval.campaign.until_decided import UntilDecided
 from ctxval.campaign.workers import WorkerPool, worker_pool
-from ctxval.certificates import RESOLUTION, CertificateOptions, StoppingRule
+from ctxval.certificates import RESOLUTION, CertificateOptions
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.distance import Distance
 from ctxval.core.trajectory import Trajectory
@@ -145,15 +146,18 @@ class Campaign(CampaignResults):
     ) -> Campaign:
         """Execute tasks until the model is validated or falsified for a threshold, or the budget is spent.
 
-        If the posterior bound is at most the threshold but some tasks are too far from all trials, and if the budget
-        suffices for all of these tasks, then they are executed. Otherwise the search chooses the next task.
+        By default the certificate is the one that is expected to decide first. If trajectories teach the dynamics, it
+        is the bound from learned dynamics, and each execution is predicted beforehand; the prediction is stored with
+        the trial. Otherwise it is the posterior bound: if it is at most the threshold but some tasks are too far from
+        all trials, and if the budget suffices for all of these tasks, then they are executed; if it is above the
+        threshold, the search chooses the next task.
 
         Args:
             threshold: tau, in the units of the distance.
             budget: largest total number of executions of S, including earlier ones.
             on_trial: called with each trial that has ended.
-            confidence, stochastic, resolution, certificate: as in :meth:`verdict`; the certificate must be the
-                posterior bound.
+            confidence, stochastic, resolution, certificate: as in :meth:`verdict`; the kind of the certificate must be
+                ``auto``, ``dynamics`` or ``posterior``.
             workers, executor, timeout: as in :meth:`run`.
 
         Raises:
@@ -161,18 +165,11 @@ class Campaign(CampaignResults):
             CertificateError: if an option of the certificate is not valid.
         """
         total = _count("budget must be a positive integer", budget)
-        by = CertificateOptions.or_posterior(certificate, confidence, stochastic, resolution)
-        stopping = StoppingRule(threshold, by)
-
-        def rule() -> Choice | None:
-            now = stopping.decide(self.trials, total - self.executions)
-            if now.decided:
-                return None
-            # The results decide when the campaign ends, so the number of independent draws is not planned.
-            return Choice(now.next_point, "covering", planned_draws=0)
-
+        by = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
+        decision = UntilDecided(self._recorder, threshold, by, total)
         pool = self._pool(workers, executor, timeout)
-        return self._execute(Schedule(self._recorder, rule, total), pool, on_trial)
+        with self._recorder.predicting(decision.predicts):
+            return self._execute(Schedule(self._recorder, decision.choose, total), pool, on_trial)
 
     def audit(
         self,

@@ -108,14 +108,13 @@ class CampaignResults:
             stochastic: whether two executions of one task may differ.
             resolution: the largest distance between a task and its nearest trial that a validation permits, in
                 diagonals of the task space.
-            certificate: the kind and the options of the certificate, in place of the posterior bound with the three
-                options above.
+            certificate: the kind and the options of the certificate, in place of ``auto`` with the three options above.
 
         Raises:
             InputError: if the threshold is not a positive number, or the confidence is below 0.5.
             CertificateError: if an option of the certificate is not valid.
         """
-        chosen = CertificateOptions.or_posterior(certificate, confidence, stochastic, resolution)
+        chosen = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         return judge(self.trials, threshold, chosen, self.provenance)
 
     @property

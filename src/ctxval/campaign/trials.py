@@ -359,6 +359,15 @@ class TrialRecorder:
         return trial
 
     @contextmanager
+    def predicting(self, predicts: bool) -> Iterator[None]:
+        """Predict the executions of the trials that are opened within this context, and store the predictions."""
+        before, self.predicts = self.predicts, predicts
+        try:
+            yield
+        finally:
+            self.predicts = before
+
+    @contextmanager
     def not_executing(self, trial: Trial) -> Iterator[None]:
         """Refuse the result of a trial that a process is executing: that process records the result.
 

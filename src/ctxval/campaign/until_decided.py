@@ -1,8 +1,8 @@
-"""The choices of a campaign that runs until its verdict is reached, by the certificate that is expected to decide first.
+"""The choices of a campaign that runs until its verdict, by the certificate that is expected to decide first.
 
 If trajectories teach the dynamics, this is the bound from learned dynamics. It needs executions where a draw of the
-dynamics exceeds the threshold, where the states and inputs are not covered by records, and where predictions are
-tested. If no dynamics can be learned, or if predictions fail again and again, it is the posterior bound of the distance.
+dynamics exceeds the threshold, where states and inputs are not covered by records, and where predictions are tested.
+If no dynamics can be learned, or if most predictions fail, it is the posterior bound of the distance.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import record
-from ctxval.campaign.learned import LearnedFromTrials
 from ctxval.campaign.trials import Choice, TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
 from ctxval.certificates.automatic import Automatic
-from ctxval.certificates.dynamics import FEWEST, PREDICTIONS, Dynamics, bound_of, certify_dynamics, held
-from ctxval.certificates.verdict import counterexample
+from ctxval.certificates.dynamics import FEWEST, Dynamics, certify_dynamics, held
+from ctxval.certificates.posterior import Posterior
+from ctxval.certificates.verdict import counterexample, require_threshold
 from ctxval.core.trial import Trial
-from ctxval.errors import CertificateError
+from ctxval.errors import CertificateError, InputError
 
 _NEAR = 0.02
 """A task that differs from an executed one by less than this in every coordinate teaches little."""
 _FAILING = 6
 """Number of the last predictions, of which more than half must hold."""
 _EXPLORE = 3
-"""Every so many executions, the one that leads farthest from the records is made even if a draw exceeds the threshold."""
+"""Every so many executions, the task that leads farthest from the records is executed in any case."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +40,28 @@ class UntilDecided:
         threshold: tau, in the distance's units.
         options: the certificate of the verdict: ``auto``, ``dynamics`` or ``posterior``.
         budget: the largest total number of executions.
+
+    Raises:
+        InputError: if the threshold is not a positive number, or the certificate does not bound d*.
     """
 
     recorder: TrialRecorder
     threshold: float
     options: CertificateOptions
     budget: int
+
+    def __post_init__(self) -> None:
+        require_threshold(self.threshold)
+        if not isinstance(self.options.kind, Automatic | Dynamics | Posterior):
+            raise InputError(
+                f"--until-decided needs a bound on d* (auto, dynamics or posterior), got {self.options.kind.name!r}."
+            )
+
+    @property
+    def predicts(self) -> bool:
+        """Whether executions are predicted beforehand."""
+        kind = self.options.kind
+        return isinstance(kind, Dynamics) or (isinstance(kind, Automatic) and not kind.stochastic)
 
     def choose(self) -> Choice | None:
         """Return the next task; None if the verdict is reached."""
@@ -67,10 +83,7 @@ class UntilDecided:
 
     def _evidence(self, trials: Sequence[Trial]) -> DynamicsEvidence | None:
         """Return what the learned dynamics say; None if the certificate does not use them."""
-        kind = self.options.kind
-        if not isinstance(kind, Dynamics) and not (isinstance(kind, Automatic) and not kind.stochastic):
-            return None
-        if any(trial.state == "failed" for trial in trials):
+        if not self.predicts or any(trial.state == "failed" for trial in trials):
             return None
         return self.recorder.dynamics.evidence(trials)
 

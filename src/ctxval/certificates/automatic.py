@@ -1,4 +1,4 @@
-"""The certificate of a verdict if none is named: a bound on d* by a prior on the distance, or by one on the dynamics."""
+"""The certificate of a verdict if none is named: the posterior bound, or the bound from learned dynamics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Found = tuple[Certificate, Forecast | None]
 @part("auto")
 @dataclass(frozen=True, repr=False)
 class Automatic(CertificateKind):
-    """The posterior bound if it keeps the threshold, otherwise the dynamics bound if that one does.
+    """The bound from learned dynamics if it keeps the threshold, otherwise the posterior bound of the distance.
 
     The dynamics bound is tried only if the experiment is loaded and the system is declared deterministic. If neither
     keeps the threshold, the certificate is the one that is nearer to a decision.
@@ -51,7 +51,7 @@ class Automatic(CertificateKind):
         return sample.learned is not None and not self.stochastic and len(sample) >= FEWEST and not sample.failed
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the posterior bound or, if it is withdrawn or refused, the dynamics bound, if that one is neither.
+        """Return the dynamics bound or, if it is withdrawn or refused, the posterior bound.
 
         Raises:
             CertificateError: if both are refused.
@@ -69,18 +69,16 @@ class Automatic(CertificateKind):
         return self._first(sample, threshold, confidence)
 
     def _first(self, sample: Sample, threshold: float | None, confidence: float) -> Found:
+        by_dynamics = _tried(Dynamics(), sample, threshold, confidence) if self.uses_dynamics(sample) else None
+        if isinstance(by_dynamics, tuple) and _decides(by_dynamics[0], threshold):
+            return by_dynamics
         by_distance = _tried(self.posterior, sample, threshold, confidence)
-        if isinstance(by_distance, tuple) and _decides(by_distance[0], threshold):
-            return by_distance
-        if not self.uses_dynamics(sample):
-            return _required(by_distance)
-        by_dynamics = _tried(Dynamics(), sample, threshold, confidence)
         if not isinstance(by_dynamics, tuple):
             return _required(by_distance)
-        if not isinstance(by_distance, tuple) or _decides(by_dynamics[0], threshold):
+        if not isinstance(by_distance, tuple):
             return by_dynamics
         supported = threshold is not None and Dynamics.support(by_dynamics[0], threshold)
-        return by_dynamics if supported else by_distance
+        return by_dynamics if supported and not _decides(by_distance[0], threshold) else by_distance
 
 
 def _tried(

@@ -229,7 +229,8 @@ def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
     coordinates = len(evidence.coverage.resolution)
     joint = (
         f"with {coordinates} coordinates of state and input, the records cover each one alone and not all "
-        "combinations: what happens only at a combination that was never visited, such as a contact in a corner, is not covered"
+        "combinations: what happens only at a combination that was never visited, such as a contact in a corner, is "
+        "not covered"
         if evidence.coverage.pair is None
         else "what happens only at a combination of three or more coordinates that was never visited is not covered"
     )

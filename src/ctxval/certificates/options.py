@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ctxval._util.representation import record
+from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.base import CertificateKind
 from ctxval.certificates.bounds import require_number, require_probability
 from ctxval.certificates.covering import RESOLUTION
@@ -35,7 +36,7 @@ class CertificateOptions:
         InputError: if the kind is not one, the confidence is below 0.5, or the volume is negative or above 0.5.
     """
 
-    kind: CertificateKind = field(default_factory=Posterior)
+    kind: CertificateKind = field(default_factory=Automatic)
     confidence: float = CONFIDENCE
     volume: float = 0.0
 
@@ -53,16 +54,16 @@ class CertificateOptions:
         return cls(Posterior(stochastic, resolution), confidence)
 
     @classmethod
-    def or_posterior(
+    def or_automatic(
         cls, certificate: CertificateOptions | None, confidence: float, stochastic: bool, resolution: float
     ) -> CertificateOptions:
-        """Return a certificate that is given; otherwise the posterior bound with these options.
+        """Return a certificate that is given; otherwise ``auto`` with these options.
 
         Raises:
             InputError: if it is not a CertificateOptions, or if options are given beside it, which it has itself.
         """
         if certificate is None:
-            return cls.posterior(confidence, stochastic=stochastic, resolution=resolution)
+            return cls(Automatic(stochastic, resolution), confidence)
         if not isinstance(certificate, CertificateOptions):
             raise InputError(f"certificate must be a CertificateOptions, got {certificate!r}.")
         if (confidence, stochastic, resolution) != (CONFIDENCE, False, RESOLUTION):

@@ -33,7 +33,7 @@ class CertificateTable(BaseModel):
 
     model_config = ConfigDict(extra="allow")
 
-    kind: str = "posterior"
+    kind: str = "auto"
     stochastic: bool = False
     volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
     resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
