@@ -77,7 +77,7 @@ def sticky_slide(seed: int, dry: float = 0.6, extra: float = 1.2) -> Experiment:
 def gust_zone(seed: int, push: float = 6.0) -> Experiment:
     """Return a trolley that meets a gust where it is far out and fast at once. 4-D.
 
-    The gust changes 2 % of the tasks, and the largest distance 17 times.
+    The gust changes 2 % of the tasks, and d* 14 times.
     """
     dt, horizon = 0.05, 40
 
@@ -131,7 +131,7 @@ def _balance(t: int, x: Array, task: Task) -> Array:
 def weak_motor(seed: int, limit: float = 3.5) -> Experiment:
     """Return a hoist whose motor gives no more than 3.5 m/s^2, which M does not know. 4-D.
 
-    The limit changes 8 % of the tasks, and the largest distance 3 times.
+    The limit changes 8 % of the tasks, and d* 3.4 times.
     """
     dt, horizon = 0.05, 40
 
@@ -158,7 +158,7 @@ def weak_motor(seed: int, limit: float = 3.5) -> Experiment:
 def gate_at_post(seed: int, stiffness: float = 900.0) -> Experiment:
     """Return a gate that a few tasks bring to a post beyond their goals. 3-D.
 
-    The post changes 0.4 % of the tasks, and the largest distance twice.
+    The post changes 0.4 % of the tasks, and d* 2.6 times.
     """
     dt, horizon, post = 0.05, 40, 1.15
 

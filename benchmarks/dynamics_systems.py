@@ -33,7 +33,7 @@ class Entry:
         misleading: whether an assumption of a certificate from learned dynamics does not hold.
         without: the experiment without the mechanism that misleads; None if there is none.
         noise: the declared standard deviation of the process noise of each state in one step; None if none is declared.
-        seeds: how many seeds have a stored truth.
+        seeds: how many seeds ``dynamics_truths.py`` computes the truth of; costly systems have fewer.
     """
 
     name: str
