@@ -20,7 +20,7 @@ from calibration_functions import DEVELOPMENT, REPORTING, generator
 from ctxval import Campaign, Trial, cases, searches
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
-from ctxval.certificates import RESOLUTION, StoppingRule, covering
+from ctxval.certificates import RESOLUTION, CertificateOptions, StoppingRule, covering
 from ctxval.certificates.verdict import counterexample
 from ctxval.reproduce.jobs import Job, Results
 
@@ -144,7 +144,7 @@ def _of_system(one: Decision) -> dict[str, Any]:
     experiment = cases.by_name(system.case, one.seed, **dict(system.options))
     threshold, budget = one.share * best_known, BUDGETS[one.dimension]
     campaign = Campaign(experiment.validation, search=searches.by_name(one.search), seed=one.seed)
-    campaign.run_until_decided(threshold, budget)
+    campaign.run_until_decided(threshold, budget, certificate=CertificateOptions.posterior())
     return _summary(
         list(campaign.trials), threshold, decided=StoppingRule(threshold).decide(campaign.trials, 0).decided
     )

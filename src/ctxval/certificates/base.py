@@ -23,6 +23,9 @@ ONE_CAMPAIGN = (
 )
 """The assumption that all certificates share."""
 
+_NOT_PRINTED = ("failures", "checked")
+"""Details that are only in JSON."""
+
 _INDENT = "\n  "
 """Line break within a text: its further lines are indented, so that none looks like a line of the certificate."""
 
@@ -79,8 +82,8 @@ class Certificate:
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """The numbers that are printed; failures are left out, because the assumptions list them."""
-        shown = {name: value for name, value in self.details.items() if name != "failures"}
+        """The numbers that are printed; failures, which the assumptions list, and long lists are left out."""
+        shown = {name: value for name, value in self.details.items() if name not in _NOT_PRINTED}
         return {**shown, "trials": self.trials, "version": self.version}
 
     def __str__(self) -> str:

@@ -33,11 +33,8 @@ FEWEST = 3
 PREDICTIONS = 3
 """Number of the last predictions that must have held."""
 
-SURPRISING = 9.0
-"""Largest squared standardised error of a prediction that held."""
-
-NEGLIGIBLE = 0.02
-"""A distance that differs from its prediction by at most this share of the bound agrees with it in any case."""
+ACCURATE = 0.05
+"""Largest difference between a distance and its prediction that held, as a share of the bound."""
 
 GAP = 0.25
 """Largest gap of the records in a state or an input, as a share of the range that closed loops visit."""
@@ -96,11 +93,11 @@ class Dynamics(CertificateKind):
         largest = details["largest_draw"]
         if largest is None or largest > threshold or details["executions"] < FEWEST:
             return ""
-        checked = details["predictions"][-PREDICTIONS:]
-        held = sum(one["held"] for one in checked)
+        predictions = details["predictions"]
         return (
             f"supported by the model: no draw of the learned dynamics exceeds {threshold:.6g} in a search of "
-            f"{details['evaluations']} closed loops; {held} of the last {len(checked)} predictions held"
+            f"{details['evaluations']} closed loops; {predictions['held']} of the last {predictions['last_ones']} "
+            "predictions held"
         )
 
 
@@ -168,9 +165,11 @@ def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> floa
 
 
 def held(prediction: CheckedPrediction, bound: float) -> bool:
-    """Return whether an execution agrees with its prediction, as far as it matters for a bound."""
-    near = abs(prediction.distance - prediction.median) <= NEGLIGIBLE * bound
-    return prediction.z2 <= SURPRISING or near
+    """Return whether an execution agrees with its prediction, as far as it matters for a bound.
+
+    A vague prediction that covers the distance does not suffice: hidden states make predictions vague.
+    """
+    return abs(prediction.distance - prediction.median) <= ACCURATE * bound
 
 
 def doubt_of(evidence: DynamicsEvidence, bound: float) -> str | None:
@@ -202,13 +201,12 @@ def doubt_of(evidence: DynamicsEvidence, bound: float) -> str | None:
 
 
 def _failed_predictions(failed: Sequence[CheckedPrediction]) -> str:
-    worst = max(failed, key=lambda one: one.z2)
-    size = f"{np.sqrt(worst.z2):.2g} standard deviations" if np.isfinite(worst.z2) else "no prediction was possible"
+    worst = max(failed, key=lambda one: abs(one.distance - one.median))
     return (
         f"of the last {PREDICTIONS} predictions {len(failed)} failed (trial {worst.trial}: distance "
-        f"{worst.distance:.4g} where {worst.median:.4g} was predicted, {size}): until more predictions hold, a state "
-        "that is not recorded, a jump such as a contact or dry friction, or noise is the likely cause; execute more "
-        "tasks, record more states, or use --kind posterior or an audit"
+        f"{worst.distance:.4g} where {worst.median:.4g} was predicted); {PREDICTIONS} must hold in a row. After few "
+        "executions, more of them help. If predictions go on failing, a state that is not recorded, a jump such as a "
+        "contact or dry friction, or noise is the likely cause: record more states, or use --kind posterior or an audit"
     )
 
 
@@ -249,7 +247,7 @@ def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
 
 
 def _details(sample: Sample, evidence: DynamicsEvidence, bound: float) -> dict[str, Any]:
-    finite = evidence.maxima[np.isfinite(evidence.maxima)]
+    finite, last = evidence.maxima[np.isfinite(evidence.maxima)], evidence.predictions[-PREDICTIONS:]
     return {
         "best": sample.best,
         "gap": bound - sample.best,
@@ -258,13 +256,19 @@ def _details(sample: Sample, evidence: DynamicsEvidence, bound: float) -> dict[s
         "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
         "median_draw": float(np.median(finite)) if len(finite) else None,
         "evaluations": evidence.evaluations,
-        "predictions": [{**one.to_json(), "held": bool(held(one, bound))} for one in evidence.predictions],
+        "predictions": {
+            "made": len(evidence.predictions),
+            "stored_beforehand": sum(one.stored for one in evidence.predictions),
+            "last_ones": len(last),
+            "held": sum(held(one, bound) for one in last),
+        },
+        "checked": [{**one.to_json(), "held": bool(held(one, bound))} for one in evidence.predictions],
         "coverage_gap": evidence.coverage.marginal,
         "coverage_gap_of_pairs": evidence.coverage.pair,
         "largest_gap_at": evidence.coverage.place,
         "resolution": evidence.coverage.resolution,
         "noise": evidence.noise,
-        "left_out": evidence.left_out,
+        "variance_left_out": evidence.left_out,
         "failures": sample.failures,
     }
 

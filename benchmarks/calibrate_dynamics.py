@@ -1,0 +1,126 @@
+"""How often is `validated` by learned dynamics false, and what does it cost? Campaigns that run until they are decided.
+
+``python benchmarks/calibrate_dynamics.py`` runs what is not stored yet. Each campaign is given a threshold of a known
+share of d*. The systems of ``dynamics_reporting.py`` were written down before any of them was run, and no threshold of
+the certificate was chosen with them. Stored lines of an earlier ``RULE`` are from earlier rules.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import study_auto
+from calibrate import RESULTS, all_of
+from ctxval import Campaign
+from ctxval._util.arrays import single_threaded
+from ctxval._util.json_lines import JsonLines
+from ctxval.certificates import Certificate, CertificateOptions, Dynamics
+from dynamics_development import DEVELOPMENT, PAPER
+from dynamics_reporting import REPORTING
+from dynamics_truths import truth
+
+RULE = 1
+"""Version of the rule by which campaigns are run now."""
+
+BUDGET = 16
+"""Largest number of executions."""
+
+FALSE, TRUE = (0.95, 0.99), (1.1, 1.25)
+"""Thresholds as shares of d*: those that must not be validated, and those that should be."""
+
+SEEDS = 10
+"""Seeds at 0.95 and 1.1; at 0.99 and 1.25 there are half as many."""
+
+GROUPS = {"reporting": REPORTING, "paper": PAPER, "development": DEVELOPMENT}
+"""Systems; only the first ones had no part in the choice of the rule."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One campaign, fully said by its fields."""
+
+    group: str
+    entry: str
+    seed: int
+    share: float
+
+
+def wanted(group: str, seeds: int = SEEDS) -> Iterator[Run]:
+    """Yield the campaigns of a group, those of seed 0 first."""
+    for seed in range(seeds):
+        for entry in GROUPS[group]:
+            for share in (FALSE[0], TRUE[0], *((FALSE[1], TRUE[1]) if 2 * seed < seeds else ())):
+                yield Run(group, entry, seed, share)
+
+
+def decide(one: Run) -> dict[str, Any]:
+    """Run one campaign until it is decided; return what is stored of it."""
+    started = time.process_time()
+    validation, largest = GROUPS[one.group][one.entry](one.seed).validation, _largest(one)
+    threshold = one.share * largest
+    options = CertificateOptions(Dynamics())
+    with single_threaded():
+        campaign = Campaign(validation, seed=one.seed)
+        campaign.run_until_decided(threshold, BUDGET, certificate=options)
+        verdict = campaign.verdict(threshold, certificate=options)
+    return {
+        "rule": RULE,
+        **dataclasses.asdict(one),
+        "answer": verdict.answer,
+        "executions": campaign.executions,
+        "largest": max(trial.distance or 0.0 for trial in campaign.trials) / largest,
+        **_summary(verdict.certificate, largest),
+        "reason": verdict.reason[:300],
+        "seconds": round(time.process_time() - started, 1),
+    }
+
+
+def _largest(one: Run) -> float:
+    """Return d*."""
+    if one.group == "paper":
+        return float(study_auto.results_of("auto")[one.entry, one.seed, "auto"]["truth"])
+    return float(truth(GROUPS[one.group][one.entry], one.seed)["distance"])
+
+
+def _summary(found: Certificate | None, largest: float) -> dict[str, Any]:
+    if found is None or found.kind != "dynamics":
+        return {}
+    details = found.details
+    return {
+        "bound": found.upper_bound / largest,
+        "evaluations": details["evaluations"],
+        "gap": details["coverage_gap"],
+        "held": [bool(prediction["held"]) for prediction in details["predictions"]],
+        "noise": details["noise"],
+        "left_out": details["left_out"],
+    }
+
+
+STORED = JsonLines(RESULTS / "calibrate_dynamics.jsonl", ("rule", *(field.name for field in dataclasses.fields(Run))))
+
+
+def missing(groups: list[str], seeds: int) -> list[Run]:
+    """Return the campaigns that are not stored."""
+    every = [one for group in groups for one in wanted(group, seeds)]
+    return [one for one in every if (RULE, *dataclasses.astuple(one)) not in STORED]
+
+
+def main() -> None:
+    """Run what is missing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("groups", nargs="*", default=["reporting", "paper", "development"], help=", ".join(GROUPS))
+    parser.add_argument("--seeds", type=int, default=SEEDS)
+    parser.add_argument("--workers", type=int, default=2)
+    arguments = parser.parse_args()
+    for result in all_of(decide, missing(arguments.groups, arguments.seeds), arguments.workers):
+        STORED.append(result)
+        print(*(result[key] for key in ("entry", "seed", "share", "answer", "executions", "seconds")), flush=True)
+
+
+if __name__ == "__main__":
+    main()

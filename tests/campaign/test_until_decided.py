@@ -1,0 +1,139 @@
+"""Campaigns that run until learned dynamics decide: what they execute, store and resume, and when they fall back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conftest import interrupt_at_once, make_validation
+from ctxval import Campaign, cases
+from ctxval.campaign.dynamics import PREDICTION
+from ctxval.campaign.until_decided import next_task
+from ctxval.certificates import Audit, CertificateOptions, Dynamics, DynamicsEvidence, Posterior, StateInputCoverage
+from ctxval.errors import InputError
+
+
+def facts(campaign: Campaign) -> list[tuple[object, ...]]:
+    return [(t.number, t.state, t.unit_point.tobytes(), t.distance, t.note) for t in campaign.trials]
+
+
+def linear(dim: int = 1, seed: int = 0):  # type: ignore[no-untyped-def]
+    case = cases.by_name("linear", seed, dim=dim)
+    assert case.truth is not None
+    return case.validation, case.truth().distance
+
+
+@pytest.mark.slow
+def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true() -> None:
+    validation, largest = linear(2)
+    campaign = Campaign(validation).run_until_decided(1.1 * largest, 12)
+    verdict = campaign.verdict(1.1 * largest)
+    assert verdict.answer == "validated"
+    assert "by a prior on the dynamics" in verdict.reason
+    assert verdict.certificate is not None
+    assert verdict.certificate.upper_bound >= largest * (1 - 1e-6)
+    assert campaign.executions <= 8
+
+
+@pytest.mark.slow
+def test_a_threshold_below_the_maximum_is_falsified() -> None:
+    validation, largest = linear(2)
+    campaign = Campaign(validation).run_until_decided(0.95 * largest, 12)
+    assert campaign.verdict(0.95 * largest).answer == "falsified"
+    assert campaign.executions <= 6
+
+
+@pytest.mark.slow
+def test_it_resumes_with_the_same_choices_and_the_same_predictions(tmp_path: Path) -> None:
+    validation, largest = linear()
+    whole = Campaign(validation, seed=3).run_until_decided(1.1 * largest, 12)
+    store = tmp_path / "a.sqlite"
+    for _ in range(20):
+        pieces = Campaign(linear()[0], seed=3, store=store)
+        try:
+            pieces.run_until_decided(1.1 * largest, 12, on_trial=lambda trial: interrupt_at_once())
+        except KeyboardInterrupt:
+            continue
+        break
+    assert facts(pieces) == facts(whole)
+    assert any(PREDICTION in (trial.note or {}) for trial in whole.trials)
+
+
+@pytest.mark.slow
+def test_predictions_are_stored_before_executions_and_equal_those_computed_afterwards() -> None:
+    validation, largest = linear()
+    campaign = Campaign(validation, seed=1).run_until_decided(1.1 * largest, 12)
+    dynamics = campaign._recorder.dynamics
+    stored = dynamics.evidence(campaign.trials)
+    without = [replace(trial, note=None) for trial in campaign.trials]
+    anew = dynamics.evidence(without)
+    assert stored is not None
+    assert anew is not None
+    assert all(one.stored for one in stored.predictions)
+    assert not any(one.stored for one in anew.predictions)
+    for one, other in zip(stored.predictions[-3:], anew.predictions, strict=True):
+        assert (one.trial, one.distance) == (other.trial, other.distance)
+        assert one.median == pytest.approx(other.median, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_plain_run_is_certified_by_predictions_that_are_computed_afterwards() -> None:
+    validation, largest = linear()
+    campaign = Campaign(validation).run(5)
+    verdict = campaign.verdict(1.2 * largest, certificate=CertificateOptions(Dynamics()))
+    assert verdict.certificate is not None
+    assert verdict.certificate.details["predictions"]["stored_beforehand"] == 0
+    assert verdict.certificate.details["predictions"]["made"] == 3
+
+
+def test_an_audit_cannot_end_it() -> None:
+    validation, _ = linear()
+    with pytest.raises(InputError, match=r"needs a bound on d\* \(auto, dynamics or posterior\), got 'audit'"):
+        Campaign(validation).run_until_decided(1.0, 5, certificate=CertificateOptions(Audit(), volume=0.1))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_draws")
+def test_the_posterior_bound_predicts_nothing() -> None:
+    campaign = Campaign(make_validation(), seed=1)
+    campaign.run_until_decided(1e3, 20, certificate=CertificateOptions(Posterior()))
+    assert campaign.verdict(1e3).answer == "validated"
+    assert not any(PREDICTION in (trial.note or {}) for trial in campaign.trials)
+
+
+def evidence(upper: float = 1.0, highest: float = 0.9) -> DynamicsEvidence:
+    rng = np.random.default_rng(0)
+    covered = StateInputCoverage(0.4, 0.4, "x[0]", {"x[0]": 0.0}, {"x[0]": 0.1}, np.array([0.11, 0.22]), 9)
+    return DynamicsEvidence(
+        np.linspace(0.5 * upper, upper, 40),
+        rng.random((40, 2)),
+        highest,
+        rng.random((5, 2)),
+        99,
+        4,
+        0.0,
+        0.0,
+        (),
+        covered,
+    )
+
+
+def test_what_is_executed_next_depends_on_what_stands_in_the_way() -> None:
+    known = np.array([[0.9, 0.9]])
+    contested = evidence()
+    at_bound = contested.points[38]
+    assert np.array_equal(next_task(contested, known, 0.5, 0.95), contested.elites[0])  # type: ignore[arg-type]
+    assert np.array_equal(next_task(contested, known, 0.95, 0.95), at_bound)  # type: ignore[arg-type]
+    assert np.array_equal(next_task(contested, known, 2.0, 0.95), [0.11, 0.22])  # type: ignore[arg-type]
+    # Every third execution explores, and no task is executed twice.
+    assert np.array_equal(next_task(contested, np.tile(known, (2, 1)), 0.5, 0.95), [0.11, 0.22])  # type: ignore[arg-type]
+    again = np.array([[0.9, 0.9], [0.8, 0.8], [0.7, 0.7], [0.11, 0.22]])
+    assert np.array_equal(next_task(contested, again, 2.0, 0.95), at_bound)  # type: ignore[arg-type]
+
+
+def test_a_threshold_must_be_positive() -> None:
+    with pytest.raises(InputError, match="threshold"):
+        Campaign(linear()[0]).run_until_decided(-1.0, 5)

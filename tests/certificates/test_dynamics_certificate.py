@@ -1,0 +1,207 @@
+"""The bound from learned dynamics, from evidence in plain numbers: its order statistic and what withdraws it."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctxval import Trial
+from ctxval.certificates import (
+    KINDS,
+    Automatic,
+    CertificateOptions,
+    CheckedPrediction,
+    Dynamics,
+    DynamicsEvidence,
+    Posterior,
+    Provenance,
+    Sample,
+    StateInputCoverage,
+    certify_dynamics,
+)
+from ctxval.certificates.dynamics import ACCURATE, FEWEST, GAP, NOISE, PAIR_GAP, PREDICTIONS, bound_of
+from ctxval.certificates.verdict import judge
+from ctxval.errors import CertificateError
+
+
+def prediction(trial: int, median: float = 0.5, distance: float = 0.5) -> CheckedPrediction:
+    return CheckedPrediction(trial, 1.0, 0.5, median, distance, stored=True)
+
+
+COVERED = StateInputCoverage(0.1, 0.2, "u[0]", {"x[0]": 1.0, "u[0]": 3.0}, {"x[0]": 0.1, "u[0]": 0.2}, np.zeros(2), 99)
+GOOD = DynamicsEvidence(
+    maxima=np.linspace(0.9, 1.0, 40),
+    points=np.random.default_rng(0).random((40, 2)),
+    highest=0.95,
+    elites=np.random.default_rng(1).random((5, 2)),
+    evaluations=9000,
+    executions=4,
+    left_out=0.01,
+    noise=1e-6,
+    predictions=tuple(prediction(k) for k in range(1, 4)),
+    coverage=COVERED,
+)
+
+
+def trials(count: int = 4, largest: float = 0.5) -> list[Trial]:
+    points = np.random.default_rng(2).random((count, 2))
+    distances = np.linspace(0.1, largest, count)
+    return [
+        Trial(k, "acquisition", "completed", points[k], {"a": 0.0}, 1, True, float(distances[k])) for k in range(count)
+    ]
+
+
+class Learned:
+    """Numbers in place of a model."""
+
+    def __init__(self, evidence: DynamicsEvidence | None) -> None:
+        self.evidence = evidence
+
+    def dynamics(self) -> DynamicsEvidence | None:
+        return self.evidence
+
+    def expected(self, points: np.ndarray, before: int) -> np.ndarray:
+        return np.full(len(points), np.nan)
+
+    def tasks(self, count: int, seed: int) -> np.ndarray:
+        return np.random.default_rng(seed).random((count, 2))
+
+
+def sample(evidence: DynamicsEvidence | None = GOOD, count: int = 4) -> Sample:
+    return replace(Sample.of(trials(count)), learned=Learned(evidence))
+
+
+def test_the_bound_is_the_order_statistic_of_the_maxima() -> None:
+    found = certify_dynamics(sample(), GOOD)
+    assert found.doubt is None
+    assert found.upper_bound == np.sort(GOOD.maxima)[38]  # 39 of 41 are 0.951
+    assert certify_dynamics(sample(), GOOD, 0.9).upper_bound == np.sort(GOOD.maxima)[36]
+    with pytest.raises(CertificateError, match="needs more than the 40 draws"):
+        certify_dynamics(sample(), GOOD, 0.99)
+
+
+def test_exchangeable_maxima_exceed_the_bound_as_rarely_as_stated() -> None:
+    """1e5 truths that are exchangeable with the draws, with any distribution of the maxima."""
+    rng = np.random.default_rng(3)
+    maxima = rng.lognormal(size=(100_000, 41))
+    upper = np.sort(maxima[:, 1:], axis=1)[:, GOOD.rank(0.95)]
+    assert (maxima[:, 0] > upper).mean() == pytest.approx(1 - 39 / 41, abs=0.003)
+
+
+@given(st.lists(st.tuples(st.floats(0, 2), st.floats(0, 2)), min_size=3, max_size=6), st.floats(0.01, 3))
+def test_the_bound_is_never_below_what_was_executed_and_never_lowered_by_a_prediction(
+    pairs: list[tuple[float, float]], best: float
+) -> None:
+    evidence = replace(GOOD, predictions=tuple(prediction(k, *pair) for k, pair in enumerate(pairs)))
+    bound = bound_of(evidence, best, 0.95)
+    assert bound >= max(best, evidence.upper(0.95))
+    excess = max(max(distance - median, 0.0) for median, distance in pairs[-PREDICTIONS:])
+    assert bound == pytest.approx(max(best, evidence.upper(0.95)) + 0.5 * excess)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"executions": FEWEST - 1}, "needs at least 3"),
+        ({"predictions": GOOD.predictions[:2]}, "2 executions were predicted beforehand"),
+        ({"predictions": (prediction(1), prediction(2, 0.5, 0.5 + 2 * ACCURATE), prediction(3))}, "trial 2: distance"),
+        ({"predictions": (prediction(1), prediction(2, 0.9, 0.5), prediction(3))}, "contact or dry friction"),
+        ({"noise": 2 * NOISE}, "2 % of the variance of the residual"),
+        ({"coverage": replace(COVERED, marginal=1.1 * GAP)}, r"away from every record in u\[0\]"),
+        ({"coverage": replace(COVERED, pair=1.1 * PAIR_GAP)}, "in two coordinates together"),
+    ],
+)
+def test_each_diagnostic_withdraws_the_bound_and_says_what_helps(changed: dict[str, object], said: str) -> None:
+    found = certify_dynamics(sample(), replace(GOOD, **changed))  # type: ignore[arg-type]
+    assert found.doubt is not None
+    assert not found.covers(1e9)
+    assert re.search(said, found.doubt)
+    assert any(word in found.doubt for word in ("execute", "execution", "record more"))
+
+
+def test_a_failure_long_ago_is_forgiven() -> None:
+    old = (prediction(0, 0.1, 0.5), *GOOD.predictions)
+    assert certify_dynamics(sample(), replace(GOOD, predictions=old)).doubt is None
+
+
+def test_a_draw_that_diverges_leaves_no_bound() -> None:
+    diverging = replace(GOOD, maxima=np.append(GOOD.maxima[:-2], [np.inf, np.inf]))
+    with pytest.raises(CertificateError, match="some draws diverge"):
+        certify_dynamics(sample(), diverging)
+    one = replace(GOOD, maxima=np.append(GOOD.maxima[:-1], np.inf))
+    found = certify_dynamics(sample(), one)
+    assert found.details["largest_draw"] is None
+    json.dumps(found.to_json(), allow_nan=False)
+
+
+def test_many_coordinates_are_said_not_to_be_covered_jointly() -> None:
+    wide = StateInputCoverage(0.1, None, "x[0]", {f"x[{i}]": 0.0 for i in range(8)}, COVERED.resolution, np.zeros(2), 9)
+    assert any(
+        "not all combinations" in one for one in certify_dynamics(sample(), replace(GOOD, coverage=wide)).assumptions
+    )
+
+
+def test_it_needs_the_model_and_executions_that_did_not_fail() -> None:
+    with pytest.raises(CertificateError, match="experiment is not loaded"):
+        Dynamics().certify(Sample.of(trials()))
+    with pytest.raises(CertificateError, match="no dynamics can be learned"):
+        Dynamics().certify(sample(None))
+    failed = [*trials(3), replace(trials(4)[3], state="failed", distance=None, failure="it fell")]
+    with pytest.raises(CertificateError, match="trial 3 failed"):
+        Dynamics().certify(replace(Sample.of(failed), learned=Learned(GOOD)))
+
+
+def test_the_verdict_names_its_evidence() -> None:
+    known = Provenance(learned=Learned(GOOD))
+    verdict = judge(trials(), 1.1, CertificateOptions(Dynamics()), known)
+    assert str(verdict).startswith("validated: by a prior on the dynamics, the dynamics bound of 4 trials is ")
+    assert verdict.rests_on is not None
+    assert "the recorded state being complete" in verdict.rests_on
+
+
+def test_a_gate_that_passes_only_in_part_is_support_and_no_validation() -> None:
+    part = Learned(replace(GOOD, coverage=replace(COVERED, marginal=0.4)))
+    verdict = judge(trials(), 1.1, CertificateOptions(Dynamics()), Provenance(learned=part))
+    assert verdict.answer == "undecided"
+    assert verdict.reason.startswith(
+        "supported by the model: no draw of the learned dynamics exceeds 1.1 in a search of 9000 closed loops; 3 of "
+        "the last 3 predictions held; but closed loops of the tasks lead 40 % of its range away from every record in u[0]"
+    )
+    above = judge(trials(), 0.95, CertificateOptions(Dynamics()), Provenance(learned=Learned(GOOD)))
+    assert above.answer == "undecided"
+    assert "d* may be up to" in above.reason
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_auto_uses_the_dynamics_if_they_decide_and_the_distance_otherwise() -> None:
+    chosen = CertificateOptions(Automatic())
+    assert judge(trials(), 1.1, chosen, Provenance(learned=Learned(GOOD))).certificate.kind == "dynamics"  # type: ignore[union-attr]
+    noisy = Provenance(learned=Learned(replace(GOOD, noise=0.5, maxima=GOOD.maxima + 1)))
+    assert judge(trials(9), 1.1, chosen, noisy).certificate.kind == "posterior"  # type: ignore[union-attr]
+    alone = judge(trials(9), 1.1, chosen)
+    assert alone.reason == judge(trials(9), 1.1, CertificateOptions(Posterior())).reason
+    stochastic = judge(
+        trials(9), 1.1, CertificateOptions(Automatic(stochastic=True)), Provenance(learned=Learned(GOOD))
+    )
+    assert stochastic.certificate.kind == "posterior"  # type: ignore[union-attr]
+
+
+def test_the_kinds_are_found_by_name() -> None:
+    assert KINDS.find("dynamics") is Dynamics
+    assert KINDS.find("auto") is Automatic
+    assert KINDS.find("dynamics").needs_model
+
+
+def test_the_text_is_complete_and_json_has_every_prediction() -> None:
+    found = certify_dynamics(sample(), GOOD)
+    assert "With probability 0.95 under the prior on the residual dynamics, d* is at most" in str(found)
+    assert "x[0] 0.1, u[0] 0.2" in str(found)
+    stored = json.loads(json.dumps(found.to_json(), allow_nan=False))["details"]
+    assert [one["trial"] for one in stored["checked"]] == [1, 2, 3]
+    assert stored["predictions"] == {"made": 3, "stored_beforehand": 3, "last_ones": 3, "held": 3}
