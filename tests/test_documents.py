@@ -10,13 +10,17 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
+from conftest import Predicted
 from ctxval.certificates import (
     KINDS,
+    Mean,
     Sample,
     certify_anytime,
     certify_audit,
     certify_convergence,
+    certify_mean,
     certify_posterior,
+    certify_region,
     draw_maxima,
 )
 from ctxval.config.settings import Settings
@@ -75,11 +79,14 @@ def keys(report: Any) -> set[str]:
 def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
     points = np.linspace(0.05, 0.95, 8)[:, None]
     origins: list[Origin] = ["iid"] * 4 + ["acquisition"] * 4
-    sample = Sample(points, np.sin(5 * points[:, 0]) + 2, origins, ["completed"] * 8)
+    learned = Predicted(lambda p: p[:, 0])
+    sample = Sample(points, np.sin(5 * points[:, 0]) + 2, origins, ["completed"] * 8, learned=learned)
     certificates = [
         certify_audit(sample),
         certify_anytime(sample, 3.0),
         certify_convergence(sample, 1.0),
+        certify_mean(sample, options=Mean(quantile=0.5, largest_possible=4.0)),
+        certify_region(sample, 3.0),
         certify_posterior(sample, 0.5, found=draw_maxima(sample, draws=4, paths=2)),
     ]
     used = set().union(*(keys(certificate.to_json()) for certificate in certificates))

@@ -234,7 +234,6 @@ def _details(
         "upper_limit": interval.high,
         "interval": "asymptotic" if options.largest_possible is None else "valid in finite samples",
         **(quantile if options.quantile is not None else {}),
-        "draws": len(draws.values),
         "mean_drawn": float(draws.values.mean()),
         "weight": interval.weight,
         "variance_left": interval.variance_left,

@@ -108,12 +108,14 @@ class _Map:
         count: number M of tasks.
         outside: number of the tasks whose bound exceeds the limit or cannot be predicted.
         unpredicted: number of the tasks that cannot be predicted.
+        fixed: whether the limit was given; else it is the largest of these bounds.
     """
 
     limit: float
     count: int
     outside: int
     unpredicted: int
+    fixed: bool
 
     @property
     def share(self) -> float:
@@ -128,7 +130,13 @@ class _Map:
 
     def volume_outside(self, beta: float) -> float:
         """Return an upper bound on the share outside, which is wrong with probability at most beta."""
-        return 1.0 if self.outside == self.count else volume_bound(self.count, self.outside, beta)
+        if self.outside == self.count:
+            return 1.0
+        if self.fixed:
+            return volume_bound(self.count, self.outside, beta)
+        # The tasks without a prediction, and those above the largest of the others, which the draws did not fix.
+        known = self.count - self.unpredicted
+        return volume_bound(self.count, self.unpredicted, beta / 2) + volume_bound(known, 0, beta / 2)
 
 
 def certify_region(
@@ -162,7 +170,7 @@ def certify_region(
     total = min(1.0, volume + mapped.volume_outside(_OF_MAP * beta))
     return Certificate(
         kind="region",
-        statement=_statement(sample, margin, volume, mapped, total, confidence, threshold is not None),
+        statement=_statement(sample, margin, volume, mapped, total, confidence),
         upper_bound=mapped.limit,
         confidence=confidence,
         volume=total,
@@ -210,12 +218,10 @@ def _map_of(bounds: Array, threshold: float | None) -> _Map:
     """Return the map of predicted bounds ``(M,)``, which are NaN if a task cannot be predicted."""
     known = bounds[~np.isnan(bounds)]
     limit = float(known.max(initial=-np.inf)) if threshold is None else float(threshold)
-    return _Map(limit, len(bounds), int((~(bounds <= limit)).sum()), len(bounds) - len(known))
+    return _Map(limit, len(bounds), int((~(bounds <= limit)).sum()), len(bounds) - len(known), threshold is not None)
 
 
-def _statement(
-    sample: Sample, margin: _Margin, volume: float, mapped: _Map, total: float, confidence: float, against: bool
-) -> str:
+def _statement(sample: Sample, margin: _Margin, volume: float, mapped: _Map, total: float, confidence: float) -> str:
     tasks, q = of_tasks(sample.distribution), margin.value
     excess = (
         f"exceeds the predicted one by at most {at_most(q)}"
@@ -226,7 +232,7 @@ def _statement(
         f"With confidence {confidence}, the distance {excess}, except on at most {at_most(100 * volume, 3)} % {tasks}; "
     )
     share, error = f"{100 * mapped.share:.4g} ± {at_most(100 * mapped.error, 2)} %", f"{mapped.count} predicted tasks"
-    if against:
+    if mapped.fixed:
         kept = f"this prediction keeps {mapped.limit:.6g} on {share} {tasks} (an estimate from {error})"
     else:
         kept = f"this prediction is at most {at_most(mapped.limit)} on each of {error} that it covers"
@@ -240,7 +246,6 @@ def _details(sample: Sample, margin: _Margin, volume: float, mapped: _Map, disca
     return {
         "margin": margin.value,
         "discarded": discard,
-        "draws": len(margin.drawn),
         "volume_of_draws": volume,
         "learned_before": margin.before,
         "predictions": mapped.count,

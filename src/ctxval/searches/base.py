@@ -86,7 +86,8 @@ class BaseSearch(ABC):
     A subclass implements these three methods. All others have a default, which does nothing.
 
     Attributes:
-        iid: whether every point is an independent uniform draw.
+        iid: whether every point is an independent uniform draw. If the task space has a distribution of tasks, a
+            campaign replaces the points by draws from it.
         initial: number of points at the start that are an initial design.
         discard: number of the largest values that the estimate of the maximum leaves out.
     """
