@@ -371,7 +371,7 @@ def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: 
         ),
         (
             ["--discard", "2"],
-            "discard is for certificates of the kind sampling-discarding; the kind here is posterior",
+            "discard is for certificates of the kind region or sampling-discarding; the kind here is posterior",
         ),
         (
             ["--kind", "audit", "--stochastic"],
@@ -384,7 +384,7 @@ def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: 
         (["--kind", "scenario", "--theorem", "1,2,3,4,5"], "theorem is for certificates of the kind convergence"),
         (
             ["--volume", "0.1", "--threshold", "9"],
-            "volume is for certificates of the kind anytime or audit or sampling-discarding or scenario",
+            "volume is for certificates of the kind anytime or audit or region or sampling-discarding or scenario",
         ),
         (["--kind", "audit", "--volume", "0.1"], "--volume needs --threshold"),
         (

@@ -127,8 +127,8 @@ class CertificateKind(ABC):
 
     A kind is a frozen dataclass with a name and a method that computes a certificate from trials. The other methods
     state what a verdict by it rests on, and refuse a useless audit before its draws are executed.
-    Their defaults suit a bound on d* that is computed from the distances alone. If a kind needs numbers that the
-    trials do not contain, such as draws of d* under a learned model of the dynamics, it has a field for them.
+    Their defaults suit a bound on d* that is computed from the distances alone. If a kind uses what the experiment's
+    model predicts, it sets ``needs_model`` and reads :attr:`Sample.learned`.
     """
 
     name: ClassVar[str]
