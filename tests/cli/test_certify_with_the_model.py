@@ -169,3 +169,18 @@ def test_a_store_made_in_python_asks_for_its_experiment(tmp_path: Path, monkeypa
     refused = invoke("certify", "own.sqlite", "--kind", "region")
     assert refused.exit_code == 2
     assert "name the experiment with --experiment FILE.toml" in " ".join(refused.stderr.split())
+
+
+def test_what_was_planned_for_a_kind_holds_although_the_kind_is_named_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("planned_parts.py").write_text(PARTS)
+    Path("rotor.toml").write_text(
+        f'{FILE.replace("rotor_parts", "planned_parts")}[certificate]\nkind = "region"\ndiscard = 2\n'
+    )
+    assert invoke("run", "rotor.toml", "--budget", "4", "--store", "r.sqlite", "--search", "cma-es").exit_code == 0
+    assert invoke("certify", "r.sqlite", "--audit", "12").exit_code == 0
+    for named in ((), ("--kind", "region")):
+        shown = invoke("certify", "r.sqlite", *named, "--json")
+        assert json.loads(shown.stdout)["details"]["discarded"] == 2

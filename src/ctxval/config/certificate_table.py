@@ -71,7 +71,8 @@ class CertificateTable(BaseModel):
 
         Args:
             confidence: the confidence level of the certificate.
-            kind: replaces the kind of the table; the options of the table's own kind are then not used.
+            kind: if it is another kind than that of the table, it replaces it, and the options of the table's own kind
+                are not used.
             stated: options that override those of the table; no value is None.
 
         Raises:
@@ -80,10 +81,11 @@ class CertificateTable(BaseModel):
             InputError: if an option has the wrong type, or if the confidence or the volume is out of range.
         """
         given, chosen = dict(stated or {}), KINDS.find(kind or self.kind)
-        if kind is None and self.kind not in KINDS.imported:
+        planned_kind = kind is None or kind == self.kind
+        if planned_kind and self.kind not in KINDS.imported:
             typed(chosen, self.model_extra or {})
         require_use(chosen.name, given)
-        planned = self.model_dump() if kind is None else self.model_dump(include=set(_OF_ANY_KIND))
+        planned = self.model_dump() if planned_kind else self.model_dump(include=set(_OF_ANY_KIND))
         merged = {**planned, **typed(chosen, given)}
         return CertificateOptions(chosen.of(merged), confidence, merged["volume"])
 
