@@ -106,7 +106,7 @@ def test_the_posterior_bound_predicts_nothing() -> None:
 
 def evidence(upper: float = 1.0, highest: float = 0.9) -> DynamicsEvidence:
     rng = np.random.default_rng(0)
-    covered = StateInputCoverage(0.4, 0.4, "x[0]", {"x[0]": 0.0}, {"x[0]": 0.1}, np.array([0.11, 0.22]), 9)
+    covered = StateInputCoverage(0.4, 0.4, 0.4, "x[0]", {"x[0]": 0.0}, {"x[0]": 0.1}, np.array([0.11, 0.22]), 9)
     return DynamicsEvidence(
         np.linspace(0.5 * upper, upper, 40),
         rng.random((40, 2)),

@@ -25,7 +25,7 @@ from ctxval.certificates import (
     StateInputCoverage,
     certify_dynamics,
 )
-from ctxval.certificates.dynamics import ACCURATE, FEWEST, GAP, NOISE, PAIR_GAP, PREDICTIONS, bound_of
+from ctxval.certificates.dynamics import ACCURATE, BEYOND, FEWEST, GAP, NOISE, PAIR_GAP, PREDICTIONS, bound_of
 from ctxval.certificates.verdict import judge
 from ctxval.errors import CertificateError
 
@@ -34,7 +34,9 @@ def prediction(trial: int, median: float = 0.5, distance: float = 0.5) -> Checke
     return CheckedPrediction(trial, 1.0, 0.5, median, distance, stored=True)
 
 
-COVERED = StateInputCoverage(0.1, 0.2, "u[0]", {"x[0]": 1.0, "u[0]": 3.0}, {"x[0]": 0.1, "u[0]": 0.2}, np.zeros(2), 99)
+COVERED = StateInputCoverage(
+    0.1, 0.01, 0.2, "u[0]", {"x[0]": 1.0, "u[0]": 3.0}, {"x[0]": 0.1, "u[0]": 0.2}, np.zeros(2), 99
+)
 GOOD = DynamicsEvidence(
     maxima=np.linspace(0.9, 1.0, 40),
     points=np.random.default_rng(0).random((40, 2)),
@@ -113,7 +115,8 @@ def test_the_bound_is_never_below_what_was_executed_and_never_lowered_by_a_predi
         ({"predictions": (prediction(1), prediction(2, 0.5, 0.5 + 2 * ACCURATE), prediction(3))}, "trial 2: distance"),
         ({"predictions": (prediction(1), prediction(2, 0.9, 0.5), prediction(3))}, "contact or dry friction"),
         ({"noise": 2 * NOISE}, "2 % of the variance of the residual"),
-        ({"coverage": replace(COVERED, marginal=1.1 * GAP)}, r"away from every record in u\[0\]"),
+        ({"coverage": replace(COVERED, marginal=1.1 * GAP)}, r"away from every record of u\[0\]"),
+        ({"coverage": replace(COVERED, beyond=2 * BEYOND)}, r"4 % of its range beyond all records of u\[0\]"),
         ({"coverage": replace(COVERED, pair=1.1 * PAIR_GAP)}, "in two coordinates together"),
     ],
 )
@@ -141,7 +144,9 @@ def test_a_draw_that_diverges_leaves_no_bound() -> None:
 
 
 def test_many_coordinates_are_said_not_to_be_covered_jointly() -> None:
-    wide = StateInputCoverage(0.1, None, "x[0]", {f"x[{i}]": 0.0 for i in range(8)}, COVERED.resolution, np.zeros(2), 9)
+    wide = StateInputCoverage(
+        0.1, 0.0, None, "x[0]", {f"x[{i}]": 0.0 for i in range(8)}, COVERED.resolution, np.zeros(2), 9
+    )
     assert any(
         "not all combinations" in one for one in certify_dynamics(sample(), replace(GOOD, coverage=wide)).assumptions
     )
@@ -171,7 +176,7 @@ def test_a_gate_that_passes_only_in_part_is_support_and_no_validation() -> None:
     assert verdict.answer == "undecided"
     assert verdict.reason.startswith(
         "supported by the model: no draw of the learned dynamics exceeds 1.1 in a search of 9000 closed loops; 3 of "
-        "the last 3 predictions held; but closed loops of the tasks lead 40 % of its range away from every record in u[0]"
+        "the last 3 predictions held; but closed loops of the tasks lead 40 % of its range away from every record of "
     )
     above = judge(trials(), 0.95, CertificateOptions(Dynamics()), Provenance(learned=Learned(GOOD)))
     assert above.answer == "undecided"

@@ -121,6 +121,7 @@ def _coverage(found: Coverage, inputs: int) -> StateInputCoverage:
     names = [*(f"x[{i}]" for i in range(states)), *(f"u[{i}]" for i in range(inputs))]
     return StateInputCoverage(
         found.marginal,
+        found.beyond,
         found.pair,
         names[found.coordinate],
         dict(zip(names, found.place.tolist(), strict=True)),

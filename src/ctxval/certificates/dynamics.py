@@ -21,7 +21,7 @@ import numpy as np
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
 from ctxval.certificates.bounds import require_probability
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputCoverage
 from ctxval.certificates.learned import require_learned
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.core.space import TaskSpace
@@ -38,6 +38,10 @@ ACCURATE = 0.05
 
 GAP = 0.25
 """Largest gap of the records in a state or an input, as a share of the range that closed loops visit."""
+
+BEYOND = 0.02
+"""Largest excess of a state or an input over its largest record, or below its smallest one, as a share of that range.
+Contacts, end stops and saturation lie beyond what is recorded more often than between records."""
 
 PAIR_GAP = 0.5
 """The same for two of them together."""
@@ -195,9 +199,7 @@ def doubt_of(evidence: DynamicsEvidence, bound: float) -> str | None:
             f"{100 * NOISE:g} % is allowed: the system is not deterministic in the recorded state and input; record "
             "more states or reduce the noise, or use --kind posterior with --stochastic"
         )
-    if coverage.marginal > GAP or (coverage.pair is not None and coverage.pair > PAIR_GAP):
-        return _uncovered(evidence)
-    return None
+    return _uncovered(coverage)
 
 
 def _failed_predictions(failed: Sequence[CheckedPrediction]) -> str:
@@ -210,16 +212,19 @@ def _failed_predictions(failed: Sequence[CheckedPrediction]) -> str:
     )
 
 
-def _uncovered(evidence: DynamicsEvidence) -> str:
-    coverage = evidence.coverage
-    place = _texts(coverage.place)
-    if coverage.marginal > GAP:
-        what = f"{100 * coverage.marginal:.0f} % of its range away from every record in {coverage.coordinate}"
+def _uncovered(coverage: StateInputCoverage) -> str | None:
+    """Return what the records do not cover; None if nothing."""
+    if coverage.beyond > BEYOND:
+        what = f"{100 * coverage.beyond:.2g} % of its range beyond all records of {coverage.coordinate}"
+    elif coverage.marginal > GAP:
+        what = f"{100 * coverage.marginal:.0f} % of its range away from every record of {coverage.coordinate}"
+    elif coverage.pair is not None and coverage.pair > PAIR_GAP:
+        what = f"{100 * coverage.pair:.0f} % of the ranges away from every record in two coordinates together"
     else:
-        what = f"{100 * (coverage.pair or 0):.0f} % of the ranges away from every record in two coordinates together"
+        return None
     return (
-        f"closed loops of the tasks lead {what}, such as to {place}; an execution of a task that leads there helps "
-        "(--until-decided executes it)"
+        f"closed loops of the tasks lead {what}, such as to {_texts(coverage.place)}; an execution of a task that leads "
+        "there helps (--until-decided executes it)"
     )
 
 
@@ -264,6 +269,7 @@ def _details(sample: Sample, evidence: DynamicsEvidence, bound: float) -> dict[s
         },
         "checked": [{**one.to_json(), "held": bool(held(one, bound))} for one in evidence.predictions],
         "coverage_gap": evidence.coverage.marginal,
+        "beyond_the_records": evidence.coverage.beyond,
         "coverage_gap_of_pairs": evidence.coverage.pair,
         "largest_gap_at": evidence.coverage.place,
         "resolution": evidence.coverage.resolution,

@@ -51,6 +51,7 @@ class StateInputCoverage:
 
     Attributes:
         marginal: the largest gap in a single coordinate, as a share of the visited range.
+        beyond: how far the loops lead beyond the smallest or the largest record of a single coordinate.
         pair: the largest gap in two coordinates together; None if there are too many coordinates to compare pairs.
         coordinate: the coordinate with the largest gap, such as ``x[1]`` or ``u[0]``.
         place: state and input where this gap is, by coordinate, in the units of the system.
@@ -60,6 +61,7 @@ class StateInputCoverage:
     """
 
     marginal: float
+    beyond: float
     pair: float | None
     coordinate: str
     place: dict[str, float]

@@ -19,8 +19,6 @@ from ctxval.learning.execution_prediction import ExecutionPrediction, predict_ex
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings, loop_pairs
 
-_COVERED = 256
-"""Number of tasks of the pool whose closed loops are compared with the records."""
 _PAIRS = 300
 """Largest number of pairs from which the pivots of a single task are chosen."""
 
@@ -93,8 +91,8 @@ class LearnedDynamics:
     def coverage(self) -> Coverage:
         """How well the records cover the closed loops of the tasks, in states and inputs."""
         with single_threaded():
-            tasks = np.concatenate([self.study.search.pool[:_COVERED], self.worst_case.elites])
-            return coverage(self.study.planner, self.posterior, tasks)
+            search = self.study.search
+            return coverage(self.study.planner, self.posterior, search.pool, search.plans)
 
     def predict(self, point: Array) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""

@@ -110,7 +110,8 @@ class WorstCaseSearch:
         return np.asarray(np.where(ends, np.round(points), points))
 
     @functools.cached_property
-    def _plans(self) -> list[PlannedTasks]:
+    def plans(self) -> list[PlannedTasks]:
+        """The plans of the pool."""
         return self.planner.plan(self.pool)
 
     def maxima(self, posterior: DynamicsPosterior, known: Array, rng: np.random.Generator) -> WorstCase:
@@ -137,7 +138,7 @@ class WorstCaseSearch:
 
     def _search_mean(self, mean: DynamicsDraws, known: Array, rng: np.random.Generator) -> tuple[float, Array, int]:
         """Return the largest distance on the posterior mean, tasks with large distances, and the number of loops."""
-        of_pool = _finite(self.planner.distances(mean, self._plans, len(self.pool)))[0]
+        of_pool = _finite(self.planner.distances(mean, self.plans, len(self.pool)))[0]
         best = self.pool[np.argsort(-of_pool, kind="stable")[: self.settings.elites * 4]]
 
         def distance(points: Array) -> Array:
