@@ -55,9 +55,13 @@ class Evaluations:
             self._values.append(values[: len(asked)])
         return values
 
+    def in_order(self) -> tuple[Array, Array]:
+        """Return all points ``(m, d)`` and their values ``(m,)`` as they were evaluated."""
+        return np.concatenate(self._points), np.concatenate(self._values)
+
     def found(self) -> tuple[Array, Array]:
         """Return all points ``(m, d)`` and their values ``(m,)``, the largest first."""
-        points, values = np.concatenate(self._points), np.concatenate(self._values)
+        points, values = self.in_order()
         order = np.argsort(-values, kind="stable")
         return points[order], values[order]
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import separated_rows
@@ -32,6 +33,8 @@ _STEPS = (0.3, 0.005)
 """Largest standard deviation of a mutation in the first and in the last generation."""
 _SPREAD = 0.03
 """Smallest standard deviation of a mutation, as a share of the largest one."""
+_PROMINENT = 200
+"""Number of prominent points that are remembered."""
 _POOL = 100
 """Number of best points of whose differences moves are made."""
 _CLIMBED = 4
@@ -106,9 +109,10 @@ def _geometric(ends: tuple[float, float], share: float) -> float:
 
 
 def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
-    """Evaluate generations of offspring of the best points that are apart from each other."""
+    """Evaluate generations of offspring of good points and of prominent points, each set apart from each other."""
     count = done.left - int((1 - _EVOLVED) * done.budget)
     sizes = _batches(count, done.budget, int(np.clip(np.sqrt(done.budget) / 4, 3, _GENERATIONS)))
+    prominence = _Prominence()
     for generation, size in enumerate(sizes):
         share = generation / max(1, len(sizes) - 1)
         points, values = done.found()
@@ -116,8 +120,56 @@ def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
         if not len(finite):
             done.evaluate(done.samples(size, rng))
             continue
-        parents = _apart(finite, _geometric(_REACHES, share))
-        done.evaluate(_offspring(parents, finite[:_POOL], _geometric(_STEPS, share), size, rng))
+        reach, step = _geometric(_REACHES, share), _geometric(_STEPS, share)
+        prominent = prominence.update(*done.in_order())
+        first = _offspring(_apart(finite, reach), finite[:_POOL], step, size - size // 2, rng)
+        second = _offspring(_apart(prominent, _REACHES[-1]), finite[:_POOL], step, size // 2, rng)
+        done.evaluate(np.concatenate([first, second]))
+
+
+class _Prominence:
+    """The points whose values exceed most what a linear function through their neighbours predicts.
+
+    A smooth function has small prominences once its samples are dense; the way to a cliff stays prominent.
+    """
+
+    def __init__(self) -> None:
+        self._seen = 0
+        self._kept: Rows = np.empty(0, dtype=np.intp)
+
+    def update(self, points: Array, values: Array) -> Array:
+        """Return the most prominent points, the most prominent first, among the new ones and those kept before.
+
+        Args:
+            points, values: all evaluations in their order, shapes ``(m, d)`` and ``(m,)``.
+        """
+        rows = np.concatenate([self._kept, np.arange(self._seen, len(points))])
+        self._seen = len(points)
+        found = _prominences(points, _compressed(values), rows)
+        order = np.argsort(-found, kind="stable")[:_PROMINENT]
+        self._kept = rows[order]
+        return points[self._kept]
+
+
+def _compressed(values: Array) -> Array:
+    """Return values on a scale that is linear near the median and logarithmic far from it; failures are lowest."""
+    finite = values[np.isfinite(values)]
+    low, middle, high = np.quantile(finite, [0.25, 0.5, 0.75])
+    spread = (high - low) or float(finite.std()) or 1.0
+    return np.asarray(np.arcsinh((np.maximum(values, finite.min()) - middle) / spread))
+
+
+def _prominences(points: Array, values: Array, rows: Rows) -> Array:
+    """Return by how much the values at some rows exceed a local linear fit, without themselves, to their neighbours."""
+    d = points.shape[1]
+    count = min(3 * d + 4, len(points))
+    distances, neighbours = KDTree(points).query(points[rows], count)
+    distances, neighbours = distances.reshape(len(rows), -1)[:, 1:], neighbours.reshape(len(rows), -1)[:, 1:]
+    offsets = (points[neighbours] - points[rows][:, None]) / np.maximum(distances[:, -1:, None], 1e-12)
+    terms = np.concatenate([np.ones((*offsets.shape[:2], 1)), offsets], axis=2)
+    normal = np.swapaxes(terms, 1, 2) @ terms + 1e-3 * np.eye(d + 1)
+    fitted = np.linalg.solve(normal, np.swapaxes(terms, 1, 2) @ values[neighbours][..., None])
+    return np.asarray(values[rows] - fitted[:, 0, 0])
 
 
 def _offspring(parents: Array, pool: Array, step: float, count: int, rng: np.random.Generator) -> Array:
