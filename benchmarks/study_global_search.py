@@ -32,7 +32,7 @@ KEY = ("case", "seed", "evaluations")
 RESULTS = study_auto.RESULTS / "global_search.jsonl"
 EVALUATIONS = (9000, 2000)
 """Those of a search before a certificate, and those of `auto` where a design is fast."""
-REFERENCE = 60_000
+REFERENCE = 30_000
 """Evaluations of one more search, from other random numbers, that may correct a stored truth upwards."""
 CLIFF = 1.5e-4
 """The share of the cube in which a cliff function is large."""

@@ -19,16 +19,24 @@ from ctxval._util.boxes import separated_rows
 from ctxval._util.representation import call
 from ctxval.gp.evaluations import Evaluations, Values
 
-_SAMPLED, _EVOLVED = 0.3, 0.75
-"""Shares of the evaluations after which sampling and evolution end."""
+_SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88
+"""Shares of the evaluations after which sampling, evolution and climbs end."""
+_STARTS = 12
+"""Largest number of points from which the function is climbed at once."""
+_SEPARATION = 0.2
+"""Least distance between these points, as a share of the cube's diagonal."""
+_CALLS = 8
+"""Number of slopes that a climb should have at least; if evaluations are few, there are fewer climbs."""
 _GENERATIONS = 40
 """Largest number of generations of the evolution."""
 _REFINEMENTS = 12
 """Largest number of batches of the refinement."""
 _ELITES = 30
 """Number of parents of a generation, and of elites that are returned."""
-_REACHES = (0.3, 0.02)
-"""Least distance of the parents in the first and in the last generation, as a share of the cube's diagonal."""
+_DISTINCT = 0.02
+"""Least distance of elites that are returned, and of prominent parents, as a share of the cube's diagonal."""
+_REACHES = (0.3, 0.1)
+"""Least distance of the good parents in the first and in the last generation, as a share of the cube's diagonal."""
 _STEPS = (0.3, 0.005)
 """Largest standard deviation of a mutation in the first and in the last generation."""
 _SPREAD = 0.03
@@ -37,8 +45,8 @@ _PROMINENT = 200
 """Number of prominent points that are remembered."""
 _POOL = 100
 """Number of best points of whose differences moves are made."""
-_CLIMBED = 4
-"""Number of points from which the refinement climbs."""
+_REFINED_POINTS = 4
+"""Number of best points that the refinement moves."""
 _REFINED = (0.02, 1e-5)
 """Standard deviations of the moves in the first and in the last batch of the refinement."""
 
@@ -82,9 +90,10 @@ def search_globally(
     for count in _batches(int(_SAMPLED * evaluations) - (evaluations - done.left), evaluations, 3):
         done.evaluate(done.samples(count, rng))
     _evolve(done, rng)
+    _climb(done, done.left - int((1 - _CLIMBED) * evaluations))
     _refine(done, rng)
     points, values = done.found()
-    return GlobalMaximum(points, values, _apart(points[np.isfinite(values)], _REACHES[-1]), len(values))
+    return GlobalMaximum(points, values, _apart(points[np.isfinite(values)], _DISTINCT), len(values))
 
 
 def _batches(count: int, evaluations: int, most: int) -> list[int]:
@@ -99,6 +108,14 @@ def _batches(count: int, evaluations: int, most: int) -> list[int]:
 def _apart(points: Array, reach: float) -> Array:
     """Return the first of the points ``(m, d)`` that are farther from each other than this share of the diagonal."""
     return points[separated_rows(points, reach * float(np.sqrt(points.shape[1])), _ELITES)]
+
+
+def _climb(done: Evaluations, budget: int) -> None:
+    """Climb from the best points that are apart, with about so many evaluations; not at all if those are too few."""
+    points, values = done.found()
+    starts = min(_STARTS, budget // (_CALLS * (done.dimension + 1)))
+    if starts > 0:
+        done.climb(_apart(points[np.isfinite(values)], _SEPARATION)[:starts], budget)
 
 
 def _geometric(ends: tuple[float, float], share: float) -> float:
@@ -123,7 +140,7 @@ def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
         reach, step = _geometric(_REACHES, share), _geometric(_STEPS, share)
         prominent = prominence.update(*done.in_order())
         first = _offspring(_apart(finite, reach), finite[:_POOL], step, size - size // 2, rng)
-        second = _offspring(_apart(prominent, _REACHES[-1]), finite[:_POOL], step, size // 2, rng)
+        second = _offspring(_apart(prominent, _DISTINCT), finite[:_POOL], step, size // 2, rng)
         done.evaluate(np.concatenate([first, second]))
 
 
@@ -222,18 +239,16 @@ def _to_bounds(points: Array, rng: np.random.Generator) -> Array:
 
 
 def _refine(done: Evaluations, rng: np.random.Generator) -> None:
-    """Climb from the best points along slopes, then try moves to bounds and ever smaller random moves around them."""
+    """Try moves to bounds and ever smaller random moves around the best points."""
     points, values = done.found()
     finite = points[np.isfinite(values)]
     if not len(finite):
         done.evaluate(done.samples(done.left, rng))
         return
-    if done.left > 4 * (done.dimension + 1):
-        done.climb(_apart(finite, _REACHES[-1])[:_CLIMBED], done.left // 2)
     sizes = _batches(done.left, done.budget, _REFINEMENTS)
     for batch, size in enumerate(sizes):
         done.move_to_bounds(rng)
         best = done.found()[0][:_POOL]
         near = best[np.argsort(np.linalg.norm(best - best[0], axis=1), kind="stable")[: 2 * done.dimension + 2]]
         step = _geometric(_REFINED, batch / max(1, len(sizes) - 1))
-        done.evaluate(_offspring(best[:_CLIMBED], near, step, min(size, done.left), rng))
+        done.evaluate(_offspring(best[:_REFINED_POINTS], near, step, min(size, done.left), rng))
