@@ -7,7 +7,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick check reliability crash-states attack bench bench-peers study reproduce search calibrate parts pictures clean
+.PHONY: demo test quick check reliability crash-states attack bench bench-peers study reproduce search global-search calibrate parts pictures clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -63,6 +63,11 @@ search: .venv/.test  ## how many executions the searches need; writes docs/searc
 	$(BIN)/python benchmarks/study_scalar.py dubins-basin --search scalar --seeds 30
 	$(BIN)/python benchmarks/misleading.py
 	$(BIN)/python benchmarks/study_ablations.py
+	$(BIN)/python benchmarks/study_global_search.py
+	$(BIN)/python benchmarks/search_page.py
+
+global-search: .venv/.test  ## what a global search of the true systems finds; writes docs/search.md, and resumes
+	$(BIN)/python benchmarks/study_global_search.py
 	$(BIN)/python benchmarks/search_page.py
 
 parts: .venv/.test  ## the parts that are found by name; writes docs/parts.md

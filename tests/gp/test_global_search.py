@@ -105,11 +105,14 @@ def test_it_finds_rare_cliffs(dimension: int) -> None:
 def test_the_elites_of_several_hills_are_on_all_of_them() -> None:
     hills = np.array([[0.2, 0.2, 0.2], [0.8, 0.8, 0.3], [0.2, 0.8, 0.7]])
     heights = np.array([1.0, 0.95, 0.9])
-    distances = lambda X: np.linalg.norm(X[:, None] - hills, axis=2)  # noqa: E731
+
+    def distances(X: Array) -> Array:
+        return np.asarray(np.linalg.norm(X[:, None] - hills, axis=2))
+
     found = search(lambda X: (heights * np.exp(-((distances(X) / 0.15) ** 2))).max(axis=1), 3)
     assert (distances(found.elites).min(axis=0) < 0.02).all()
     apart = np.linalg.norm(found.elites[:, None] - found.elites, axis=2)[np.triu_indices(len(found.elites), 1)]
-    assert apart.min() > 0.02
+    assert apart.min() > 0.1
     np.testing.assert_array_equal(found.elites[0], found.points[0])
 
 
@@ -139,7 +142,7 @@ def test_it_keeps_its_budget_and_stays_in_the_cube(dimension: int, evaluations: 
 
     def function(X: Array) -> Array:
         asked.append(X)
-        return X.sum(axis=1)
+        return np.asarray(X.sum(axis=1))
 
     rng = np.random.default_rng(seed)
     first = rng.random((starts, dimension))
@@ -156,7 +159,7 @@ def test_batches_are_few_and_no_larger_than_a_tenth() -> None:
 
     def function(X: Array) -> Array:
         sizes.append(len(X))
-        return X.sum(axis=1)
+        return np.asarray(X.sum(axis=1))
 
     search(function, 4, evaluations=5000)
     assert max(sizes) <= 500

@@ -34,9 +34,9 @@ _REFINEMENTS = 12
 _ELITES = 30
 """Number of parents of a generation, and of elites that are returned."""
 _DISTINCT = 0.02
-"""Least distance of elites that are returned, and of prominent parents, as a share of the cube's diagonal."""
+"""Least distance of prominent parents, as a share of the cube's diagonal."""
 _REACHES = (0.3, 0.1)
-"""Least distance of the good parents in the first and in the last generation, as a share of the cube's diagonal."""
+"""Least distance of good parents in the first and the last generation, and of elites, as a share of the diagonal."""
 _STEPS = (0.3, 0.005)
 """Largest standard deviation of a mutation in the first and in the last generation."""
 _SPREAD = 0.03
@@ -93,7 +93,7 @@ def search_globally(
     _climb(done, done.left - int((1 - _CLIMBED) * evaluations))
     _refine(done, rng)
     points, values = done.found()
-    return GlobalMaximum(points, values, _apart(points[np.isfinite(values)], _DISTINCT), len(values))
+    return GlobalMaximum(points, values, _apart(points[np.isfinite(values)], _REACHES[-1]), len(values))
 
 
 def _batches(count: int, evaluations: int, most: int) -> list[int]:
