@@ -274,10 +274,25 @@ def example() -> str:
 # The global search of true systems
 
 
+@functools.cache
+def global_results() -> JsonLines:
+    """Return the results of the global search; they are read once."""
+    return JsonLines(study_global_search.RESULTS, study_global_search.KEY)
+
+
 def global_search_table(chosen_by: bool) -> str:
     """Return what the global search finds, on the cases that its settings were chosen by or on the others."""
-    stored = JsonLines(study_global_search.RESULTS, study_global_search.KEY)
-    return table(study_global_search.HEADER, study_global_search.rows(stored, chosen_by))
+    return table(study_global_search.HEADER, study_global_search.rows(global_results(), chosen_by))
+
+
+def global_search_notes() -> str:
+    """Return which cases have no results, and where a search has surpassed a stored truth; empty if there are none."""
+    missing = [f"`{case}`" for case in study_global_search.CASES if not global_results().select(case=case)]
+    surpassed = study_global_search.surpassed(global_results())
+    notes = [f"Not measured: {', '.join(missing)}."] if missing else []
+    if surpassed:
+        notes.append(f"Searches have found more than 1 % above the stored truth: {'; '.join(surpassed)}.")
+    return "\n\n".join(notes)
 
 
 # Pictures
@@ -473,6 +488,8 @@ Settings of the search were chosen by these cases:
 These cases were not used to choose any setting:
 
 {global_others}
+
+{global_notes}
 """
 
 
@@ -492,6 +509,7 @@ def text() -> str:
         reference=f"{study_global_search.REFERENCE:,}",
         cliff=f"{study_global_search.CLIFF:.1e}",
         global_chosen=global_search_table(chosen_by=True),
+        global_notes=global_search_notes(),
         global_others=global_search_table(chosen_by=False),
     )
     # What is empty leaves no gap.

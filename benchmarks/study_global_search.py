@@ -81,8 +81,13 @@ def of_validation(validation: Validation, truth: float, exact: bool = False) -> 
 
 def loop(case: str, seed: int) -> Problem:
     """Return a case of the paper; its truth is that of the stored campaigns."""
-    truth = study_auto.results_of("auto")[case, seed, "auto"]["truth"]
-    return of_validation(study_auto.experiment(case, seed).validation, truth, exact=case.startswith("linear"))
+    found = study_auto.experiment(case, seed)
+    if case == "arm-fnn":
+        # The training of the network differs between machines, so the truth of a stored campaign is another model's.
+        truth = study_auto.truth(case, found, study_auto.ROOT / "runs" / "truth")
+    else:
+        truth = study_auto.results_of("auto")[case, seed, "auto"]["truth"]
+    return of_validation(found.validation, truth, exact=case.startswith("linear"))
 
 
 def misleading_loop(case: str, seed: int) -> Problem:
@@ -183,6 +188,17 @@ def shares(case: str, evaluations: int, results: JsonLines) -> list[float]:
     for record in results.select(case=case, evaluations=evaluations):
         known = results.select(case=case, seed=record["seed"])
         found.append(record["found"] / max(max(other["found"], other["truth"]) for other in known))
+    return found
+
+
+def surpassed(results: JsonLines) -> list[str]:
+    """Return where a search has found more than 1 % above the stored truth."""
+    found = []
+    for case in CASES:
+        for seed in sorted({record["seed"] for record in results.select(case=case)}):
+            best = max(results.select(case=case, seed=seed), key=lambda record: float(record["found"]))
+            if best["found"] > 1.01 * best["truth"]:
+                found.append(f"`{case}`, seed {seed}: {best['found']:.3g} instead of {best['truth']:.3g}")
     return found
 
 
