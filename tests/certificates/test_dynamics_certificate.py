@@ -144,12 +144,10 @@ def test_a_draw_that_diverges_leaves_no_bound() -> None:
 
 
 def test_many_coordinates_are_said_not_to_be_covered_jointly() -> None:
-    wide = StateInputCoverage(
-        0.1, 0.0, None, "x[0]", {f"x[{i}]": 0.0 for i in range(8)}, COVERED.resolution, np.zeros(2), 9
-    )
-    assert any(
-        "not all combinations" in one for one in certify_dynamics(sample(), replace(GOOD, coverage=wide)).assumptions
-    )
+    wide = replace(COVERED, pair=None, beyond=0.9 * GAP)
+    found = certify_dynamics(sample(), replace(GOOD, coverage=wide))
+    assert found.doubt is None
+    assert any("not all combinations" in one for one in found.assumptions)
 
 
 def test_it_needs_the_model_and_executions_that_did_not_fail() -> None:

@@ -41,7 +41,8 @@ GAP = 0.25
 
 BEYOND = 0.02
 """Largest excess of a state or an input over its largest record, or below its smallest one, as a share of that range.
-Contacts, end stops and saturation lie beyond what is recorded more often than between records."""
+Contacts, end stops and saturation lie beyond what is recorded more often than between records. With too many
+coordinates for a comparison of pairs, it is the same as ``GAP``: each extreme would take an execution of its own."""
 
 PAIR_GAP = 0.5
 """The same for two of them together."""
@@ -214,7 +215,7 @@ def _failed_predictions(failed: Sequence[CheckedPrediction]) -> str:
 
 def _uncovered(coverage: StateInputCoverage) -> str | None:
     """Return what the records do not cover; None if nothing."""
-    if coverage.beyond > BEYOND:
+    if coverage.beyond > (GAP if coverage.pair is None else BEYOND):
         what = f"{100 * coverage.beyond:.2g} % of its range beyond all records of {coverage.coordinate}"
     elif coverage.marginal > GAP:
         what = f"{100 * coverage.marginal:.0f} % of its range away from every record of {coverage.coordinate}"
@@ -223,8 +224,8 @@ def _uncovered(coverage: StateInputCoverage) -> str | None:
     else:
         return None
     return (
-        f"closed loops of the tasks lead {what}, such as to {_texts(coverage.place)}; an execution of a task that leads "
-        "there helps (--until-decided executes it)"
+        f"closed loops of the tasks lead {what}, such as to {_texts(coverage.place)}; an execution of a task that "
+        "leads there helps (--until-decided executes it)"
     )
 
 

@@ -23,8 +23,8 @@ from ctxval.learning.dynamics_posterior import DynamicsDraws, DynamicsPosterior
 
 _DIVERGED = 1e30
 """The distance of a loop that diverges, in searches: larger than all others, and finite."""
-_EVALUATIONS = (0, 512, 2048, 4096)
-"""Number of tasks in the global search for 0, 1, 2 and 3 task parameters."""
+_EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)
+"""Number of tasks in the global search for 1, 2, ... task parameters; the last one holds for all higher numbers."""
 _SHARES = (0.1, 0.03, 0.01)
 """Standard deviations of the random moves in successive rounds of the search on each draw."""
 
@@ -52,9 +52,8 @@ class WorstCaseSettings:
     @classmethod
     def for_dimension(cls, dimension: int) -> WorstCaseSettings:
         """Return settings with as many tasks as a search of so many task parameters needs."""
-        if dimension >= len(_EVALUATIONS):
-            return cls()
-        return cls(pool=_EVALUATIONS[dimension] // 4, evaluations=_EVALUATIONS[dimension])
+        evaluations = _EVALUATIONS[min(dimension, len(_EVALUATIONS)) - 1]
+        return cls(pool=min(1024, evaluations // 4), evaluations=evaluations)
 
 
 @dataclass(frozen=True, eq=False)
