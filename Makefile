@@ -53,6 +53,8 @@ pictures: .venv/.installed  ## those of the README
 calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/calibration.md, and resumes
 	$(BIN)/python benchmarks/calibrate.py --campaigns $(CAMPAIGNS)
 	$(BIN)/python benchmarks/calibrate_verdicts.py
+	$(BIN)/python benchmarks/dynamics_truths.py
+	$(BIN)/python benchmarks/calibrate_dynamics.py
 	$(BIN)/python benchmarks/study_retrain.py
 	$(BIN)/python benchmarks/calibration_page.py
 

@@ -27,6 +27,7 @@ from calibrate import (
     Run,
     stored,
 )
+from calibration_dynamics_part import by_dynamics
 from calibration_verdicts_part import interval, table, until_decided
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.diagnostics import LEVEL
@@ -277,6 +278,8 @@ with that value.
 
 {until_decided}
 
+{by_dynamics}
+
 ## Audits after retraining
 
 {retrained}
@@ -318,6 +321,7 @@ def main() -> None:
             noise=NOISE,
             noisy=used_table(noisy),
             until_decided=until_decided(),
+            by_dynamics=by_dynamics(),
             retrained=retrained(),
         )
     )

@@ -1,0 +1,155 @@
+"""The part of ``docs/calibration.md`` on campaigns that learned dynamics decide. Nothing is run here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from calibrate_dynamics import BUDGET, FALSE, GROUPS, RULE, STORED, TRUE
+from calibration_verdicts_part import false_of, table
+from ctxval.certificates import dynamics as rule
+
+TEXT = """## Verdicts by learned dynamics
+
+These campaigns run as `--until-decided --kind dynamics` does, with at most {budget} executions. The thresholds of the
+certificate were chosen on the development systems: a prediction holds within {accurate:.0%} of the bound, the last
+{predictions} predictions must hold, the largest gap of the records is {gap:.0%}, and the largest excess over the records
+is {beyond:.0%}. The reporting systems (`benchmarks/dynamics_reporting.py`) were written down before any of them was run,
+and nothing was chosen with them. The parentheses contain the share of false verdicts, and the upper limit of this share
+with confidence 97.5 %. The kind may say `validated` as long as at 0.95 d* at most 5 % are false, with a limit of at most
+7.5 %.
+
+### Reporting systems
+
+At 0.95 d*: {at_95}. At 0.99 d*: {at_99}. Of the misleading systems at 0.95 d*: {misleading_95}.
+
+At 1.1 d*, {decided_11} of the {systems_11} systems that do not mislead are decided within 12 executions in the median
+of their seeds, and {campaigns_11} of the campaigns on them; at 1.25 d*, {decided_125} of {systems_125}, and
+{campaigns_125}.
+
+{reporting}
+
+`misleading`: the state is not complete, or the dynamics jump, or there is noise. At a threshold above d*, `validated`
+is true of these systems as well; the column says how often it was given. Executions: median and quartiles.
+
+### False verdicts
+
+{false}
+
+### The paper's cases
+
+No threshold was chosen with these cases, but the method was tried on them while it was written. Each has ten seeds.
+
+{paper}
+
+### Development systems
+
+The thresholds of the certificate were chosen with seeds 0 to 2 of these systems, so this table is not evidence.
+
+{development}
+"""
+
+Result = dict[str, Any]
+
+
+def by_dynamics() -> str:
+    """Return the part of the page."""
+    reported = _of("reporting")
+    mild = [one for one in reported if not _entry(one).misleading]
+    return TEXT.format(
+        budget=BUDGET,
+        accurate=rule.ACCURATE,
+        predictions=rule.PREDICTIONS,
+        gap=rule.GAP,
+        beyond=rule.BEYOND,
+        at_95=false_of(_at(reported, FALSE[0]))[1],
+        at_99=false_of(_at(reported, FALSE[1]))[1],
+        misleading_95=false_of([one for one in _at(reported, FALSE[0]) if _entry(one).misleading])[1],
+        **_decided(mild, TRUE[0], "11"),
+        **_decided(mild, TRUE[1], "125"),
+        reporting=_table(reported),
+        false=_false(reported),
+        paper=_table(_of("paper")),
+        development=_table(_of("development")),
+    ).rstrip()
+
+
+def _of(group: str) -> list[Result]:
+    return STORED.select(rule=RULE, group=group)
+
+
+def _at(results: Iterable[Result], share: float) -> list[Result]:
+    return [one for one in results if one["share"] == share]
+
+
+def _entry(result: Result) -> Any:
+    return GROUPS[result["group"]][result["entry"]]
+
+
+def _decided(results: list[Result], share: float, name: str) -> dict[str, str | int]:
+    """Return how many systems, and which share of their campaigns, are validated within 12 executions."""
+    chosen = _at(results, share)
+    early = [one["answer"] == "validated" and one["executions"] <= 12 for one in chosen]
+    entries = dict.fromkeys(one["entry"] for one in chosen)
+    of = {name: [done for one, done in zip(chosen, early, strict=True) if one["entry"] == name] for name in entries}
+    return {
+        f"decided_{name}": sum(np.mean(done) >= 0.5 for done in of.values()),
+        f"systems_{name}": len(entries),
+        f"campaigns_{name}": f"{sum(early)} of {len(early)}",
+    }
+
+
+def _table(results: list[Result]) -> str:
+    """Return a table with a row for each system."""
+    rows = []
+    for name in dict.fromkeys(one["entry"] for one in results):
+        own = [one for one in results if one["entry"] == name]
+        entry = _entry(own[0])
+        tasks, pairs, _ = entry.dimensions()
+        rows.append([
+            name, entry.family + (" (misleading)" if entry.misleading else ""), f"{tasks}-D", str(pairs),
+            *(_count(_at(own, share), "validated") for share in FALSE),
+            *(cell for share in TRUE for cell in (_count(_at(own, share), "validated"), _executions(_at(own, share)))),
+            _median(own, lambda one: one["seconds"] / max(1, one["executions"])),
+        ])  # fmt: skip
+    header = ["system", "family", "tasks", "n + m", *(f"{share:g} d*: validated (false)" for share in FALSE)]
+    header += [text for share in TRUE for text in (f"{share:g} d*: validated", "executions")]
+    return table([*header, "CPU s for each execution"], rows)
+
+
+def _count(results: list[Result], answer: str) -> str:
+    return f"{sum(one['answer'] == answer for one in results)} of {len(results)}" if results else "-"
+
+
+def _executions(results: list[Result]) -> str:
+    """Return the quartiles of the executions until validated; more than the budget if it never was."""
+    if not results:
+        return "-"
+    counts = [one["executions"] if one["answer"] == "validated" else np.inf for one in results]
+    low, middle, high = np.quantile(counts, [0.25, 0.5, 0.75], method="higher")
+    return f"{_number(middle)} ({_number(low)} to {_number(high)})"
+
+
+def _number(count: float) -> str:
+    return "undecided" if np.isinf(count) else f"{count:g}"
+
+
+def _median(results: list[Result], value: Callable[[Result], float]) -> str:
+    return f"{np.median([value(one) for one in results]):.2g}"
+
+
+def _false(results: list[Result]) -> str:
+    """Return a table of the false verdicts, with what the certificate said."""
+    rows = [
+        [
+            one["entry"], str(one["seed"]), f"{one['share']:g}", str(one["executions"]), f"{one['bound']:.3f}",
+            f"{one['largest']:.3f}", f"{one['gap']:.2f}",
+        ]
+        for one in results
+        if one["answer"] == "validated" and one["share"] < 1
+    ]  # fmt: skip
+    if not rows:
+        return "There are none."
+    return table(["system", "seed", "tau / d*", "executions", "bound / d*", "best / d*", "gap"], rows)
