@@ -107,6 +107,19 @@ def draw_hyperparameters(
     return [_of(best.kernel, best.mode), *(_of(*found[row]) for row in chosen)]
 
 
+def draw_prior(dimension: int, inputs: int, rng: np.random.Generator) -> Hyperparameters:
+    """Return hyperparameters from the prior, such as those of a system on which a posterior is tested.
+
+    Args:
+        dimension: the number k of coordinates of a state-input pair.
+        inputs: the number of inputs of the system.
+        rng: the source of the draw.
+    """
+    nu, growth = FAMILIES[rng.integers(len(FAMILIES))]
+    centres, deviations = _prior(dimension + 3)
+    return _of(ResidualKernel(nu, growth, inputs), centres + deviations * rng.standard_normal(dimension + 3))
+
+
 def learning_rows(Z: Array, inputs: int, count: int) -> Rows:
     """Return rows of well-spread pairs, from which the hyperparameters are learned."""
     k = Z.shape[1]
@@ -138,10 +151,15 @@ def log_posterior(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array)
 
 
 def _log_prior(parameters: Array) -> tuple[float, Array]:
-    centres = np.log([*[_LENGTH[0]] * (len(parameters) - 3), *[_LINEAR_PART[0]] * 2, _NOISE_PRIOR[0]])
-    deviations = np.array([*[_LENGTH[1]] * (len(parameters) - 3), *[_LINEAR_PART[1]] * 2, _NOISE_PRIOR[1]])
+    centres, deviations = _prior(len(parameters))
     scaled = (parameters - centres) / deviations
     return float(-0.5 * (scaled**2).sum()), -scaled / deviations
+
+
+def _prior(count: int) -> tuple[Array, Array]:
+    """Return means and standard deviations of the ``count`` parameters (theta, log noise)."""
+    medians, deviations = np.transpose([*[_LENGTH] * (count - 3), _LINEAR_PART, _LINEAR_PART, _NOISE_PRIOR])
+    return np.log(medians), deviations
 
 
 def _box(kernel: ResidualKernel, dimension: int) -> tuple[Array, Array]:
