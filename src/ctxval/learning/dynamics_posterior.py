@@ -19,7 +19,7 @@ from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise, tenfold
 from ctxval.gp.subset import pivoted_rows
-from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters, draw_hyperparameters, learning_rows
+from ctxval.learning.hyperparameters import FAMILIES, NOISE, Hyperparameters, draw_hyperparameters, learning_rows
 from ctxval.learning.kernel_expansion import KernelExpansion
 from ctxval.learning.residual_data import ResidualData, residual_data
 
@@ -123,7 +123,7 @@ class Component:
         chosen, L, left_out = self._pivots(relevant, pivots)
         n = self.weights.shape[1]
         if not len(chosen):
-            return KernelExpansion(self.hyperparameters, self.centres, np.repeat(self.weights[None], count, 0)), 0.0
+            return KernelExpansion(self.hyperparameters, self.centres, np.repeat(self.weights[None], count, 0)), left_out
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
         normal = rng.standard_normal((count, len(chosen), n)) * self.amplitudes
         # The values L xi at the pivots are interpolated by the posterior covariance L L', with weights L'^-1 xi.
@@ -139,8 +139,8 @@ class Component:
         """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
         half, left = self._halved(relevant)
-        least = max(_NEGLIGIBLE * float(left.max()), self.hyperparameters.noise)
         first = float(left.max())
+        least = max(_NEGLIGIBLE * first, NOISE[0])
         columns = np.zeros((min(count, len(relevant)), len(relevant)))
         chosen: list[int] = []
         for k in range(len(columns)):
@@ -154,7 +154,7 @@ class Component:
             left[pivot] = 0.0
             chosen.append(pivot)
         L = np.tril(columns[: len(chosen)][:, chosen].T)
-        return np.array(chosen, dtype=np.intp), L, float(left.max()) / first if first > 0 else 0.0
+        return np.array(chosen, dtype=np.intp), L, float(left.max()) / first if first > NOISE[0] else 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln
+from scipy.special import gammaln, logsumexp
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
@@ -37,6 +37,12 @@ _FREEDOM = 6.0
 """Degrees of freedom of the t distribution of the proposals."""
 _PROPOSALS = 48
 """Number of proposals for each family."""
+_STARTS = (1e-5, 0.1)
+"""Noise variances at which climbs to the modes start. A rough function without noise can look like a smooth one with it."""
+_LOWEST = 12.0
+"""A mode whose log posterior is lower than the highest one by more than this does not count."""
+_SAME = 0.5
+"""Two climbs whose logarithms differ by less than this have reached the same mode."""
 _LEAST_CURVATURE = 0.25
 """No direction is less certain than a standard deviation of 2 in the logarithm."""
 _STEP = 0.05
@@ -60,27 +66,32 @@ class Hyperparameters:
 
 @dataclass(frozen=True, eq=False)
 class _Mode:
-    """The posterior of one family around its mode.
+    """The posterior of one family around one of its modes.
 
     Attributes:
         kernel: the family.
-        mode: the most probable (theta, log noise).
+        height: the log posterior there.
+        mode: the (theta, log noise) of the mode.
         scale: matrix ``(D, D)`` that maps standard normal draws to draws around the mode.
     """
 
     kernel: ResidualKernel
+    height: float
     mode: Array
     scale: Array
 
-    def proposals(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return draws ``(count, D)`` of a t distribution, and the logarithms of their density ``(count,)``."""
+    def proposals(self, count: int, rng: np.random.Generator) -> Array:
+        """Return draws ``(count, D)`` of a t distribution around the mode."""
+        normal = rng.standard_normal((count, len(self.mode)))
+        return self.mode + normal / np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM) @ self.scale.T
+
+    def log_density(self, draws: Array) -> Array:
+        """Return the logarithms of the density ``(count,)`` of this t distribution."""
         D = len(self.mode)
-        normal = rng.standard_normal((count, D))
-        draws = normal / np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
         constant = gammaln((_FREEDOM + D) / 2) - gammaln(_FREEDOM / 2) - 0.5 * D * np.log(_FREEDOM * np.pi)
-        _, log_volume = np.linalg.slogdet(self.scale)
-        density = constant - log_volume - 0.5 * (_FREEDOM + D) * np.log1p((draws**2).sum(axis=1) / _FREEDOM)
-        return self.mode + draws @ self.scale.T, density
+        squares = (np.linalg.solve(self.scale, (draws - self.mode).T) ** 2).sum(axis=0)
+        log_volume = np.linalg.slogdet(self.scale)[1]
+        return np.asarray(constant - log_volume - 0.5 * (_FREEDOM + D) * np.log1p(squares / _FREEDOM))
 
 
 def draw_hyperparameters(
@@ -96,13 +107,17 @@ def draw_hyperparameters(
         rng: the source of the draws.
         families: smoothness and growth of each covariance.
     """
-    modes = [_mode_of(ResidualKernel(nu, growth, inputs), Z, Y) for nu, growth in families]
-    found, weights = [], []
-    for mode in modes:
-        drawn, densities = mode.proposals(_PROPOSALS, rng)
-        found += [(mode.kernel, theta) for theta in drawn]
-        weights.append(np.array([_log_posterior_or_none(mode.kernel, theta, Z, Y) for theta in drawn]) - densities)
-    best = max(modes, key=lambda mode: log_posterior(mode.kernel, mode.mode, Z, Y)[0])
+    found, weights, modes = [], [], []
+    for nu, growth in families:
+        kernel = ResidualKernel(nu, growth, inputs)
+        of_family = _modes_of(kernel, Z, Y)
+        drawn = np.concatenate([mode.proposals(_PROPOSALS // len(of_family), rng) for mode in of_family])
+        # All modes of a family make one proposal distribution: the mixture of theirs in equal parts.
+        density = logsumexp([mode.log_density(drawn) for mode in of_family], axis=0) - np.log(len(of_family))
+        found += [(kernel, theta) for theta in drawn]
+        weights.append(np.array([_log_posterior_or_none(kernel, theta, Z, Y) for theta in drawn]) - density)
+        modes += of_family
+    best = max(modes, key=lambda mode: mode.height)
     chosen = _resampled(np.concatenate(weights), count - 1, rng)
     return [_of(best.kernel, best.mode), *(_of(*found[row]) for row in chosen)]
 
@@ -168,19 +183,32 @@ def _box(kernel: ResidualKernel, dimension: int) -> tuple[Array, Array]:
     return low, high
 
 
-def _mode_of(kernel: ResidualKernel, Z: Array, Y: Array) -> _Mode:
+def _modes_of(kernel: ResidualKernel, Z: Array, Y: Array) -> list[_Mode]:
+    """Return the modes of a family, the highest first: one with little noise, one with much, or one that is both."""
     low, high = _box(kernel, Z.shape[1])
-    start = np.log([*[_LENGTH[0]] * Z.shape[1], 1.0, 1.0, 1e-5])
-    mode = most_likely(
-        lambda parameters: log_posterior(kernel, parameters, Z, Y), start[None], list(zip(low, high, strict=True))
-    )
+    found: list[tuple[float, Array]] = []
+    for noise in _STARTS:
+        start = np.log([*[_LENGTH[0]] * Z.shape[1], 1.0, 1.0, noise])
+        mode = most_likely(
+            lambda parameters: log_posterior(kernel, parameters, Z, Y), start[None], list(zip(low, high, strict=True))
+        )
+        found.append((log_posterior(kernel, mode, Z, Y)[0], mode))
+    found.sort(key=lambda one: -one[0])
+    (height, mode), (lower, other) = found
+    relevant = height - lower < _LOWEST and np.abs(mode - other).max() > _SAME
+    return [_Mode(kernel, *one, _scale_at(kernel, one[1], Z, Y)) for one in (found if relevant else found[:1])]
+
+
+def _scale_at(kernel: ResidualKernel, mode: Array, Z: Array, Y: Array) -> Array:
+    """Return a root of the inverse of the curvature of the log posterior, by differences of its gradient."""
+    low, high = _box(kernel, Z.shape[1])
     curvature = np.empty((len(mode), len(mode)))
     for i, step in enumerate(np.eye(len(mode)) * _STEP):
         up, down = np.minimum(mode + step, high), np.maximum(mode - step, low)
         slopes = _gradient_or_zero(kernel, up, Z, Y) - _gradient_or_zero(kernel, down, Z, Y)
         curvature[i] = -slopes / (up - down)[i]
     values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
-    return _Mode(kernel, mode, vectors / np.sqrt(np.maximum(values, _LEAST_CURVATURE)))
+    return np.asarray(vectors / np.sqrt(np.maximum(values, _LEAST_CURVATURE)))
 
 
 def _gradient_or_zero(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array) -> Array:
