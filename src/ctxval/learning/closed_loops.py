@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Rows
+from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.model import Step
@@ -46,8 +47,8 @@ class Loops:
     """Closed loops of S drawn systems on q tasks.
 
     Attributes:
-        distances: d, shape ``(S, q)``; NaN if a task cannot be planned, infinity if a loop diverges.
-        states: shape ``(S, q, H + 1, n)``; NaN if a task cannot be planned.
+        distances: d, shape ``(S, q)``; NaN if the loop of M diverges, infinity if that of a drawn system does.
+        states: shape ``(S, q, H + 1, n)``.
         inputs: shape ``(S, q, H, m)``.
     """
 
@@ -101,7 +102,7 @@ class LoopPlanner:
         return [self._run(draws, one) for one in planned]
 
     def distances(self, draws: DynamicsDraws, planned: Sequence[PlannedTasks], tasks: int) -> Array:
-        """Return the distances ``(S, q)`` of all draws on the same q tasks; NaN for a task that was not planned."""
+        """Return the distances ``(S, q)`` of all draws on the same q tasks; NaN for a task without a finite plan."""
         found = np.full((len(draws), tasks), np.nan)
         for one, loops in zip(planned, self.run(draws, planned), strict=True):
             found[:, one.rows] = loops.distances
@@ -136,10 +137,13 @@ class LoopPlanner:
         )
 
     def _distances(self, planned: PlannedTasks, loops: Trajectory) -> Array:
-        """Return the distances ``(q,)`` of loops; infinity if a loop diverges."""
+        """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does."""
+        promised, known = planned.promised.finite, planned.promised.finite & loops.finite
+        both = (_without_divergence(one, known) for one in (planned.promised, loops))
         with np.errstate(all="ignore"):
-            values = np.asarray(self.validation.distance(planned.promised, loops, planned.task), dtype=np.float64)
-        return np.where(np.isfinite(values) & loops.finite, values, np.inf).reshape(len(planned.rows))
+            values = np.asarray(self.validation.distance(*both, planned.task), dtype=np.float64)
+        found = np.where(np.isfinite(values) & known, values, np.inf)
+        return np.where(promised, found, np.nan).reshape(len(planned.rows))
 
     def _for_draws(self, controller: Controller, start: Array) -> Controller:
         """Return a controller that takes states with draws as another first axis."""
@@ -178,11 +182,30 @@ class _OwnStep:
     rows: Rows
 
     def __call__(self, x: Array, u: Array) -> Array:
-        whole = [np.zeros((len(self.draws) * self.tasks, part.shape[-1])) for part in (x, u)]
+        first = self._first * self.tasks
+        whole = [np.zeros((len(self._needed) * self.tasks, part.shape[-1])) for part in (x, u)]
         for all_rows, part in zip(whole, (x, u), strict=True):
-            all_rows[self.rows] = part
-        states, inputs = (part.reshape(len(self.draws), self.tasks, -1) for part in whole)
-        return np.asarray(self.draws.step(states, inputs).reshape(-1, x.shape[-1])[self.rows])
+            all_rows[self.rows - first] = part
+        states, inputs = (part.reshape(len(self._needed), self.tasks, -1) for part in whole)
+        return np.asarray(self._needed.step(states, inputs).reshape(-1, x.shape[-1])[self.rows - first])
+
+    @property
+    def _first(self) -> int:
+        """The first draw with a task in this batch."""
+        return int(self.rows[0]) // self.tasks
+
+    @functools.cached_property
+    def _needed(self) -> DynamicsDraws:
+        """The draws with tasks in this batch."""
+        return self.draws.between(self._first, int(self.rows[-1]) // self.tasks + 1)
+
+
+def _without_divergence(loops: Trajectory, finite: Mask) -> Trajectory:
+    """Return trajectories with zeros instead of those that are not finite, which a distance need not take."""
+    if finite.all():
+        return loops
+    kept = finite[..., None, None]
+    return Trajectory(loops.times, np.where(kept, loops.states, 0.0), np.where(kept, loops.inputs, 0.0))
 
 
 def _same(controller: Controller, looped: Controller, probe: Array) -> bool:

@@ -231,14 +231,22 @@ class DynamicsDraws:
                 first = last
             return self.model.step(x, u) + residuals * self.data.units
 
+    def between(self, first: int, last: int) -> DynamicsDraws:
+        """Return the draws from ``first`` up to and without ``last``."""
+        groups, left_out, start = [], [], 0
+        for one, left in zip(self.expansions, self.left_out, strict=True):
+            own = one.weights[max(first - start, 0) : max(last - start, 0)]
+            if len(own):
+                groups.append(KernelExpansion(one.hyperparameters, one.centres, own))
+                left_out.append(left)
+            start += len(one.weights)
+        return DynamicsDraws(self.model, self.data, tuple(groups), tuple(left_out))
+
     def __getitem__(self, index: int) -> DrawnModel:
         """Return one draw as a model."""
-        for one in self.expansions:
-            if index < len(one.weights):
-                own = KernelExpansion(one.hyperparameters, one.centres, one.weights[index : index + 1])
-                return DrawnModel(DynamicsDraws(self.model, self.data, (own,), (0.0,)))
-            index -= len(one.weights)
-        raise IndexError(f"there are {len(self)} draws.")
+        if not 0 <= index < len(self):
+            raise IndexError(f"there are {len(self)} draws.")
+        return DrawnModel(self.between(index, index + 1))
 
     def __repr__(self) -> str:
         return call(self, self.model, draws=len(self))
