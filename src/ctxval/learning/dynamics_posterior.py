@@ -19,14 +19,18 @@ from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise, tenfold
 from ctxval.gp.subset import pivoted_rows
-from ctxval.learning.hyperparameters import FAMILIES, NOISE, Hyperparameters, draw_hyperparameters, learning_rows
+from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters, draw_hyperparameters, learning_rows
 from ctxval.learning.kernel_expansion import KernelExpansion
 from ctxval.learning.residual_data import ResidualData, residual_data
 
 _PIVOT = 0.1
 """Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
 _NEGLIGIBLE = 1e-3
-"""Share of the largest posterior variance below which a pivot adds nothing to those chosen before it."""
+"""Share of the posterior variance below which a pivot adds nothing to those chosen before it."""
+_FAR = 10.0
+"""A pair counts as far away if its posterior variance is larger than that of the median pair by this factor."""
+_ROUNDING = 1e-13
+"""Posterior variances below this share of the prior variance are rounding errors."""
 _WORK = 30_000
 """Number of centres times the horizon; it bounds the time of a closed loop."""
 _CENTRES = (150, 400)
@@ -136,16 +140,20 @@ class Component:
         ), left_out
 
     def _pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
-        """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""
+        """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left.
+
+        What is left of a variance is compared with the largest one, but of pairs far away, on loops that diverge, with
+        their own: beside theirs, the variances of all other pairs would be negligible.
+        """
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
         half, left = self._halved(relevant)
-        first = float(left.max())
-        least = max(_NEGLIGIBLE * first, NOISE[0])
+        scale = np.maximum(left, min(_FAR * np.median(left), left.max())) if len(left) else left
+        rounding = _ROUNDING * kernel.diagonal(theta, relevant)
         columns = np.zeros((min(count, len(relevant)), len(relevant)))
         chosen: list[int] = []
         for k in range(len(columns)):
-            pivot = int(np.argmax(left))
-            if left[pivot] <= least:
+            pivot = int(np.argmax(_share(left, scale, rounding)))
+            if left[pivot] <= max(_NEGLIGIBLE * scale[pivot], rounding[pivot]):
                 break
             covariances = kernel(theta, relevant[pivot : pivot + 1], relevant)[0]
             row = covariances - half[:, pivot] @ half - columns[:k, pivot] @ columns[:k]
@@ -154,7 +162,13 @@ class Component:
             left[pivot] = 0.0
             chosen.append(pivot)
         L = np.tril(columns[: len(chosen)][:, chosen].T)
-        return np.array(chosen, dtype=np.intp), L, float(left.max()) / first if first > NOISE[0] else 0.0
+        left_out = _share(left, scale, rounding).max(initial=0.0)
+        return np.array(chosen, dtype=np.intp), L, float(left_out)
+
+
+def _share(left: Array, scale: Array, rounding: Array) -> Array:
+    """Return variances as shares of a scale; 0 if rounding errors are as large."""
+    return np.where(left > rounding, left, 0.0) / np.maximum(scale, rounding)
 
 
 @dataclass(frozen=True, eq=False)

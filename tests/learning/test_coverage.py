@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from ctxval import Task, TaskSpace, Transitions, Validation, controllers, distances, models, systems
+from ctxval._util.arrays import Array
+from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.learning.coverage import MOST_COORDINATES, coverage
+from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
+
+TASKS = np.random.default_rng(3).random((9, 2))
+
+
+def make_planner(states: int = 2, horizon: int = 15) -> LoopPlanner:
+    A = 0.9 * np.eye(states) + 0.05 * np.eye(states, k=1)
+    return LoopPlanner(
+        Validation(
+            space=TaskSpace(start=([-2.0, -1.0], [2.0, 1.0])),
+            task=lambda p: Task(
+                [p.start[..., 0], p.start[..., 1], *[1.0] * (states - 2)], horizon=horizon, dt=0.1
+            ),
+            system=systems.Simulated(lambda x, u: x, vectorized=True),
+            model=models.Linear(A, np.full((states, 1), 0.1)),
+            synthesizer=controllers.LQR([1.0] * states, [0.1]),
+            distance=distances.MeanDeviation(),
+        )
+    )
+
+
+def learn(planner: LoopPlanner, x: Array, u: Array) -> DynamicsPosterior:
+    x_next = planner.validation.model.step(x, u) + 0.02 * np.sin(x)
+    settings = PosteriorSettings(hyperparameters=2, functions=1)
+    sources = np.zeros(len(x), dtype=np.intp)
+    found = learn_posterior(
+        planner.validation.model, Transitions(x, u, x_next), sources, np.random.default_rng(0), settings
+    )
+    assert found is not None
+    return found
+
+
+def visited(planner: LoopPlanner, posterior: DynamicsPosterior) -> Array:
+    """Return the pairs ``(q, H, k)`` of the mean's closed loops, in the system's units."""
+    (loops,) = planner.run(posterior.mean, planner.plan(TASKS))
+    return np.concatenate([loops.states[0, :, :-1], loops.inputs[0]], axis=-1)
+
+
+def nearest(recorded: Array, there: Array) -> Array:
+    """Return, for each row of ``there``, the distance to the nearest recorded row in the largest coordinate."""
+    return np.asarray(np.abs(there[:, None] - recorded[None]).max(axis=-1).min(axis=1))
+
+
+@pytest.mark.parametrize("reach", [0.3, 1.0, 3.0])
+def test_gaps_are_those_of_all_pairs_compared(reach: float) -> None:
+    rng, planner = np.random.default_rng(1), make_planner()
+    x, u = reach * rng.normal(size=(20, 2)), reach * rng.normal(size=(20, 1))
+    posterior = learn(planner, x, u)
+    there = visited(planner, posterior)
+    width = np.diff(np.quantile(there, [1e-3, 1 - 1e-3], axis=(0, 1)), axis=0)[0]
+    recorded, flat = np.concatenate([x, u], axis=1) / width, (there / width).reshape(-1, 3)
+    marginal = np.stack([nearest(recorded[:, [i]], flat[:, [i]]) for i in range(3)], axis=1)
+    paired = np.max([nearest(recorded[:, [i, j]], flat[:, [i, j]]) for i, j in combinations(range(3), 2)], axis=0)
+    found = coverage(planner, posterior, TASKS)
+    assert found.marginal == pytest.approx(marginal.max(), rel=1e-6)
+    assert found.pair == pytest.approx(paired.max(), rel=1e-6)
+    assert found.coordinate == np.unravel_index(marginal.argmax(), marginal.shape)[1]
+    np.testing.assert_allclose(found.place, there.reshape(-1, 3)[marginal.max(axis=1).argmax()], rtol=1e-6)
+    np.testing.assert_allclose(found.resolution, marginal.max(axis=0) * width, rtol=1e-6)
+    far = (marginal.max(axis=1) + 0.3 * paired).reshape(there.shape[:2]).max(axis=1)
+    np.testing.assert_array_equal(found.task, TASKS[far.argmax()])
+    assert found.tasks == len(TASKS)
+
+
+def test_what_is_recorded_on_the_same_loops_leaves_no_gap() -> None:
+    planner = make_planner()
+    first = learn(planner, *np.split(np.random.default_rng(0).normal(size=(20, 3)), [2], axis=1))
+    there = visited(planner, first).reshape(-1, 3)
+    # The residual is that of the first posterior's mean, so that its loops are visited again.
+    x, u = there[:, :2], there[:, 2:]
+    again = learn(planner, x, u)
+    found = coverage(planner, again, TASKS)
+    assert found.marginal < 0.05
+    assert found.pair is not None
+    assert found.pair < 0.05
+
+
+def test_an_input_that_was_never_used_is_named() -> None:
+    rng, planner = np.random.default_rng(1), make_planner()
+    x = np.stack(np.meshgrid(np.linspace(-3, 3, 12), np.linspace(-2, 2, 12)), axis=-1).reshape(-1, 2)
+    posterior = learn(planner, x + 1e-3 * rng.normal(size=x.shape), 1e-3 * rng.normal(size=(144, 1)))
+    found = coverage(planner, posterior, TASKS)
+    assert found.coordinate == 2
+    assert found.resolution[2] == pytest.approx(abs(found.place[2]), abs=0.01)
+
+
+def test_with_many_coordinates_pairs_are_not_compared() -> None:
+    planner = make_planner(MOST_COORDINATES)
+    rng = np.random.default_rng(0)
+    posterior = learn(planner, rng.normal(size=(30, MOST_COORDINATES)), rng.normal(size=(30, 1)))
+    found = coverage(planner, posterior, TASKS)
+    assert found.pair is None
+    assert found.marginal > 0
+
+
+def test_of_long_loops_steps_from_start_to_end_are_compared() -> None:
+    planner = make_planner(horizon=200)
+    rng = np.random.default_rng(0)
+    posterior = learn(planner, 0.01 * rng.normal(size=(30, 2)), 0.01 * rng.normal(size=(30, 1)))
+    starts = planner.validation.space.from_unit(TASKS)
+    # Only the starts are far from what is recorded near the origin.
+    found = coverage(planner, posterior, TASKS)
+    assert np.abs(starts - found.place[:2]).max(axis=1).min() < 1e-9 or found.coordinate == 2
+
+
+def test_one_recorded_coordinate_that_never_changes_is_allowed() -> None:
+    rng, planner = np.random.default_rng(1), make_planner()
+    posterior = learn(planner, rng.normal(size=(20, 2)), np.zeros((20, 1)))
+    assert np.isfinite(coverage(planner, posterior, TASKS).marginal)
+
+
+def test_tasks_that_cannot_be_planned_are_not_counted() -> None:
+    class Right:
+        batched = True
+
+        def design(self, task: Task, model: models.Model) -> controllers.Controller:  # type: ignore[name-defined]
+            if (task.initial_state[..., 0] > 0).any():
+                raise ValueError("not here")
+            return controllers.LQR([1.0, 1.0], [0.1]).design(task, model)
+
+    planner = make_planner()
+    posterior = learn(planner, *np.split(np.random.default_rng(0).normal(size=(20, 3)), [2], axis=1))
+    planner.validation.synthesizer = Right()
+    left = TASKS[:, 0] < 0.5
+    found = coverage(planner, posterior, TASKS)
+    assert found.tasks == left.sum()
+    assert (found.task == TASKS[left]).all(axis=1).any()

@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+import pytest
+
+from ctxval import Task, TaskSpace, Transitions, Validation, controllers, distances, models, systems
+from ctxval._util.arrays import Array
+from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.learning.dynamics_posterior import DynamicsDraws, DynamicsPosterior, PosteriorSettings, learn_posterior
+from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings, loop_pairs
+
+MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
+
+
+def truth(x: Array, u: Array) -> Array:
+    return np.asarray(MODEL.step(x, u) + 0.05 * np.sin(2 * x) * (1 + u))
+
+
+def make_planner(dimension: int) -> LoopPlanner:
+    space = TaskSpace(start=([-2.0, -1.0][:dimension], [2.0, 1.0][:dimension]))
+    return LoopPlanner(
+        Validation(
+            space=space,
+            task=lambda p: Task([p.start[..., 0], p.start[..., 1] if dimension == 2 else 0.4], horizon=12, dt=0.1),
+            system=systems.Simulated(truth, vectorized=True),
+            model=MODEL,
+            synthesizer=controllers.LQR([1.0, 0.1], [0.1]),
+            distance=distances.MeanDeviation(),
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Remembering(DynamicsPosterior):
+    """A posterior that keeps the draws that a search takes from it."""
+
+    taken: list[DynamicsDraws] = field(default_factory=list)
+
+    def draw(self, relevant: Array, rng: np.random.Generator) -> DynamicsDraws:
+        self.taken.append(super().draw(relevant, rng))
+        return self.taken[-1]
+
+
+@functools.cache
+def learned() -> DynamicsPosterior:
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(14, 2)), rng.normal(size=(14, 1))
+    settings = PosteriorSettings(hyperparameters=4, functions=2)
+    transitions = Transitions(x, u, truth(x, u))
+    found = learn_posterior(MODEL, transitions, np.zeros(14, dtype=np.intp), rng, settings)
+    assert found is not None
+    return found
+
+
+def remembering() -> Remembering:
+    known = learned()
+    return Remembering(**{one.name: getattr(known, one.name) for one in fields(known)})
+
+
+def grid(dimension: int) -> Array:
+    side = np.linspace(0, 1, 401 if dimension == 1 else 41)
+    return np.stack(np.meshgrid(*[side] * dimension), axis=-1).reshape(-1, dimension)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_maxima_are_those_of_a_dense_grid(dimension: int, seed: int) -> None:
+    planner, posterior = make_planner(dimension), remembering()
+    search = WorstCaseSearch(planner, seed, WorstCaseSettings.for_dimension(dimension))
+    found = search.maxima(posterior, np.empty((0, dimension)), np.random.default_rng(seed))
+    (draws,) = posterior.taken
+    points = grid(dimension)
+    plans = planner.plan(points)
+    largest = planner.distances(draws, plans, len(points)).max(axis=1)
+    assert len(found.maxima) == len(draws) == 8
+    assert (found.maxima >= 0.995 * largest).all()
+    of_mean = planner.distances(posterior.mean, plans, len(points)).max()
+    assert found.of_mean >= 0.995 * of_mean
+
+
+@pytest.mark.slow
+def test_maxima_are_distances_at_their_points() -> None:
+    planner, posterior = make_planner(2), remembering()
+    search = WorstCaseSearch(planner, 0, WorstCaseSettings.for_dimension(2))
+    found = search.maxima(posterior, np.empty((0, 2)), np.random.default_rng(0))
+    again = planner.own_distances(posterior.taken[0], found.points[:, None])[:, 0]
+    np.testing.assert_allclose(found.maxima, again, rtol=1e-7)
+    assert ((found.points >= 0) & (found.points <= 1)).all()
+    np.testing.assert_allclose(
+        planner.distances(posterior.mean, planner.plan(found.elites[:1]), 1), found.of_mean, rtol=1e-7
+    )
+    assert found.left_out == max(posterior.taken[0].left_out)
+
+
+FEW = WorstCaseSettings(pool=64, evaluations=300, elites=6, shared=6, moves=4, relevant=100)
+
+
+def test_equal_seeds_give_equal_maxima_whatever_was_computed_before() -> None:
+    known, posterior = np.array([[0.9, 0.2]]), learned()
+    used = WorstCaseSearch(make_planner(2), 3, FEW)
+    used.maxima(posterior, known, np.random.default_rng(8))
+    np.random.default_rng().random()
+    fresh = WorstCaseSearch(make_planner(2), 3, FEW)
+    first, second = (one.maxima(posterior, known, np.random.default_rng(4)) for one in (used, fresh))
+    np.testing.assert_array_equal(first.maxima, second.maxima)
+    np.testing.assert_array_equal(first.points, second.points)
+    np.testing.assert_array_equal(first.elites, second.elites)
+    other = fresh.maxima(posterior, known, np.random.default_rng(5))
+    assert not np.array_equal(first.maxima, other.maxima)
+
+
+def test_the_pool_covers_the_cube_and_its_faces() -> None:
+    pool = WorstCaseSearch(make_planner(2), 0, FEW).pool
+    assert pool.shape == (64, 2)
+    assert ((pool >= 0) & (pool <= 1)).all()
+    at_bounds = np.isin(pool, [0.0, 1.0]).any(axis=1)
+    assert not at_bounds[::2].any()
+    assert at_bounds[1::2].mean() > 0.3
+    np.testing.assert_array_equal(pool, WorstCaseSearch(make_planner(2), 0, FEW).pool)
+    assert not np.array_equal(pool, WorstCaseSearch(make_planner(2), 1, FEW).pool)
+
+
+def test_known_tasks_are_run_on_all_draws() -> None:
+    posterior, known = remembering(), np.array([[0.31, 0.77], [1.0, 1.0]])
+    planner = make_planner(2)
+    found = WorstCaseSearch(planner, 0, FEW).maxima(posterior, known, np.random.default_rng(0))
+    there = planner.distances(posterior.taken[0], planner.plan(known), 2).max(axis=1)
+    assert (found.maxima >= there * (1 - 1e-9)).all()
+
+
+def test_drawn_loops_that_diverge_have_an_infinite_maximum() -> None:
+    planner = make_planner(1)
+    planner.validation.synthesizer = controllers.Policy(lambda t, x, task: 1e80 * x[..., :1] ** 3)
+    planner.validation.model = models.Function(lambda x, u: 0.5 * x, vectorized=True)
+    found = WorstCaseSearch(planner, 0, FEW).maxima(learned(), np.empty((0, 1)), np.random.default_rng(0))
+    assert np.isinf(found.maxima).all()
+
+
+def test_the_number_of_loops_is_counted() -> None:
+    found = WorstCaseSearch(make_planner(2), 0, FEW).maxima(learned(), np.empty((0, 2)), np.random.default_rng(0))
+    on_draws = found.evaluations - FEW.evaluations
+    each = len(found.elites) + FEW.shared + 3 * (4 + FEW.moves + 1)
+    assert on_draws == 8 * each
+
+
+def test_pairs_of_loops_are_those_that_the_mean_visits() -> None:
+    planner, posterior = make_planner(2), learned()
+    tasks = np.random.default_rng(0).random((5, 2))
+    (loops,) = planner.run(posterior.mean, planner.plan(tasks))
+    pairs = np.concatenate([loops.states[0, :, :-1], loops.inputs[0]], axis=-1).reshape(-1, 3)
+    expected = (pairs - posterior.data.shift) / posterior.data.scale
+    np.testing.assert_allclose(loop_pairs(planner, posterior, tasks), expected)
+
+
+@pytest.mark.parametrize(("dimension", "evaluations"), [(1, 512), (2, 2048), (3, 4096), (4, 6000), (20, 6000)])
+def test_few_task_parameters_need_fewer_loops(dimension: int, evaluations: int) -> None:
+    assert WorstCaseSettings.for_dimension(dimension).evaluations == evaluations
