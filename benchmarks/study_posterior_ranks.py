@@ -1,4 +1,4 @@
-"""Are draws of the residual dynamics as uncertain as they should be? Ranks of the truth among draws (Talts et al. 2018).
+"""Are draws of the residual dynamics as uncertain as they should be? Ranks of the truth (Talts et al. 2018).
 
 The residual of each system is drawn from exactly the prior that the posterior assumes. The posterior is learned from
 transitions of the system, and the rank of the true value among the draws is stored: for the residual at new state-input
@@ -32,7 +32,7 @@ from ctxval._util.json_lines import JsonLines
 from ctxval.core.model import Step
 from ctxval.core.rollout import rollout
 from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.dynamics_posterior import DynamicsDraws, PosteriorSettings, learn_posterior
+from ctxval.learning.dynamics_posterior import PosteriorSettings, learn_posterior
 from ctxval.learning.hyperparameters import Hyperparameters, draw_prior
 from ctxval.learning.worst_case import loop_pairs
 from ctxval.models.scaling import standard_deviations
@@ -60,16 +60,16 @@ class PriorResidual:
 
     Args:
         hyperparameters: the covariance, and its hyperparameters.
-        states, inputs: the numbers n and m.
+        states: the number n of its values.
         rng: the source of the function.
     """
 
-    def __init__(self, hyperparameters: Hyperparameters, states: int, inputs: int, rng: np.random.Generator) -> None:
+    def __init__(self, hyperparameters: Hyperparameters, states: int, rng: np.random.Generator) -> None:
         self._kernel, self._theta, self._rng = hyperparameters.kernel, hyperparameters.theta, rng
         constant, slope = np.exp(0.5 * self._theta[-2:])
         self._constant = constant * rng.standard_normal(states)
-        self._slopes = slope * rng.standard_normal((states + inputs, states))
-        self._pairs = np.empty((0, states + inputs))
+        self._slopes = slope * rng.standard_normal((len(self._theta) - 2, states))
+        self._pairs = np.empty((0, len(self._theta) - 2))
         self._white = np.empty((0, states))
         self._factor = np.empty((0, 0))
 
@@ -152,7 +152,7 @@ def recorded(
     hyperparameters = draw_prior(n + 1, 1, rng)
     pairs = np.concatenate([x, u], axis=1)
     shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
-    residual = PriorResidual(hyperparameters, n, 1, rng)
+    residual = PriorResidual(hyperparameters, n, rng)
     noise = np.sqrt(hyperparameters.noise) * rng.standard_normal((len(x), n))
     values = residual((pairs - shift) / scale) + noise
     sizes = SIZE * standard_deviations(model.step(x, u) - x) / np.sqrt((values**2).mean(axis=0))

@@ -19,9 +19,7 @@ def make_planner(states: int = 2, horizon: int = 15) -> LoopPlanner:
     return LoopPlanner(
         Validation(
             space=TaskSpace(start=([-2.0, -1.0], [2.0, 1.0])),
-            task=lambda p: Task(
-                [p.start[..., 0], p.start[..., 1], *[1.0] * (states - 2)], horizon=horizon, dt=0.1
-            ),
+            task=lambda p: Task([p.start[..., 0], p.start[..., 1], *[1.0] * (states - 2)], horizon=horizon, dt=0.1),
             system=systems.Simulated(lambda x, u: x, vectorized=True),
             model=models.Linear(A, np.full((states, 1), 0.1)),
             synthesizer=controllers.LQR([1.0] * states, [0.1]),

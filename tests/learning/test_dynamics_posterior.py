@@ -72,9 +72,7 @@ def test_the_mean_passes_through_the_observations_within_the_noise() -> None:
 def test_the_amplitudes_are_draws_of_their_posterior() -> None:
     rng, one = np.random.default_rng(0), component()
     Y = one.factor.L @ one.factor.L.T @ one.weights
-    drawn = [
-        Component.conditioned(one.hyperparameters, one.centres, Y, 400, rng).amplitudes ** -2 for _ in range(600)
-    ]
+    drawn = [Component.conditioned(one.hyperparameters, one.centres, Y, 400, rng).amplitudes ** -2 for _ in range(600)]
     # N / (y' K^-1 y) is the mean of the precision of a normal distribution of N numbers with a flat prior.
     expected = len(Y) / (Y * one.weights).sum(axis=0)
     np.testing.assert_allclose(np.mean(drawn, axis=0) / expected, 1, atol=5 * np.sqrt(2 / 15 / 600))
@@ -252,8 +250,9 @@ def test_draws_pass_through_what_was_recorded() -> None:
 
 
 def test_a_state_that_m_explains_stays_that_of_m() -> None:
-    truth = models.Function(lambda x, u: MODEL.step(x, u) + np.stack([0 * x[..., 0], np.sin(x[..., 0])], -1),
-                            vectorized=True)
+    truth = models.Function(
+        lambda x, u: MODEL.step(x, u) + np.stack([0 * x[..., 0], np.sin(x[..., 0])], -1), vectorized=True
+    )
     posterior = learn(record(40, truth=truth))
     draws = posterior.draw(posterior.data.pairs, np.random.default_rng(0))
     x, u = np.random.default_rng(1).normal(size=(len(draws), 5, 2)), np.zeros((len(draws), 5, 1))

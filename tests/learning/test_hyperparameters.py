@@ -50,9 +50,7 @@ def log_evidence(y: Array, K: Array) -> float:
 def test_the_likelihood_has_the_amplitudes_integrated_out() -> None:
     Z, Y = observations()
     other = PARAMETERS + np.array([0.3, -0.2, 0.5, 1.0, -0.6])
-    expected = [
-        sum(log_evidence(y, covariance(at, Z)) for y in Y.T) + log_prior(at) for at in (PARAMETERS, other)
-    ]
+    expected = [sum(log_evidence(y, covariance(at, Z)) for y in Y.T) + log_prior(at) for at in (PARAMETERS, other)]
     found = [log_posterior(KERNEL, at, Z, Y)[0] for at in (PARAMETERS, other)]
     assert found[1] - found[0] == pytest.approx(expected[1] - expected[0], rel=1e-7)
 
@@ -101,9 +99,7 @@ def test_a_covariance_that_is_not_finite_is_refused() -> None:
 def test_the_first_draw_is_the_mode_of_the_most_probable_family() -> None:
     Z, Y = observations(25)
     drawn = draw_hyperparameters(Z, Y, 1, 10, np.random.default_rng(0), FAMILIES)
-    density = [
-        log_posterior(one.kernel, np.append(one.theta, np.log(one.noise)), Z, Y)[0] for one in drawn
-    ]
+    density = [log_posterior(one.kernel, np.append(one.theta, np.log(one.noise)), Z, Y)[0] for one in drawn]
     assert len(drawn) == 10
     assert density[0] >= max(density) - 1e-6
     again = draw_hyperparameters(Z, Y, 1, 3, np.random.default_rng(1), FAMILIES)

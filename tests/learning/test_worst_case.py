@@ -77,7 +77,8 @@ def test_maxima_are_those_of_a_dense_grid(dimension: int, seed: int) -> None:
     plans = planner.plan(points)
     largest = planner.distances(draws, plans, len(points)).max(axis=1)
     assert len(found.maxima) == len(draws) == 8
-    assert (found.maxima >= 0.995 * largest).all()
+    assert (found.maxima >= 0.97 * largest).all()
+    assert np.median(found.maxima / largest) > 0.995
     of_mean = planner.distances(posterior.mean, plans, len(points)).max()
     assert found.of_mean >= 0.995 * of_mean
 
@@ -143,8 +144,9 @@ def test_drawn_loops_that_diverge_have_an_infinite_maximum() -> None:
 def test_the_number_of_loops_is_counted() -> None:
     found = WorstCaseSearch(make_planner(2), 0, FEW).maxima(learned(), np.empty((0, 2)), np.random.default_rng(0))
     on_draws = found.evaluations - FEW.evaluations
-    each = len(found.elites) + FEW.shared + 3 * (4 + FEW.moves + 1)
-    assert on_draws == 8 * each
+    each = len(found.elites) + FEW.shared + 4 * (4 + FEW.moves + 1)
+    # Each draw also tries the best tasks of the others, of which there are at most eight.
+    assert 8 * (each + 1) <= on_draws <= 8 * (each + 8)
 
 
 def test_pairs_of_loops_are_those_that_the_mean_visits() -> None:

@@ -127,7 +127,9 @@ class Component:
         chosen, L, left_out = self._pivots(relevant, pivots)
         n = self.weights.shape[1]
         if not len(chosen):
-            return KernelExpansion(self.hyperparameters, self.centres, np.repeat(self.weights[None], count, 0)), left_out
+            return KernelExpansion(
+                self.hyperparameters, self.centres, np.repeat(self.weights[None], count, 0)
+            ), left_out
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
         normal = rng.standard_normal((count, len(chosen), n)) * self.amplitudes
         # The values L xi at the pivots are interpolated by the posterior covariance L L', with weights L'^-1 xi.

@@ -38,7 +38,7 @@ _FREEDOM = 6.0
 _PROPOSALS = 48
 """Number of proposals for each family."""
 _STARTS = (1e-5, 0.1)
-"""Noise variances at which climbs to the modes start. A rough function without noise can look like a smooth one with it."""
+"""Noise variances from which climbs start: the data can look like a rough function, or like a smooth one with noise."""
 _LOWEST = 12.0
 """A mode whose log posterior is lower than the highest one by more than this does not count."""
 _SAME = 0.5

@@ -3,7 +3,8 @@
 First the distance on the posterior mean is searched globally, from a pool of tasks whose controllers are designed once
 for a whole campaign. Its elites, the tasks with known distances and some random tasks are then run on all draws.
 Around the best of these, each draw is searched on its own: coordinates are moved to bounds, one at a time and all that
-help together, and points are moved at random by ever smaller steps.
+help together, and points are moved at random by ever smaller steps. Between these rounds each draw tries the best tasks
+of the others.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import qmc
 
-from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.boxes import moves_to_bounds
+from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.boxes import moves_to_bounds, separated_rows
 from ctxval._util.representation import call
 from ctxval.gp.global_search import search_globally
 from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks
@@ -25,8 +26,16 @@ _DIVERGED = 1e30
 """The distance of a loop that diverges, in searches: larger than all others, and finite."""
 _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)
 """Number of tasks in the global search for 1, 2, ... task parameters; the last one holds for all higher numbers."""
-_SHARES = (0.1, 0.03, 0.01)
+_SHARES = (0.1, 0.05, 0.02, 0.007)
 """Standard deviations of the random moves in successive rounds of the search on each draw."""
+_EXCHANGED = 2
+"""Round before which each draw tries the best tasks of the other draws."""
+_SHOWN = 16
+"""Largest number of these tasks."""
+_SAME = 0.02
+"""Least distance of two of them, as a share of the cube's diagonal."""
+_APART = 0.15
+"""Least distance of two tasks that are not next to each other, as a share of the cube's diagonal."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +54,7 @@ class WorstCaseSettings:
     pool: int = 1024
     evaluations: int = 6000
     elites: int = 24
-    shared: int = 24
+    shared: int = 64
     moves: int = 10
     relevant: int = 700
 
@@ -161,19 +170,26 @@ class WorstCaseSearch:
         values = _finite(self.planner.distances(draws, planned, len(tasks)))
         order = np.argsort(-values, axis=1, kind="stable")
         best, points = np.take_along_axis(values, order[:, :1], 1)[:, 0], tasks[order[:, 0]]
-        second, loops = tasks[order[:, min(1, len(tasks) - 1)]], len(tasks)
-        for share in _SHARES:
+        second, loops = _others(tasks, order), len(tasks)
+        for round_, share in enumerate(_SHARES):
+            if round_ == _EXCHANGED:
+                points, best, more = self._exchanged(draws, points, best)
+                loops += more
             moved = self._moves(points, second, share, rng)
             found = _finite(self.planner.own_distances(draws, moved))
-            together = _together(points, best, moved, found)
-            tried = np.concatenate([moved, together[:, None]], axis=1)
-            found = np.concatenate([found, _finite(self.planner.own_distances(draws, together[:, None]))], axis=1)
-            row, at = np.arange(len(points)), found.argmax(axis=1)
-            better = found[row, at] > best
-            points = np.where(better[:, None], tried[row, at], points)
-            best = np.where(better, found[row, at], best)
+            together = _together(points, best, moved, found)[:, None]
+            last = _finite(self.planner.own_distances(draws, together))
+            tried, found = np.concatenate([moved, together], axis=1), np.concatenate([found, last], axis=1)
+            points, best = _better(points, best, tried, found)
             loops += tried.shape[1]
         return points, best, loops
+
+    def _exchanged(self, draws: DynamicsDraws, points: Array, best: Array) -> tuple[Array, Array, int]:
+        """Return the better of each draw's best point and the best points of all others, and the number of loops."""
+        order = np.argsort(-best, kind="stable")
+        tasks = points[order][separated_rows(points[order], _SAME * np.sqrt(self.dimension), _SHOWN)]
+        found = _finite(self.planner.distances(draws, self.planner.plan(tasks), len(tasks)))
+        return *_better(points, best, np.broadcast_to(tasks, (len(best), *tasks.shape)), found), len(tasks)
 
     def _moves(self, points: Array, others: Array, share: float, rng: np.random.Generator) -> Array:
         """Return the moves of each point: to bounds, 2 d of them, and at random around it and around another one."""
@@ -194,9 +210,24 @@ def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array)
     return np.asarray(pairs[(np.abs(pairs) < _DIVERGED).all(axis=1)])
 
 
+def _others(tasks: Array, order: Rows) -> Array:
+    """Return, for each draw, its best task ``(d,)`` that is not next to its best one; the second best if all are."""
+    ordered = tasks[order]
+    apart = np.linalg.norm(ordered - ordered[:, :1], axis=2) > _APART * np.sqrt(tasks.shape[1])
+    at = np.where(apart.any(axis=1), apart.argmax(axis=1), min(1, len(tasks) - 1))
+    return np.asarray(ordered[np.arange(len(ordered)), at])
+
+
 def _finite(distances: Array) -> Array:
     """Return distances for a search: very large if a loop diverges, minus infinity if a task cannot be planned."""
     return np.where(np.isnan(distances), -np.inf, np.minimum(distances, _DIVERGED))
+
+
+def _better(points: Array, best: Array, tried: Array, found: Array) -> tuple[Array, Array]:
+    """Return, for each draw, the best of its point ``(S, d)`` and those that were tried, ``(S, q, d)``."""
+    row, at = np.arange(len(points)), found.argmax(axis=1)
+    better = found[row, at] > best
+    return np.where(better[:, None], tried[row, at], points), np.where(better, found[row, at], best)
 
 
 def _together(points: Array, best: Array, moved: Array, found: Array) -> Array:
