@@ -7,7 +7,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick check reliability crash-states attack bench bench-peers study reproduce search global-search calibrate parts pictures clean
+.PHONY: demo test quick check reliability crash-states attack bench bench-peers study reproduce search global-search calibrate parts pictures posterior-ranks clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -57,6 +57,9 @@ calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/
 	$(BIN)/python benchmarks/calibrate_dynamics.py
 	$(BIN)/python benchmarks/study_retrain.py
 	$(BIN)/python benchmarks/calibration_page.py
+
+posterior-ranks: .venv/.test  ## are draws of the learned dynamics as uncertain as they should be? Resumes
+	$(BIN)/python benchmarks/study_posterior_ranks.py
 
 search: .venv/.test  ## how many executions the searches need; writes docs/search.md, and resumes
 	$(BIN)/python benchmarks/study_auto.py

@@ -130,21 +130,11 @@ def test_with_few_pivots_draws_leave_out_as_much_variance_as_they_say(pivots: in
     relevant = rng.uniform(-4, 4, (60, 2))
     _, covariance, left_out = moments(one, relevant, relevant, pivots)
     exact_variances = np.diag(exact(one, relevant)[1])
-    assert exact_variances.max() < 10 * np.median(exact_variances)
     missing = (exact_variances - np.diag(covariance)) / exact_variances.max()
     assert left_out > 0.05
     assert missing.max() == pytest.approx(left_out, abs=5 * np.sqrt(2 / 4000))
     # What is left out never makes a draw too wide.
     assert (missing > -5 * np.sqrt(2 / 4000)).all()
-
-
-def test_pairs_of_loops_that_diverge_do_not_take_all_pivots() -> None:
-    rng, one = np.random.default_rng(1), component(8)
-    near = rng.uniform(-3, 3, (40, 2))
-    far = 1e4 * rng.normal(size=(30, 2))
-    _, covariance, left_out = moments(one, np.concatenate([near, far]), near, 50, 1000)
-    assert left_out < 0.5
-    assert np.median(np.diag(covariance) / np.diag(exact(one, near)[1])) > 0.9
 
 
 def test_draws_differ_even_if_less_than_the_noise() -> None:

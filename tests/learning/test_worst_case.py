@@ -77,7 +77,7 @@ def test_maxima_are_those_of_a_dense_grid(dimension: int, seed: int) -> None:
     plans = planner.plan(points)
     largest = planner.distances(draws, plans, len(points)).max(axis=1)
     assert len(found.maxima) == len(draws) == 8
-    assert (found.maxima >= 0.97 * largest).all()
+    assert (found.maxima >= 0.95 * largest).all()
     assert np.median(found.maxima / largest) > 0.995
     of_mean = planner.distances(posterior.mean, plans, len(points)).max()
     assert found.of_mean >= 0.995 * of_mean
@@ -156,6 +156,16 @@ def test_pairs_of_loops_are_those_that_the_mean_visits() -> None:
     pairs = np.concatenate([loops.states[0, :, :-1], loops.inputs[0]], axis=-1).reshape(-1, 3)
     expected = (pairs - posterior.data.shift) / posterior.data.scale
     np.testing.assert_allclose(loop_pairs(planner, posterior, tasks), expected)
+
+
+def test_pairs_of_loops_that_diverge_are_left_out() -> None:
+    planner, posterior = make_planner(2), learned()
+    planner.validation.synthesizer = controllers.Policy(
+        lambda t, x, task: np.where(task.initial_state[..., :1] > 0, 1e5 * x[..., :1], 0 * x[..., :1])
+    )
+    pairs = loop_pairs(planner, posterior, np.array([[0.1, 0.5], [0.9, 0.5]]))
+    assert 12 <= len(pairs) < 24
+    assert np.abs(pairs).max() < 1e3
 
 
 @pytest.mark.parametrize(("dimension", "evaluations"), [(1, 512), (2, 2048), (3, 4096), (4, 6000), (20, 6000)])

@@ -26,9 +26,7 @@ from ctxval.learning.residual_data import ResidualData, residual_data
 _PIVOT = 0.1
 """Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
 _NEGLIGIBLE = 1e-3
-"""Share of the posterior variance below which a pivot adds nothing to those chosen before it."""
-_FAR = 10.0
-"""A pair counts as far away if its posterior variance is larger than that of the median pair by this factor."""
+"""Share of the largest posterior variance below which a pivot adds nothing to those chosen before it."""
 _ROUNDING = 1e-13
 """Posterior variances below this share of the prior variance are rounding errors."""
 _WORK = 30_000
@@ -56,7 +54,7 @@ class PosteriorSettings:
     functions: int = 2
     learned_from: int = 120
     centres: int = 400
-    pivots: int = 50
+    pivots: int = 100
     families: tuple[tuple[float, float], ...] = FAMILIES
 
     @classmethod
@@ -142,20 +140,17 @@ class Component:
         ), left_out
 
     def _pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
-        """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left.
-
-        What is left of a variance is compared with the largest one, but of pairs far away, on loops that diverge, with
-        their own: beside theirs, the variances of all other pairs would be negligible.
-        """
+        """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
         half, left = self._halved(relevant)
-        scale = np.maximum(left, min(_FAR * np.median(left), left.max())) if len(left) else left
-        rounding = _ROUNDING * kernel.diagonal(theta, relevant)
+        first = left.max(initial=0.0)
+        # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
+        rounding = _ROUNDING * kernel.diagonal(theta, relevant).max(initial=0.0)
         columns = np.zeros((min(count, len(relevant)), len(relevant)))
         chosen: list[int] = []
         for k in range(len(columns)):
-            pivot = int(np.argmax(_share(left, scale, rounding)))
-            if left[pivot] <= max(_NEGLIGIBLE * scale[pivot], rounding[pivot]):
+            pivot = int(np.argmax(left))
+            if left[pivot] <= max(_NEGLIGIBLE * first, rounding):
                 break
             covariances = kernel(theta, relevant[pivot : pivot + 1], relevant)[0]
             row = covariances - half[:, pivot] @ half - columns[:k, pivot] @ columns[:k]
@@ -164,13 +159,8 @@ class Component:
             left[pivot] = 0.0
             chosen.append(pivot)
         L = np.tril(columns[: len(chosen)][:, chosen].T)
-        left_out = _share(left, scale, rounding).max(initial=0.0)
+        left_out = left.max() / first if first > rounding else 0.0
         return np.array(chosen, dtype=np.intp), L, float(left_out)
-
-
-def _share(left: Array, scale: Array, rounding: Array) -> Array:
-    """Return variances as shares of a scale; 0 if rounding errors are as large."""
-    return np.where(left > rounding, left, 0.0) / np.maximum(scale, rounding)
 
 
 @dataclass(frozen=True, eq=False)
