@@ -226,6 +226,7 @@ def test_noise_is_learned_within_a_factor_of_two(deviation: float) -> None:
         assert 0.5 < posterior.noise / expected < 2
 
 
+@pytest.mark.slow
 def test_a_system_without_noise_is_learned_as_one() -> None:
     assert learn(record(120, truth=models.Function(rough, vectorized=True))).noise < 1e-5
 
@@ -255,6 +256,7 @@ def test_a_model_without_error_has_no_posterior() -> None:
     assert learn_posterior(MODEL, transitions, np.zeros(30, dtype=np.intp), np.random.default_rng(0)) is None
 
 
+@pytest.mark.slow
 def test_seeds_alone_decide_the_draws() -> None:
     transitions, found = record(30, truth=models.Function(rough, vectorized=True)), []
     for seed in (0, 0, 1):

@@ -100,6 +100,7 @@ def test_maxima_are_distances_at_their_points() -> None:
 FEW = WorstCaseSettings(pool=64, evaluations=300, elites=6, shared=6, moves=4, relevant=100)
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_maxima_whatever_was_computed_before() -> None:
     known, posterior = np.array([[0.9, 0.2]]), learned()
     used = WorstCaseSearch(make_planner(2), 3, FEW)

@@ -139,9 +139,9 @@ class LoopPlanner:
     def _distances(self, planned: PlannedTasks, loops: Trajectory) -> Array:
         """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does."""
         promised, known = planned.promised.finite, planned.promised.finite & loops.finite
-        both = (_without_divergence(one, known) for one in (planned.promised, loops))
+        model, system = (_without_divergence(one, known) for one in (planned.promised, loops))
         with np.errstate(all="ignore"):
-            values = np.asarray(self.validation.distance(*both, planned.task), dtype=np.float64)
+            values = np.asarray(self.validation.distance(model, system, planned.task), dtype=np.float64)
         found = np.where(np.isfinite(values) & known, values, np.inf)
         return np.where(promised, found, np.nan).reshape(len(planned.rows))
 

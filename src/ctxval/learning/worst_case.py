@@ -25,7 +25,7 @@ from ctxval.learning.dynamics_posterior import DynamicsDraws, DynamicsPosterior
 _DIVERGED = 1e30
 """The distance of a loop that diverges, in searches: larger than all others, and finite."""
 _FARTHEST = 1e3
-"""Standardised pairs beyond this magnitude belong to loops that diverge; pivots there would take those of all others."""
+"""Standardised pairs beyond this magnitude belong to loops that diverge, which would otherwise take all pivots."""
 _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)
 """Number of tasks in the global search for 1, 2, ... task parameters; the last one holds for all higher numbers."""
 _SHARES = (0.1, 0.05, 0.02, 0.007)
@@ -204,7 +204,7 @@ class WorstCaseSearch:
 
 
 def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Array:
-    """Return the standardised state-input pairs ``(N, k)`` that the mean's closed loops on tasks visit, but far ones."""
+    """Return the standardised pairs ``(N, k)`` that the mean's closed loops on tasks visit, without those far away."""
     parts = []
     for loops in planner.run(posterior.mean, planner.plan(tasks)):
         parts.append(posterior.data.standardised(loops.states[..., :-1, :], loops.inputs))
