@@ -164,6 +164,7 @@ class Failing:
         return LQR.design(task, model)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batched", [True, False])
 def test_tasks_without_a_controller_have_no_distance(batched: bool) -> None:
     draws, planner = make_draws(), LoopPlanner(make_validation(Failing(batched=batched)))

@@ -25,7 +25,7 @@ from ctxval.learning.residual_data import ResidualData, residual_data
 
 _PIVOT = 0.1
 """Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
-_NEGLIGIBLE = 1e-3
+_NEGLIGIBLE = 1e-6
 """Share of the largest posterior variance below which a pivot adds nothing to those chosen before it."""
 _ROUNDING = 1e-13
 """Posterior variances below this share of the prior variance are rounding errors."""
