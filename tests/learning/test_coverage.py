@@ -8,7 +8,8 @@ import pytest
 from ctxval import Task, TaskSpace, Transitions, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
 from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.coverage import MOST_COORDINATES, coverage
+from ctxval.learning.coverage import MOST_COORDINATES, Coverage
+from ctxval.learning.coverage import coverage as coverage_of
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 
 TASKS = np.random.default_rng(3).random((9, 2))
@@ -39,6 +40,10 @@ def learn(planner: LoopPlanner, x: Array, u: Array) -> DynamicsPosterior:
     return found
 
 
+def coverage(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Coverage:
+    return coverage_of(planner, posterior, tasks, planner.plan(tasks))
+
+
 def visited(planner: LoopPlanner, posterior: DynamicsPosterior) -> Array:
     """Return the pairs ``(q, H, k)`` of the mean's closed loops, in the system's units."""
     (loops,) = planner.run(posterior.mean, planner.plan(TASKS))
@@ -60,14 +65,18 @@ def test_gaps_are_those_of_all_pairs_compared(reach: float) -> None:
     recorded, flat = np.concatenate([x, u], axis=1) / width, (there / width).reshape(-1, 3)
     marginal = np.stack([nearest(recorded[:, [i]], flat[:, [i]]) for i in range(3)], axis=1)
     paired = np.max([nearest(recorded[:, [i, j]], flat[:, [i, j]]) for i, j in combinations(range(3), 2)], axis=0)
+    beyond = np.maximum(np.maximum(flat - recorded.max(axis=0), recorded.min(axis=0) - flat), 0.0)
     found = coverage(planner, posterior, TASKS)
     assert found.marginal == pytest.approx(marginal.max(), rel=1e-6)
+    assert found.beyond == pytest.approx(beyond.max(), rel=1e-6)
     assert found.pair == pytest.approx(paired.max(), rel=1e-6)
-    assert found.coordinate == np.unravel_index(marginal.argmax(), marginal.shape)[1]
-    np.testing.assert_allclose(found.place, there.reshape(-1, 3)[marginal.max(axis=1).argmax()], rtol=1e-6)
+    worst = beyond if 10 * beyond.max() > marginal.max() else marginal
+    assert found.coordinate == np.unravel_index(worst.argmax(), worst.shape)[1]
+    np.testing.assert_allclose(found.place, there.reshape(-1, 3)[worst.max(axis=1).argmax()], rtol=1e-6)
     np.testing.assert_allclose(found.resolution, marginal.max(axis=0) * width, rtol=1e-6)
-    far = (marginal.max(axis=1) + 0.3 * paired).reshape(there.shape[:2]).max(axis=1)
-    np.testing.assert_array_equal(found.task, TASKS[far.argmax()])
+    of_gaps = (marginal.max(axis=1) + 0.3 * paired).reshape(there.shape[:2]).max(axis=1)
+    of_range = 10 * beyond.max(axis=1).reshape(there.shape[:2]).max(axis=1)
+    np.testing.assert_array_equal(found.task, TASKS[(of_gaps + of_range).argmax()])
     assert found.tasks == len(TASKS)
 
 

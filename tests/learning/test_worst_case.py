@@ -169,6 +169,6 @@ def test_pairs_of_loops_that_diverge_are_left_out() -> None:
     assert np.abs(pairs).max() < 1e3
 
 
-@pytest.mark.parametrize(("dimension", "evaluations"), [(1, 512), (2, 2048), (3, 4096), (4, 6000), (20, 6000)])
+@pytest.mark.parametrize(("dimension", "evaluations"), [(1, 512), (2, 2048), (3, 4096), (4, 6000), (20, 12000)])
 def test_few_task_parameters_need_fewer_loops(dimension: int, evaluations: int) -> None:
     assert WorstCaseSettings.for_dimension(dimension).evaluations == evaluations
