@@ -95,9 +95,10 @@ def _summary(found: Certificate | None, largest: float) -> dict[str, Any]:
         "bound": found.upper_bound / largest,
         "evaluations": details["evaluations"],
         "gap": details["coverage_gap"],
-        "held": [bool(prediction["held"]) for prediction in details["predictions"]],
+        "beyond": details["beyond_the_records"],
+        "held": [bool(prediction["held"]) for prediction in details["checked"]],
         "noise": details["noise"],
-        "left_out": details["left_out"],
+        "left_out": details["variance_left_out"],
     }
 
 

@@ -16,10 +16,10 @@ TEXT = """## Verdicts by learned dynamics
 These campaigns run as `--until-decided` does with the certificate `dynamics`, and at most {budget} executions. The
 thresholds of the certificate were chosen on the development systems: a prediction holds within {accurate:.0%} of the
 bound, the last {predictions} predictions must hold, the largest gap of the records is {gap:.0%}, and the largest excess
-over the records is {beyond:.0%}. The reporting systems (`benchmarks/dynamics_reporting.py`) were written down before any
-of them was run, and nothing was chosen with them. The parentheses contain the share of false verdicts, and the upper
-limit of this share with confidence 97.5 %. The kind may say `validated` as long as at 0.95 d* at most 5 % are false, with
-a limit of at most 7.5 %.
+over the records is {beyond:.0%}. The reporting systems (`benchmarks/dynamics_reporting.py`) were written down before
+any of them was run, and nothing was chosen with them. The parentheses contain the share of false verdicts, and the
+upper limit of this share with confidence 97.5 %. The kind may say `validated` as long as at 0.95 d* at most 5 % are
+false, with a limit of at most 7.5 %.
 
 ### Reporting systems
 

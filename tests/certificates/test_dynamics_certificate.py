@@ -115,6 +115,7 @@ def test_the_bound_is_never_below_what_was_executed_and_never_lowered_by_a_predi
         ({"predictions": (prediction(1), prediction(2, 0.5, 0.5 + 2 * ACCURATE), prediction(3))}, "trial 2: distance"),
         ({"predictions": (prediction(1), prediction(2, 0.9, 0.5), prediction(3))}, "contact or dry friction"),
         ({"noise": 2 * NOISE}, "2 % of the variance of the residual"),
+        ({"left_out": 0.9}, "leave out 90 % of the largest variance"),
         ({"coverage": replace(COVERED, marginal=1.1 * GAP)}, r"away from every record of u\[0\]"),
         ({"coverage": replace(COVERED, beyond=2 * BEYOND)}, r"4 % of its range beyond all records of u\[0\]"),
         ({"coverage": replace(COVERED, pair=1.1 * PAIR_GAP)}, "in two coordinates together"),

@@ -51,7 +51,7 @@ NOISE = 0.01
 """Largest learned variance of noise, as a share of the mean square of the residual."""
 
 LEFT_OUT = 0.5
-"""Largest share of the posterior variance that the draws may leave out, if this variance matters."""
+"""Largest share of the posterior variance that the draws may leave out between their pivots."""
 
 _RAISE = 0.5
 """Share of the largest excess over predictions by which the bound is raised."""
@@ -199,6 +199,11 @@ def doubt_of(evidence: DynamicsEvidence, bound: float) -> str | None:
             f"noise is learned with {100 * evidence.noise:.2g} % of the variance of the residual, and at most "
             f"{100 * NOISE:g} % is allowed: the system is not deterministic in the recorded state and input; record "
             "more states or reduce the noise, or use --kind posterior with --stochastic"
+        )
+    if evidence.left_out > LEFT_OUT:
+        return (
+            f"the draws of the dynamics leave out {100 * evidence.left_out:.0f} % of the largest variance, more than "
+            f"{100 * LEFT_OUT:g} %; more executions reduce this variance"
         )
     return _uncovered(coverage)
 
