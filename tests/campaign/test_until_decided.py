@@ -10,9 +10,18 @@ import pytest
 
 from conftest import interrupt_at_once, make_validation
 from ctxval import Campaign, cases
-from ctxval.campaign.dynamics import PREDICTION
+from ctxval.campaign.dynamics import AUDIT, PREDICTION
 from ctxval.campaign.until_decided import next_task
-from ctxval.certificates import Audit, CertificateOptions, Dynamics, DynamicsEvidence, Posterior, StateInputCoverage
+from ctxval.certificates import (
+    AnytimeAudit,
+    Audit,
+    CertificateOptions,
+    Dynamics,
+    DynamicsEvidence,
+    Posterior,
+    StateInputCoverage,
+)
+from ctxval.certificates.dynamics import AUDITED
 from ctxval.errors import InputError
 
 
@@ -89,10 +98,36 @@ def test_a_plain_run_is_certified_by_predictions_that_are_computed_afterwards() 
     assert verdict.certificate.details["predictions"]["made"] == 3
 
 
-def test_an_audit_cannot_end_it() -> None:
+def test_an_audit_of_a_planned_number_cannot_end_it() -> None:
     validation, _ = linear()
-    with pytest.raises(InputError, match=r"needs a bound on d\* \(auto, dynamics or posterior\), got 'audit'"):
+    with pytest.raises(InputError, match="auto, dynamics, posterior and anytime, got 'audit'"):
         Campaign(validation).run_until_decided(1.0, 5, certificate=CertificateOptions(Audit(), volume=0.1))
+    with pytest.raises(InputError, match="needs the volume"):
+        Campaign(validation).run_until_decided(1.0, 5, certificate=CertificateOptions(AnytimeAudit()))
+
+
+def test_an_anytime_audit_ends_as_soon_as_its_volume_is_small_enough() -> None:
+    validation, largest = linear()
+    options = CertificateOptions(AnytimeAudit(), volume=0.2)
+    campaign = Campaign(validation).run_until_decided(1.1 * largest, 60, certificate=options)
+    assert campaign.verdict(1.1 * largest, certificate=options).answer == "validated"
+    fewer = Campaign(validation).run_until_decided(1.1 * largest, campaign.executions - 1, certificate=options)
+    assert fewer.verdict(1.1 * largest, certificate=options).answer == "undecided"
+    assert 14 <= campaign.executions <= 30
+    assert {trial.origin for trial in campaign.trials} == {"iid"}
+
+
+@pytest.mark.slow
+def test_a_prediction_audit_executes_eight_fresh_tasks() -> None:
+    validation, largest = linear()
+    plain = Campaign(validation, seed=2).run_until_decided(1.1 * largest, 12)
+    audited = Campaign(validation, seed=2).run_until_decided(1.1 * largest, 30, audited=True)
+    assert audited.executions == plain.executions + AUDITED
+    assert sum(AUDIT in (trial.note or {}) for trial in audited.trials) == AUDITED
+    verdict = audited.verdict(1.1 * largest)
+    assert verdict.answer == "validated"
+    assert verdict.certificate is not None
+    assert verdict.certificate.details["predictions"]["audited"] == AUDITED
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ from ctxval.errors import CertificateError
 
 
 def prediction(trial: int, median: float = 0.5, distance: float = 0.5) -> CheckedPrediction:
-    return CheckedPrediction(trial, 1.0, 0.5, median, distance, stored=True)
+    return CheckedPrediction(trial, 1.0, 0.5, median, 1.1 * median, distance, stored=True)
 
 
 COVERED = StateInputCoverage(
@@ -129,6 +129,15 @@ def test_each_diagnostic_withdraws_the_bound_and_says_what_helps(changed: dict[s
     assert any(word in found.doubt for word in ("execute", "execution", "record more"))
 
 
+def test_an_audited_distance_above_its_prediction_withdraws_the_bound() -> None:
+    fresh = tuple(replace(prediction(k, 0.5, 0.54), audit=True) for k in range(4, 8))
+    assert certify_dynamics(sample(), replace(GOOD, predictions=(*GOOD.predictions, *fresh))).doubt is None
+    worse = (*GOOD.predictions, replace(prediction(4, 0.5, 0.6), audit=True), *fresh)
+    found = certify_dynamics(sample(), replace(GOOD, predictions=worse))
+    assert found.doubt is not None
+    assert "the prediction audit failed: the distance of trial 4 is 0.6, and at most 0.55 was predicted" in found.doubt
+
+
 def test_a_failure_long_ago_is_forgiven() -> None:
     old = (prediction(0, 0.1, 0.5), *GOOD.predictions)
     assert certify_dynamics(sample(), replace(GOOD, predictions=old)).doubt is None
@@ -208,4 +217,4 @@ def test_the_text_is_complete_and_json_has_every_prediction() -> None:
     assert "x[0] 0.1, u[0] 0.2" in str(found)
     stored = json.loads(json.dumps(found.to_json(), allow_nan=False))["details"]
     assert [one["trial"] for one in stored["checked"]] == [1, 2, 3]
-    assert stored["predictions"] == {"made": 3, "stored_beforehand": 3, "last_ones": 3, "held": 3}
+    assert stored["predictions"] == {"made": 3, "stored_beforehand": 3, "last_ones": 3, "held": 3, "audited": 0}

@@ -140,6 +140,7 @@ class Campaign(CampaignResults):
         stochastic: bool = False,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
+        audited: bool = False,
         workers: int | None = None,
         executor: cf.Executor | None = None,
         timeout: float | None = None,
@@ -157,7 +158,9 @@ class Campaign(CampaignResults):
             budget: largest total number of executions of S, including earlier ones.
             on_trial: called with each trial that has ended.
             confidence, stochastic, resolution, certificate: as in :meth:`verdict`; the kind of the certificate must be
-                ``auto``, ``dynamics`` or ``posterior``.
+                ``auto``, ``dynamics``, ``posterior`` or, with an acceptable volume, ``anytime``.
+            audited: before the bound from learned dynamics decides, predict and execute eight fresh random tasks, half
+                of them with parameters at their bounds. If a distance exceeds its prediction, the bound is withdrawn.
             workers, executor, timeout: as in :meth:`run`.
 
         Raises:
@@ -166,7 +169,7 @@ class Campaign(CampaignResults):
         """
         total = _count("budget must be a positive integer", budget)
         by = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
-        decision = UntilDecided(self._recorder, threshold, by, total)
+        decision = UntilDecided(self._recorder, threshold, by, total, audited)
         pool = self._pool(workers, executor, timeout)
         with self._recorder.predicting(decision.predicts):
             return self._execute(Schedule(self._recorder, decision.choose, total), pool, on_trial)

@@ -20,6 +20,9 @@ from ctxval.storage.store import Store
 PREDICTION = "prediction"
 """Key of the prediction of an execution in the note of its trial."""
 
+AUDIT = "prediction_audit"
+"""Key in the note of a trial that tests a prediction at a fresh random task."""
+
 _REMEMBERED = 4
 """Number of sets of executions whose dynamics are kept."""
 
@@ -105,11 +108,8 @@ class CampaignDynamics:
                 continue
             score = prediction.score(trajectory, trial.distance)
             if score is not None:
-                found.append(
-                    CheckedPrediction(
-                        trial.number, score.z2, score.rank, prediction.median, trial.distance, stored is not None
-                    )
-                )
+                facts = (score.z2, score.rank, prediction.median, prediction.upper, trial.distance, stored is not None)
+                found.append(CheckedPrediction(trial.number, *facts, audit=AUDIT in (trial.note or {})))
         return tuple(found)
 
     def __repr__(self) -> str:

@@ -61,12 +61,14 @@ class Choice:
         because: the change that was made to the system since the task was executed before.
         planned_draws: the planned number of independent draws, which is stored with each draw; 0 if the results decide
             the number, None if it is not known.
+        note: what is recorded about the choice, in types that JSON has.
     """
 
     unit_point: Array | None = None
     origin: Origin = "acquisition"
     because: str | None = None
     planned_draws: int | None = None
+    note: dict[str, Any] | None = None
 
 
 class TrialRecorder:
@@ -245,7 +247,7 @@ class TrialRecorder:
             unit_point, origin = self._proposal(), self._origin()
             note = _plain_note(self.search.note())
         else:
-            unit_point, origin = choice.unit_point, choice.origin
+            unit_point, origin, note = choice.unit_point, choice.origin, choice.note
             self.search.tell(unit_point[None], [np.nan])
         if origin == "iid" and choice.planned_draws is not None:
             note = {**(note or {}), PLANNED: choice.planned_draws}

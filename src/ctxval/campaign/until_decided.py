@@ -14,10 +14,12 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import record
+from ctxval.campaign.dynamics import AUDIT
 from ctxval.campaign.trials import Choice, TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
+from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
-from ctxval.certificates.dynamics import FEWEST, Dynamics, certify_dynamics, held
+from ctxval.certificates.dynamics import AUDITED, FEWEST, Dynamics, certify_dynamics, held
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.verdict import counterexample, require_threshold
 from ctxval.core.trial import Trial
@@ -38,24 +40,31 @@ class UntilDecided:
     Attributes:
         recorder: the recorder of the trials.
         threshold: tau, in the distance's units.
-        options: the certificate of the verdict: ``auto``, ``dynamics`` or ``posterior``.
+        options: the certificate of the verdict: ``auto``, ``dynamics``, ``posterior`` or ``anytime``.
         budget: the largest total number of executions.
+        audited: whether the bound from learned dynamics must also pass a prediction audit.
 
     Raises:
-        InputError: if the threshold is not a positive number, or the certificate does not bound d*.
+        InputError: if the threshold is not a positive number, the certificate cannot be used, or an anytime audit may
+            leave out no volume.
     """
 
     recorder: TrialRecorder
     threshold: float
     options: CertificateOptions
     budget: int
+    audited: bool = False
 
     def __post_init__(self) -> None:
         require_threshold(self.threshold)
-        if not isinstance(self.options.kind, Automatic | Dynamics | Posterior):
+        kind = self.options.kind
+        if not isinstance(kind, Automatic | Dynamics | Posterior | AnytimeAudit):
             raise InputError(
-                f"--until-decided needs a bound on d* (auto, dynamics or posterior), got {self.options.kind.name!r}."
+                "--until-decided needs one of the certificates auto, dynamics, posterior and anytime, "
+                f"got {kind.name!r}."
             )
+        if isinstance(kind, AnytimeAudit) and not self.options.volume:
+            raise InputError("--until-decided with an anytime audit needs the volume that may exceed the threshold.")
 
     @property
     def predicts(self) -> bool:
@@ -68,11 +77,13 @@ class UntilDecided:
         trials = self.recorder.trials
         if counterexample(trials, self.threshold) is not None:
             return None
+        if isinstance(self.options.kind, AnytimeAudit):
+            return self._by_draws(trials, self.options.kind)
         evidence = self._evidence(trials)
         if evidence is None or self._fails(evidence):
             return self._by_distance(trials)
         if self._decides(trials, evidence):
-            return None
+            return self._audit(evidence) if self.audited else None
         point = next_task(evidence, _points(trials, self._dimension), self.threshold, self.options.confidence)
         # The results decide when the campaign ends, so the number of independent draws is not planned.
         return Choice(point, "covering", planned_draws=0)
@@ -104,6 +115,25 @@ class UntilDecided:
         except CertificateError:
             return False
         return found.covers(self.threshold)
+
+    def _audit(self, evidence: DynamicsEvidence) -> Choice | None:
+        """Return the next fresh task whose prediction is tested; None if there were enough."""
+        done = sum(one.audit for one in evidence.predictions)
+        if done >= AUDITED:
+            return None
+        # Every second task has coordinates at bounds, where dynamics are most often other than within.
+        point = self.recorder.draw()
+        snapped = np.random.default_rng([done, len(self.recorder.trials)]).random(len(point)) < 0.5 * (done % 2)
+        return Choice(np.where(snapped, np.round(point), point), "covering", planned_draws=0, note={AUDIT: done + 1})
+
+    def _by_draws(self, trials: Sequence[Trial], kind: AnytimeAudit) -> Choice | None:
+        """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
+        ended = [trial for trial in trials if trial.state != "open"]
+        if any(trial.origin == "iid" for trial in ended):
+            found, _ = kind.certify_against(Sample.of(ended), self.threshold, self.options.confidence)
+            if found.covers(self.threshold, self.options.volume):
+                return None
+        return Choice(self.recorder.draw(), "iid", planned_draws=0)
 
     def _by_distance(self, trials: Sequence[Trial]) -> Choice | None:
         kind = self.options.kind

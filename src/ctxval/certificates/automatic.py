@@ -34,6 +34,7 @@ class Automatic(CertificateKind):
     """
 
     name: ClassVar[str] = "auto"
+    needs_model: ClassVar[bool] = True
 
     stochastic: bool = False
     resolution: float = RESOLUTION

@@ -36,6 +36,12 @@ PREDICTIONS = 3
 ACCURATE = 0.05
 """Largest difference between a distance and its prediction that held, as a share of the bound."""
 
+AUDITED = 8
+"""Number of fresh random tasks of a prediction audit."""
+
+TOLERATED = 0.02
+"""Largest excess of an audited distance over the 0.95 quantile of its prediction, as a share of the bound."""
+
 GAP = 0.25
 """Largest gap of the records in a state or an input, as a share of the range that closed loops visit."""
 
@@ -187,6 +193,13 @@ def doubt_of(evidence: DynamicsEvidence, bound: float) -> str | None:
             f"the dynamics are learned from {evidence.executions} executed trajectories, and the bound needs at least "
             f"{FEWEST}; execute more tasks"
         )
+    exceeding = [one for one in evidence.predictions if one.audit and one.distance > one.upper + TOLERATED * bound]
+    if exceeding:
+        return (
+            f"the prediction audit failed: the distance of trial {exceeding[0].trial} is {exceeding[0].distance:.4g}, "
+            f"and at most {exceeding[0].upper:.4g} was predicted. A state that is not recorded or a jump is the likely "
+            "cause: record more states, or use --kind posterior or an audit"
+        )
     if failed:
         return _failed_predictions(failed)
     if len(checked) < PREDICTIONS:
@@ -272,6 +285,7 @@ def _details(sample: Sample, evidence: DynamicsEvidence, bound: float) -> dict[s
             "stored_beforehand": sum(one.stored for one in evidence.predictions),
             "last_ones": len(last),
             "held": sum(held(one, bound) for one in last),
+            "audited": sum(one.audit for one in evidence.predictions),
         },
         "checked": [{**one.to_json(), "held": bool(held(one, bound))} for one in evidence.predictions],
         "coverage_gap": evidence.coverage.marginal,

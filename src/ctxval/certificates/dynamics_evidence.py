@@ -21,16 +21,20 @@ class CheckedPrediction:
             predicted, because most draws diverged.
         rank: share of the predicted distances that are below the executed one.
         median: median of the predicted distances; infinity if nothing was predicted.
+        upper: 0.95 quantile of the predicted distances; infinity if more draws than that diverged.
         distance: the executed distance.
         stored: whether the prediction was stored before the execution; if not, it was computed afterwards.
+        audit: whether the task was a fresh random one of a prediction audit.
     """
 
     trial: int
     z2: float
     rank: float
     median: float
+    upper: float
     distance: float
     stored: bool
+    audit: bool = False
 
     @property
     def excess(self) -> float:

@@ -29,7 +29,8 @@ Kind = Annotated[
     str | None,
     typer.Option(
         help=f"Kind of the certificate: {', '.join(KINDS.built_in)}, or a kind from an installed package (default: "
-        "posterior, or audit if --audit is given)."
+        "audit if --audit is given, otherwise posterior). The kinds auto, dynamics, mean and region load the "
+        "experiment."
     ),
 ]
 Draws = Annotated[
@@ -103,6 +104,7 @@ def certify_store(
     Options that are not given have the values that the campaign was run with.
     """
     opened = Store.existing(store)
+    kind = _chosen_kind(opened, kind, audit)
     loads = audit is not None or _needs_model(opened, kind)
     if not loads and (trust or experiment is not None):
         raise InputError(
@@ -116,7 +118,7 @@ def certify_store(
     _require_together(given, limit)
     options = settings.certificate.options(
         settings.confidence if confidence is None else confidence,
-        kind="audit" if kind is None and audit is not None else kind,
+        kind=kind,
         stated=given,
     )
     if audit is not None:
@@ -132,6 +134,18 @@ def certify_store(
         print_other_stores(others)
     report = {**found.to_json(), "store": str(store), "other_stores": others}
     return report, FALSIFIED if found.verdict is not None and found.verdict.answer == "falsified" else 0
+
+
+def _chosen_kind(store: Store, kind: str | None, audit: int | None) -> str | None:
+    """Return the kind of the certificate; None for the one that the campaign was run with.
+
+    ``auto`` would load the experiment, which must be asked for by name.
+    """
+    if kind is not None:
+        return kind
+    if audit is not None:
+        return "audit"
+    return "posterior" if planned_settings(store).certificate.kind == "auto" else None
 
 
 def _needs_model(store: Store, kind: str | None) -> bool:

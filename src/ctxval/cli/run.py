@@ -71,6 +71,14 @@ UntilDecided = Annotated[
         "--until-decided", help="Stop as soon as the model is validated or falsified, or when the budget is spent."
     ),
 ]
+Audited = Annotated[
+    bool,
+    typer.Option(
+        "--audited",
+        help="Before learned dynamics validate the model, predict and execute eight fresh random tasks. Only with "
+        "--until-decided.",
+    ),
+]
 Seed = Annotated[
     int | None, typer.Option(help="Seed of the random numbers of the data, the model and the search (default: 0).")
 ]
@@ -98,6 +106,7 @@ def run(
     threshold: Threshold = None,
     confidence: Confidence = None,
     until_decided: UntilDecided = False,
+    audited: Audited = False,
     stochastic: Stochastic = None,
     resolution: Resolution = None,
     seed: Seed = None,
@@ -122,6 +131,8 @@ def run(
     settings = read_settings(target, {**given, "store": store, "options": options})
     settings = settings.certified_as({"stochastic": stochastic, "resolution": resolution})
     experiment = settings.load()
+    if audited and not until_decided:
+        raise InputError("--audited needs --until-decided.")
     certificate = settings.certificate_options  # it is checked before executions are paid for
     if truth:
         _require_truth(experiment)  # before executions are paid for
@@ -129,7 +140,7 @@ def run(
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
     total = experiment.budget if settings.budget is None else settings.budget
-    execute = _until_decided(campaign, limit, settings) if until_decided else campaign.run
+    execute = _until_decided(campaign, limit, settings, audited) if until_decided else campaign.run
     with worker_options(workers, dask, timeout) as execution, progress(campaign, total, show=not as_json) as on_trial:
         execute(budget=total, on_trial=on_trial, **execution)
     known = experiment.truth() if truth and experiment.truth is not None else None
@@ -155,10 +166,14 @@ def _status(campaign: Campaign, verdict: Verdict | None) -> int:
     return FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
 
-def _until_decided(campaign: Campaign, threshold: float | None, settings: Settings) -> Callable[..., Campaign]:
+def _until_decided(
+    campaign: Campaign, threshold: float | None, settings: Settings, audited: bool
+) -> Callable[..., Campaign]:
     if threshold is None:
         raise InputError("--until-decided needs a threshold: give --threshold.")
-    return functools.partial(campaign.run_until_decided, threshold, certificate=settings.certificate_options)
+    return functools.partial(
+        campaign.run_until_decided, threshold, certificate=settings.certificate_options, audited=audited
+    )
 
 
 def _require_truth(experiment: Experiment) -> None:

@@ -55,11 +55,20 @@ class ExecutionPrediction:
         """The median of the distance."""
         return self.quantiles[len(self.quantiles) // 2]
 
+    @property
+    def upper(self) -> float:
+        """The 0.95 quantile of the distance."""
+        return self.quantiles[-2]
+
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON: infinity is None."""
-        values = asdict(self)
-        values["quantiles"] = [None if np.isinf(one) else one for one in self.quantiles]
-        return values
+        return {
+            **asdict(self),
+            "quantiles": [None if np.isinf(one) else one for one in self.quantiles],
+            "steps": list(self.steps),
+            "states": [list(row) for row in self.states],
+            "deviations": [list(row) for row in self.deviations],
+        }
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self | None:
