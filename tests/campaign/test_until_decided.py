@@ -159,14 +159,22 @@ def evidence(upper: float = 1.0, highest: float = 0.9) -> DynamicsEvidence:
 def test_what_is_executed_next_depends_on_what_stands_in_the_way() -> None:
     known = np.array([[0.9, 0.9]])
     contested = evidence()
-    at_bound = contested.points[38]
-    assert np.array_equal(next_task(contested, known, 0.5, 0.95), contested.elites[0])  # type: ignore[arg-type]
-    assert np.array_equal(next_task(contested, known, 0.95, 0.95), at_bound)  # type: ignore[arg-type]
-    assert np.array_equal(next_task(contested, known, 2.0, 0.95), [0.11, 0.22])  # type: ignore[arg-type]
+    at_bound, farthest, largest = contested.points[38], contested.coverage.task, contested.elites[0]
+    assert asked(contested, known, 0.5) == largest.tolist()
+    assert asked(contested, known, 0.95) == at_bound.tolist()
+    assert asked(contested, known, 2.0) == farthest.tolist()
+    covered = replace(contested, coverage=replace(contested.coverage, marginal=0.1, beyond=0.0, pair=0.1))
+    assert asked(covered, known, 2.0, best=0.2) == largest.tolist()
+    assert asked(covered, known, 2.0, best=0.9) == farthest.tolist()
     # Every third execution explores, and no task is executed twice.
-    assert np.array_equal(next_task(contested, np.tile(known, (2, 1)), 0.5, 0.95), [0.11, 0.22])  # type: ignore[arg-type]
-    again = np.array([[0.9, 0.9], [0.8, 0.8], [0.7, 0.7], [0.11, 0.22]])
-    assert np.array_equal(next_task(contested, again, 2.0, 0.95), at_bound)  # type: ignore[arg-type]
+    assert asked(contested, np.tile(known, (2, 1)), 0.5) == farthest.tolist()
+    assert asked(contested, np.array([[0.9, 0.9], [0.8, 0.8], [0.7, 0.7], farthest]), 2.0) == at_bound.tolist()
+
+
+def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: float = 0.2) -> list[float]:
+    point = next_task(found, known, best, threshold, 0.95)
+    assert point is not None
+    return list(point.tolist())
 
 
 def test_a_threshold_must_be_positive() -> None:

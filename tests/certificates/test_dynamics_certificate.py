@@ -51,7 +51,7 @@ GOOD = DynamicsEvidence(
 )
 
 
-def trials(count: int = 4, largest: float = 0.5) -> list[Trial]:
+def trials(count: int = 4, largest: float = 0.8) -> list[Trial]:
     points = np.random.default_rng(2).random((count, 2))
     distances = np.linspace(0.1, largest, count)
     return [
@@ -115,6 +115,7 @@ def test_the_bound_is_never_below_what_was_executed_and_never_lowered_by_a_predi
         ({"predictions": (prediction(1), prediction(2, 0.5, 0.5 + 2 * ACCURATE), prediction(3))}, "trial 2: distance"),
         ({"predictions": (prediction(1), prediction(2, 0.9, 0.5), prediction(3))}, "contact or dry friction"),
         ({"noise": 2 * NOISE}, "2 % of the variance of the residual"),
+        ({"highest": 1.1}, "predicted to be 1.1, but the largest executed one is 0.8"),
         ({"left_out": 0.9}, "leave out 90 % of the largest variance"),
         ({"coverage": replace(COVERED, marginal=1.1 * GAP)}, r"away from every record of u\[0\]"),
         ({"coverage": replace(COVERED, beyond=2 * BEYOND)}, r"4 % of its range beyond all records of u\[0\]"),

@@ -19,7 +19,7 @@ from ctxval.campaign.trials import Choice, TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
-from ctxval.certificates.dynamics import AUDITED, FEWEST, Dynamics, certify_dynamics, held
+from ctxval.certificates.dynamics import AUDITED, FEWEST, Dynamics, certify_dynamics, held, uncovered, untested
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.verdict import counterexample, require_threshold
 from ctxval.core.trial import Trial
@@ -84,7 +84,9 @@ class UntilDecided:
             return self._by_distance(trials)
         if self._decides(trials, evidence):
             return self._audit(evidence) if self.audited else None
-        point = next_task(evidence, _points(trials, self._dimension), self.threshold, self.options.confidence)
+        known = _points(trials, self._dimension)
+        best = max((trial.distance or 0.0 for trial in trials), default=0.0)
+        point = next_task(evidence, known, best, self.threshold, self.options.confidence)
         # The results decide when the campaign ends, so the number of independent draws is not planned.
         return Choice(point, "covering", planned_draws=0)
 
@@ -148,32 +150,38 @@ class UntilDecided:
         return record(self)
 
 
-def next_task(evidence: DynamicsEvidence, known: Array, threshold: float, confidence: float) -> Array | None:
+def next_task(
+    evidence: DynamicsEvidence, known: Array, best: float, threshold: float, confidence: float
+) -> Array | None:
     """Return the task to execute next, a point ``(d,)``; None if the search is to choose it.
 
     These come first: a task whose predicted distance exceeds the threshold; the task of the draw that sets the bound,
     while the bound exceeds the threshold; the task that leads farthest from the records, while they leave gaps; and
-    tasks at which the largest draws lie, to test the predictions.
+    the task with the largest predicted distance, while no similar distance was executed. Further tasks test the
+    predictions.
 
     Args:
         evidence: what the learned dynamics say.
         known: executed and open tasks, points ``(n, d)``.
+        best: the largest executed distance.
         threshold: tau, in the distance's units.
         confidence: the probability with which the bound holds.
     """
     order = np.argsort(evidence.maxima, kind="stable")
     rank = evidence.rank(confidence)
     highest = evidence.points[[*order[rank::-1], *order[:rank:-1]]]
-    farthest = evidence.coverage.task[None]
+    farthest, largest = evidence.coverage.task[None], evidence.elites
     exceeds = evidence.upper(confidence) > threshold
     if exceeds and len(known) % _EXPLORE == _EXPLORE - 1:
         candidates = [farthest, highest]
     elif evidence.highest > threshold:
-        candidates = [evidence.elites, highest, farthest]
+        candidates = [largest, highest, farthest]
     elif exceeds:
         candidates = [highest, farthest]
+    elif uncovered(evidence.coverage) is None and untested(evidence, best) is not None:
+        candidates = [largest, farthest, highest]
     else:
-        candidates = [farthest, highest, evidence.elites]
+        candidates = [farthest, highest, largest]
     return _first_new(np.concatenate(candidates), known)
 
 

@@ -59,6 +59,9 @@ NOISE = 0.01
 LEFT_OUT = 0.5
 """Largest share of the posterior variance that the draws may leave out between their pivots."""
 
+TESTED = 0.8
+"""Least share of the largest distance on the posterior mean that must have been executed: the bound is tested there."""
+
 _RAISE = 0.5
 """Share of the largest excess over predictions by which the bound is raised."""
 
@@ -147,7 +150,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: flo
             "the dynamics give no bound: the closed loops of some draws diverge, or an execution could not be "
             "predicted. More executions narrow the draws."
         )
-    doubt = doubt_of(evidence, raised)
+    doubt = doubt_of(evidence, sample.best, raised)
     return Certificate(
         kind="dynamics",
         statement=(
@@ -183,8 +186,14 @@ def held(prediction: CheckedPrediction, bound: float) -> bool:
     return abs(prediction.distance - prediction.median) <= ACCURATE * bound
 
 
-def doubt_of(evidence: DynamicsEvidence, bound: float) -> str | None:
-    """Return why the bound is withdrawn, and what would help; None if it is not."""
+def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    """Return why the bound is withdrawn, and what would help; None if it is not.
+
+    Args:
+        evidence: what the learned dynamics say.
+        best: the largest executed distance.
+        bound: the bound.
+    """
     checked = evidence.predictions[-PREDICTIONS:]
     failed = [one for one in checked if not held(one, bound)]
     coverage = evidence.coverage
@@ -218,7 +227,7 @@ def doubt_of(evidence: DynamicsEvidence, bound: float) -> str | None:
             f"the draws of the dynamics leave out {100 * evidence.left_out:.0f} % of the largest variance, more than "
             f"{100 * LEFT_OUT:g} %; more executions reduce this variance"
         )
-    return _uncovered(coverage)
+    return uncovered(coverage) or untested(evidence, best)
 
 
 def _failed_predictions(failed: Sequence[CheckedPrediction]) -> str:
@@ -231,7 +240,7 @@ def _failed_predictions(failed: Sequence[CheckedPrediction]) -> str:
     )
 
 
-def _uncovered(coverage: StateInputCoverage) -> str | None:
+def uncovered(coverage: StateInputCoverage) -> str | None:
     """Return what the records do not cover; None if nothing."""
     if coverage.beyond > (GAP if coverage.pair is None else BEYOND):
         what = f"{100 * coverage.beyond:.2g} % of its range beyond all records of {coverage.coordinate}"
@@ -244,6 +253,16 @@ def _uncovered(coverage: StateInputCoverage) -> str | None:
     return (
         f"closed loops of the tasks lead {what}, such as to {_texts(coverage.place)}; an execution of a task that "
         "leads there helps (--until-decided executes it)"
+    )
+
+
+def untested(evidence: DynamicsEvidence, best: float) -> str | None:
+    """Return that the task with the largest predicted distance was not executed; None if a similar distance was."""
+    if best >= TESTED * evidence.highest:
+        return None
+    return (
+        f"the largest distance is predicted to be {evidence.highest:.4g}, but the largest executed one is {best:.4g}: "
+        "the prediction is not tested where it matters; an execution of that task helps (--until-decided executes it)"
     )
 
 
