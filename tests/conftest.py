@@ -19,7 +19,14 @@ from hypothesis import settings
 
 from ctxval import Task, TaskSpace, Validation, controllers, distances, models, systems
 from ctxval.cases import pendulum
-from ctxval.certificates import Maxima, Sample, draw_maxima
+from ctxval.certificates import (
+    CheckedPrediction,
+    DynamicsEvidence,
+    Maxima,
+    Sample,
+    StateInputCoverage,
+    draw_maxima,
+)
 
 # A shell starts what is in the background deaf to Ctrl-C, and tests may run there.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -72,6 +79,16 @@ class Predicted:
     def expected(self, points: np.ndarray, before: int) -> np.ndarray:
         self.asked.append(before)
         return self.function(points)
+
+    def dynamics(self) -> DynamicsEvidence:
+        """Return evidence against which no diagnostic speaks, with 2000 draws of d* between 2 and 3."""
+        rng = np.random.default_rng(4)
+        covered = StateInputCoverage(
+            0.1, 0.0, 0.1, "x[0]", {"x[0]": 0.0}, {"x[0]": 0.1}, rng.random(self.dimension), 99
+        )
+        checked = tuple(CheckedPrediction(k, 1.0, 0.5, 1.0, 1.2, 1.0, stored=True) for k in range(3))
+        draws, elites = rng.random((2000, self.dimension)), rng.random((3, self.dimension))
+        return DynamicsEvidence(np.linspace(2, 3, 2000), draws, 1.9, elites, 999, 5, 0.0, 0.0, checked, covered)
 
     def tasks(self, count: int, seed: int) -> np.ndarray:
         return np.random.default_rng([seed, 9]).random((count, self.dimension))

@@ -79,5 +79,5 @@ def test_screening_alone_keeps_a_bound_from_being_asked_for() -> None:
 
 
 def test_the_rule_stops_by_the_posterior_bound_alone() -> None:
-    with pytest.raises(InputError, match="needs the posterior bound, got 'audit'"):
+    with pytest.raises(InputError, match="for the posterior bound, got 'audit'"):
         StoppingRule(50.0, CertificateOptions(Audit()))

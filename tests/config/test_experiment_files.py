@@ -132,7 +132,7 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         (
             'kind = "posterior"',
             'kind = "audit"\nresolution = 0.3',
-            "resolution is for certificates of the kind posterior; the kind here is",
+            "resolution is for certificates of the kind auto or posterior; the kind here is",
         ),
         ("repeats = 1", "repeats = 0", "search.repeats"),
         ("components = [0]", "componets = [0]", "did you mean 'components'"),
@@ -166,7 +166,7 @@ def test_what_the_certificate_of_the_file_would_ignore_is_refused(invoke: Any) -
     target = changed(('kind = "posterior"', 'kind = "scenario"'))
     for option in (["--stochastic"], ["--resolution", "1"]):
         said = sentence(invoke("run", target, *option))
-        assert f"{option[0][2:]} is for certificates of the kind posterior; the kind here is scenario" in said
+        assert f"{option[0][2:]} is for certificates of the kind auto or posterior; the kind here is scenario" in said
     assert not Path("runs").exists()
 
 

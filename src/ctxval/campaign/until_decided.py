@@ -68,9 +68,12 @@ class UntilDecided:
 
     @property
     def predicts(self) -> bool:
-        """Whether executions are predicted beforehand."""
+        """Whether learned dynamics choose the tasks, and each execution is predicted beforehand."""
         kind = self.options.kind
-        return isinstance(kind, Dynamics) or (isinstance(kind, Automatic) and not kind.stochastic)
+        if isinstance(kind, Automatic) and not kind.stochastic:
+            # Another search was chosen for its tasks: they are not replaced.
+            return self.recorder.search.uses_prediction
+        return isinstance(kind, Dynamics)
 
     def choose(self) -> Choice | None:
         """Return the next task; None if the verdict is reached."""

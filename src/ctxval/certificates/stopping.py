@@ -74,14 +74,14 @@ class StoppingRule:
     """
 
     threshold: float
-    options: CertificateOptions = field(default_factory=CertificateOptions)
+    options: CertificateOptions = field(default_factory=CertificateOptions.posterior)
     screenings: tuple[Screening, ...] = (Screening(8, 0.3), Screening(32, 0.05))
     confirmations: int = 2
 
     def __post_init__(self) -> None:
         require_threshold(self.threshold)
         if not isinstance(self.options.kind, Posterior):
-            raise InputError(f"--until-decided needs the posterior bound, got {self.options.kind.name!r}.")
+            raise InputError(f"this rule is for the posterior bound, got {self.options.kind.name!r}.")
 
     def decide(self, trials: Sequence[Trial], left: int) -> StoppingDecision:
         """Return whether a campaign stops and, if not, which task must be executed next.
