@@ -11,13 +11,18 @@ import numpy as np
 import pytest
 
 from conftest import Predicted
+from ctxval.campaign.dynamics import PREDICTION
 from ctxval.certificates import (
     KINDS,
+    CheckedPrediction,
+    DynamicsEvidence,
     Mean,
     Sample,
+    StateInputCoverage,
     certify_anytime,
     certify_audit,
     certify_convergence,
+    certify_dynamics,
     certify_mean,
     certify_posterior,
     certify_region,
@@ -25,6 +30,7 @@ from ctxval.certificates import (
 )
 from ctxval.config.settings import Settings
 from ctxval.core.trial import Origin, State
+from ctxval.learning import ExecutionPrediction
 from ctxval.testing import check_search
 
 ROOT = Path(__file__).parents[1]
@@ -71,9 +77,20 @@ def test_links_lead_somewhere(document: str) -> None:
 
 def keys(report: Any) -> set[str]:
     """Return the keys of a report, at every depth."""
+    if isinstance(report, list):
+        return set().union(*map(keys, report))
     if not isinstance(report, dict):
         return set()
     return set(report).union(*(keys(value) for value in report.values()))
+
+
+def evidence() -> DynamicsEvidence:
+    place = {"x[0]": 0.0, "u[0]": 1.0}
+    coverage = StateInputCoverage(0.1, 0.0, 0.2, "x[0]", place, place, np.zeros(1), 9)
+    checked = tuple(CheckedPrediction(k, 1.0, 0.5, 2.0, 2.0, stored=True) for k in range(3))
+    return DynamicsEvidence(
+        np.linspace(2, 3, 40), np.zeros((40, 1)), 2.5, np.zeros((2, 1)), 99, 8, 0, 0, checked, coverage
+    )
 
 
 def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
@@ -85,11 +102,13 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
         certify_audit(sample),
         certify_anytime(sample, 3.0),
         certify_convergence(sample, 1.0),
+        certify_dynamics(sample, evidence()),
         certify_mean(sample, options=Mean(quantile=0.5, largest_possible=4.0)),
         certify_region(sample, 3.0),
         certify_posterior(sample, 0.5, found=draw_maxima(sample, draws=4, paths=2)),
     ]
     used = set().union(*(keys(certificate.to_json()) for certificate in certificates))
+    used |= keys({PREDICTION: ExecutionPrediction(1, (0.5,), 0.1, (1,), ((0.0,),), ((0.1,),), 0.0).to_json()})
     used |= {*get_args(Origin), *get_args(State), *KINDS, "validated", "falsified", "undecided"}
     explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
     assert used <= set(explained)

@@ -29,10 +29,12 @@ from ctxval import (
     Transitions,
     Trial,
     Truth,
+    Validation,
     Verdict,
     certificates,
     controllers,
     distances,
+    learning,
     models,
     plot,
     searches,
@@ -46,7 +48,17 @@ from ctxval.certificates import Certificate, Sample
 from ctxval.core.trial import Change
 from ctxval.errors import InputError
 
-PACKAGES = ("", ".searches", ".systems", ".models", ".controllers", ".distances", ".certificates", ".testing")
+PACKAGES = (
+    "",
+    ".searches",
+    ".systems",
+    ".models",
+    ".controllers",
+    ".distances",
+    ".learning",
+    ".certificates",
+    ".testing",
+)
 
 DATA = Transitions(np.linspace(-1, 1, 80).reshape(40, 2) ** 3, np.linspace(-5, 5, 40)[:, None] ** 2, np.zeros((40, 2)))
 LINEAR = models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]], data=DATA)
@@ -139,6 +151,54 @@ def diagnosis() -> certificates.Diagnosis:
     return certificates.Diagnosis(0.5, 4, 1.1, 0.2, None)
 
 
+def nonlinear(x: Any, u: Any) -> Any:
+    return LINEAR.step(x, u) + 0.05 * np.sin(2 * x)
+
+
+@functools.cache
+def learned() -> learning.LearnedDynamics:
+    """Return what one execution teaches of a system that M does not explain."""
+    found = Validation(
+        space=TaskSpace(start=([-2.0, -1.0], [2.0, 1.0])),
+        task=lambda p: Task(p.start, goal=[0.3, 0.0], horizon=20, dt=0.1),
+        system=systems.Simulated(nonlinear, vectorized=True),
+        model=models.Linear(LINEAR.A, LINEAR.B),
+        synthesizer=controllers.LQR([1, 0.1], [0.1]),
+        distance=distances.MeanDeviation(),
+    )
+    point = np.array([0.2, 0.7])
+    taught = learning.DynamicsStudy(found).learn(
+        [(point, found.outcome(found.space.from_unit(point)).system_trajectory)]
+    )
+    assert taught is not None
+    return taught
+
+
+@functools.cache
+def predicted() -> learning.ExecutionPrediction:
+    found = learned().predict(np.array([0.9, 0.1]))
+    assert found is not None
+    return found
+
+
+@functools.cache
+def residual() -> learning.Residual:
+    found = learning.learn_residual(LINEAR, RECORDED, np.zeros(len(RECORDED), dtype=np.intp))
+    assert found is not None
+    return found
+
+
+def evidence() -> certificates.DynamicsEvidence:
+    return certificates.DynamicsEvidence(
+        np.linspace(0.9, 1, 40), np.zeros((40, 2)), 0.95, np.zeros((5, 2)), 9000, 4, 0.01, 1e-6, (CHECKED,), COVERED
+    )
+
+
+RECORDED = Transitions(DATA.x, DATA.u, nonlinear(DATA.x, DATA.u))
+CHECKED = certificates.CheckedPrediction(3, 1.0, 0.5, 0.52, 0.5, stored=True)
+COVERED = certificates.StateInputCoverage(
+    0.1, 0.01, 0.2, "u[0]", {"x[0]": 1.0, "u[0]": 3.0}, {"x[0]": 0.1, "u[0]": 0.2}, np.zeros(2), 1024
+)
 BY_POSTERIOR = certificates.CertificateOptions.posterior()
 
 EXAMPLES: dict[str, Callable[[], object]] = {
@@ -202,16 +262,31 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "distances.GoalError": distances.GoalError,
     "distances.MeanDeviation": distances.MeanDeviation,
     "distances.WholeTrajectory": distances.WholeTrajectory,
+    "learning.CorrectedModel": lambda: learning.CorrectedModel(LINEAR, residual()),
+    "learning.Coverage": lambda: learning.Coverage(0.1, 0.02, None, 7, np.zeros(8), np.zeros(11), np.ones(8), 1024),
+    "learning.DynamicsDraws": lambda: learned().posterior.mean,
+    "learning.DynamicsPosterior": lambda: learned().posterior,
+    "learning.DynamicsStudy": lambda: learned().study,
+    "learning.ExecutionPrediction": predicted,
+    "learning.Identity": learning.Identity,
+    "learning.LearnedDynamics": learned,
+    "learning.PredictionScore": lambda: learning.PredictionScore(1.5, 0.35, 0.98),
+    "learning.Residual": residual,
     "certificates.Assessment": lambda: certificates.assess(campaign().trials, BY_POSTERIOR),
     "certificates.AnytimeAudit": certificates.AnytimeAudit,
     "certificates.Audit": certificates.Audit,
+    "certificates.Automatic": certificates.Automatic,
     "certificates.Certificate": lambda: CERTIFICATE,
     "certificates.CertificateOptions": certificates.CertificateOptions.posterior,
+    "certificates.CheckedPrediction": lambda: CHECKED,
     "certificates.Convergence": certificates.Convergence,
+    "certificates.Dynamics": certificates.Dynamics,
+    "certificates.DynamicsEvidence": evidence,
     "certificates.Posterior": certificates.Posterior,
     "certificates.Provenance": lambda: certificates.Provenance(remarks=("fuse replaced",)),
     "certificates.SamplingDiscarding": lambda: certificates.SamplingDiscarding(2),
     "certificates.Scenario": certificates.Scenario,
+    "certificates.StateInputCoverage": lambda: COVERED,
     "certificates.StoppingDecision": lambda: certificates.StoppingDecision(next_point=np.zeros(3)),
     "certificates.StoppingRule": lambda: certificates.StoppingRule(0.5, BY_POSTERIOR),
     "certificates.Diagnosis": diagnosis,

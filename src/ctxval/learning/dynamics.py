@@ -208,6 +208,9 @@ class Identity:
         """Return the state itself."""
         return x
 
+    def __repr__(self) -> str:
+        return call(self)
+
 
 class CorrectedModel:
     """The model ``M_hat(x, u) = M(x, u) + r(x, u)``.

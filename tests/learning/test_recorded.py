@@ -1,0 +1,162 @@
+"""Which recorded transitions the dynamics are learned from, and the closed loops that show which are needed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctxval import Task, TaskSpace, Trajectory, Transitions, Validation, controllers, distances, models, systems
+from ctxval._util.arrays import Array
+from ctxval.core.controller import Controller
+from ctxval.core.rollout import rollout
+from ctxval.errors import DesignError
+from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
+
+A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
+LQR = controllers.LQR([1.0, 0.1], [0.1])
+MOST, MOST_OF_MODEL = 3000, 600
+
+
+def make_validation(synthesizer: Any = LQR, model: Any = None) -> Validation:
+    return Validation(
+        space=TaskSpace(start=([-2.0, -1.0], [2.0, 1.0])),
+        task=lambda p: Task(p.start, goal=[0.3, 0.0], horizon=12, dt=0.1),
+        system=systems.Simulated(models.Linear(A, B)),
+        model=model or models.Linear(A, B),
+        synthesizer=synthesizer,
+        distance=distances.MeanDeviation(),
+    )
+
+
+def executions(count: int) -> list[Trajectory]:
+    found = make_validation()
+    points = np.random.default_rng(1).random((count, 2))
+    return [found.outcome(found.space.from_unit(point)).system_trajectory for point in points]
+
+
+def loops() -> Trajectory:
+    found = closed_loops_on_model(make_validation())
+    assert found is not None
+    return found
+
+
+def data(count: int, spread: float = 1.0) -> Transitions:
+    rng = np.random.default_rng(2)
+    x, u = spread * rng.normal(size=(count, 2)), spread * rng.normal(size=(count, 1))
+    return Transitions(x, u, models.Linear(A, B).step(x, u))
+
+
+def rows_of(transitions: Transitions) -> Array:
+    return np.concatenate([transitions.x, transitions.u, transitions.x_next], axis=1)
+
+
+class Refusing:
+    """LQR that designs a controller for a share of the tasks, one at a time."""
+
+    def __init__(self, low: float) -> None:
+        self.low = low
+
+    def design(self, task: Task, model: models.Model) -> Controller:
+        if task.initial_state[0] < self.low:
+            raise DesignError("there is no controller")
+        return LQR.design(task, model)
+
+
+class Batched(Refusing):
+    """The same for batches, which fail as a whole."""
+
+    batched = True
+
+    def design(self, task: Task, model: models.Model) -> Controller:
+        if task.batch_shape:
+            raise DesignError("no batches here")
+        return super().design(task, model)
+
+
+def test_nothing_is_known_without_executions_and_data() -> None:
+    assert recorded_transitions(models.Linear(A, B), [], loops()) is None
+
+
+@given(st.integers(1, 4))
+def test_each_transition_has_the_number_of_its_execution(count: int) -> None:
+    executed = executions(count)
+    found = recorded_transitions(models.Linear(A, B), executed, loops())
+    assert found is not None
+    transitions, sources = found
+    np.testing.assert_array_equal(sources, np.repeat(np.arange(count), 12))
+    for k, trajectory in enumerate(executed):
+        own = sources == k
+        np.testing.assert_array_equal(transitions.x[own], trajectory.states[:-1])
+        np.testing.assert_array_equal(transitions.u[own], trajectory.inputs)
+        np.testing.assert_array_equal(transitions.x_next[own], trajectory.states[1:])
+
+
+def test_the_data_of_the_model_have_no_execution() -> None:
+    own = data(50)
+    found = recorded_transitions(models.Linear(A, B, data=own), executions(1), loops())
+    assert found is not None
+    transitions, sources = found
+    np.testing.assert_array_equal(sources, [*[0] * 12, *[-1] * 50])
+    np.testing.assert_array_equal(transitions.x[12:], own.x)
+
+
+def test_of_many_data_those_near_the_closed_loops_are_kept() -> None:
+    near, far = data(MOST_OF_MODEL, 0.1), data(400, 0.1)
+    everything = Transitions.joined([Transitions(far.x + 50, far.u + 50, far.x_next + 50), near])
+    found = recorded_transitions(models.Linear(A, B, data=everything), [], loops())
+    assert found is not None
+    np.testing.assert_array_equal(rows_of(found[0]), rows_of(near))
+
+
+def test_if_all_closed_loops_diverge_all_data_are_kept() -> None:
+    own = data(MOST_OF_MODEL + 100)
+    diverged = loops()
+    infinite = Trajectory(diverged.times, np.full_like(diverged.states, np.inf), diverged.inputs)
+    found = recorded_transitions(models.Linear(A, B, data=own), [], infinite)
+    assert found is not None
+    assert len(found[0]) == len(own)
+
+
+def test_of_very_many_transitions_a_random_part_is_kept_and_it_is_always_the_same() -> None:
+    executed = executions(1) * 300
+    first, second = (recorded_transitions(models.Linear(A, B), executed, loops()) for _ in range(2))
+    assert first is not None
+    assert second is not None
+    assert len(first[0]) == MOST
+    assert len(first[1]) == MOST
+    assert (np.diff(first[1]) >= 0).all()
+    assert len(set(first[1])) > 280
+    np.testing.assert_array_equal(first[1], second[1])
+    np.testing.assert_array_equal(rows_of(first[0]), rows_of(second[0]))
+
+
+def test_closed_loops_on_the_model_are_those_of_random_tasks() -> None:
+    found = make_validation()
+    together = closed_loops_on_model(found)
+    assert together is not None
+    assert together.batch_shape == (64,)
+    start = together.states[5, 0]
+    task = found.task(found.space.parameters(start))
+    np.testing.assert_allclose(
+        together.states[5], rollout(found.model.step, LQR.design(task, found.model), task).states, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("kind", [Refusing, Batched])
+def test_one_closed_loop_is_enough_if_there_can_be_no_batch(kind: type[Refusing]) -> None:
+    found = closed_loops_on_model(make_validation(kind(-2.5)))
+    assert found is not None
+    assert found.batch_shape == ()
+
+
+def test_a_task_without_a_controller_is_passed_over() -> None:
+    points = make_validation().space.from_unit(np.random.default_rng(0).random((64, 2)))[:3]
+    low = float(np.sort(points[:, 0])[-1])  # a controller for one of the three tasks that are tried
+    found = closed_loops_on_model(make_validation(Refusing(low)))
+    assert found is not None
+    assert found.states[0, 0] == low
+    assert closed_loops_on_model(make_validation(Refusing(2.5))) is None
