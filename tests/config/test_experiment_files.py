@@ -130,7 +130,7 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         ("[system] ", "[sistem] ", "no setting is called 'sistem'; did you mean 'system'?"),
         ("stochastic = false", "stochastik = true", "no setting is called 'stochastik'; did you mean 'stochastic'?"),
         (
-            'kind = "posterior"',
+            'kind = "auto"',
             'kind = "audit"\nresolution = 0.3',
             "resolution is for certificates of the kind auto or posterior; the kind here is",
         ),
@@ -141,7 +141,7 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         ('name = "auto"', 'name = "gp-ucb"\ninitial = true', "search 'gp-ucb': initial"),
         ('name = "auto"', 'name = "gp-ucb"\nkernel = "matern"', "search 'gp-ucb': kernel"),
         ('name = "auto"', 'name = "gp-ucb"\nnoise = 3', "search 'gp-ucb': noise"),
-        ('kind = "posterior"', 'kind = "posteriour"', "did you mean 'posterior'"),
+        ('kind = "auto"', 'kind = "posteriour"', "did you mean 'posterior'"),
         ('name = "cart"', 'name = "cart"\nexperiment = "pendulum"', "has its own"),
         ('name = "cart"', 'name = "cart"\n[options]\nx = 1\n[other]', "other"),
     ],
@@ -163,7 +163,7 @@ def test_options_of_a_case_are_plain_values(invoke: Any, options: str) -> None:
 
 
 def test_what_the_certificate_of_the_file_would_ignore_is_refused(invoke: Any) -> None:
-    target = changed(('kind = "posterior"', 'kind = "scenario"'))
+    target = changed(('kind = "auto"', 'kind = "scenario"'))
     for option in (["--stochastic"], ["--resolution", "1"]):
         said = sentence(invoke("run", target, *option))
         assert f"{option[0][2:]} is for certificates of the kind auto or posterior; the kind here is scenario" in said
@@ -172,13 +172,13 @@ def test_what_the_certificate_of_the_file_would_ignore_is_refused(invoke: Any) -
 
 @pytest.mark.slow
 def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: Any) -> None:
-    scenario = ('kind = "posterior"', 'kind = "scenario"\nvolume = 0.5')
+    scenario = ('kind = "auto"', 'kind = "scenario"\nvolume = 0.5')
     target = changed(scenario, ('name = "auto"', 'name = "random"'))
     run = json.loads(invoke("run", target, "--json").stdout)
     assert (run["verdict"], run["certificate"]["kind"]) == ("validated", "scenario")
     certified = json.loads(invoke("certify", run["store"], "--threshold", "0.5", "--json").stdout)
     assert (certified["kind"], certified["verdict"]) == ("scenario", "validated")
-    assert "needs the posterior bound" in sentence(invoke("run", target, "--until-decided"))
+    assert "needs a bound on d*" in sentence(invoke("run", target, "--until-decided"))
     adaptive = changed(scenario, ('name = "auto"', 'name = "gp-ucb"'))
     refused = json.loads(invoke("run", adaptive, "--store", "b.sqlite", "--json").stdout)
     assert refused["verdict"] == "undecided"

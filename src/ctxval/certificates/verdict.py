@@ -192,8 +192,8 @@ def judge(
     Args:
         trials: all trials of the campaign.
         threshold: tau, in the distance's units.
-        options: the kind of certificate, its confidence and the acceptable volume; the posterior bound by default. If
-            the theory of the certificate refuses the trials, the verdict is undecided.
+        options: the kind of certificate, its confidence and the acceptable volume; ``auto`` by default. If the theory
+            of the certificate refuses the trials, the verdict is undecided.
         provenance: the task space, the search and remarks on the campaign, as far as they are known.
 
     Raises:

@@ -78,7 +78,7 @@ name = "auto"
 repeats = 1             # executions of each task; raise it if two executions of one task differ
 
 [certificate]           # certificate for the verdict: see `ctxval certify --help`
-kind = "posterior"
+kind = "auto"           # learned dynamics if they decide, otherwise the posterior bound of the distance
 stochastic = false      # true if two executions of one task may differ
 """
 

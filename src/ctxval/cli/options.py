@@ -29,17 +29,18 @@ Stochastic = Annotated[
     bool | None,
     typer.Option(
         "--stochastic",
-        help="State that two executions of one task may differ. The posterior certificate then bounds the largest "
-        "expected distance.",
+        help="State that two executions of one task may differ. The certificate is then the posterior bound, and it "
+        "bounds the largest expected distance. The dynamics bound is not used.",
     ),
 ]
 Resolution = Annotated[
     float | None,
     typer.Option(
         help="Largest distance between a task and its nearest trial with which the posterior certificate still "
-        "validates, in diagonals of the task space (default: 0.125). False validations are more frequent above the "
-        "default: in a study with thresholds just below d*, 1 of 74 campaigns was validated at 0.125, and 8 of 75 at "
-        "0.25. On narrow peaks in two dimensions, 11 of 48 were validated at 0.25."
+        "validates, in diagonals of the task space (default: 0.125). The dynamics certificate does not use it. False "
+        "validations are more frequent above the default: in a study with thresholds just below d*, 1 of 74 campaigns "
+        "was validated at 0.125, and 8 of 75 at 0.25. On narrow peaks in two dimensions, 11 of 48 were validated at "
+        "0.25."
     ),
 ]
 Workers = Annotated[

@@ -68,7 +68,10 @@ SearchName = Annotated[str | None, typer.Option(help=f"Search method: {SEARCH_ME
 UntilDecided = Annotated[
     bool,
     typer.Option(
-        "--until-decided", help="Stop as soon as the model is validated or falsified, or when the budget is spent."
+        "--until-decided",
+        help="Execute the tasks that decide fastest, and stop as soon as the model is validated or falsified, or when "
+        "the budget is spent. The executions are chosen for the bound from learned dynamics if trajectories teach "
+        "them, and otherwise for the posterior bound of the distance.",
     ),
 ]
 Audited = Annotated[
