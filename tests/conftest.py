@@ -25,6 +25,7 @@ from ctxval.certificates import (
     Maxima,
     Sample,
     StateInputCoverage,
+    StateInputGap,
     draw_maxima,
 )
 
@@ -80,13 +81,12 @@ class Predicted:
         self.asked.append(before)
         return self.function(points)
 
-    def dynamics(self) -> DynamicsEvidence:
+    def dynamics(self, confidence: float) -> DynamicsEvidence:
         """Return evidence against which no diagnostic speaks, with 2000 draws of d* between 2 and 3."""
         rng = np.random.default_rng(4)
-        covered = StateInputCoverage(
-            0.1, 0.0, 0.1, "x[0]", {"x[0]": 0.0}, {"x[0]": 0.1}, rng.random(self.dimension), 99
-        )
-        checked = tuple(CheckedPrediction(k, 1.0, 0.5, 1.0, 1.2, 1.0, stored=True) for k in range(3))
+        gap = StateInputGap(0.01, ("x[0]",), {"x[0]": 0.0})
+        covered = StateInputCoverage(gap, gap, gap, {"x[0]": 0.1}, rng.random(self.dimension), 99)
+        checked = tuple(CheckedPrediction(k, 0.5, 1.0, 1.2, 1.0) for k in range(3))
         draws, elites = rng.random((2000, self.dimension)), rng.random((3, self.dimension))
         return DynamicsEvidence(np.linspace(2, 3, 2000), draws, 1.9, elites, 999, 5, 0.0, 0.0, checked, covered)
 

@@ -16,10 +16,13 @@ from ctxval.certificates import (
     AnytimeAudit,
     Audit,
     CertificateOptions,
+    CheckedPrediction,
     Dynamics,
     DynamicsEvidence,
     Posterior,
     StateInputCoverage,
+    StateInputGap,
+    UntriedParameter,
 )
 from ctxval.certificates.dynamics import AUDITED
 from ctxval.errors import InputError
@@ -76,14 +79,14 @@ def test_predictions_are_stored_before_executions_and_equal_those_computed_after
     validation, largest = linear()
     campaign = Campaign(validation, seed=1).run_until_decided(1.1 * largest, 12)
     dynamics = campaign._recorder.dynamics
-    stored = dynamics.evidence(campaign.trials)
+    stored = dynamics.evidence(campaign.trials, 0.95)
     without = [replace(trial, note=None) for trial in campaign.trials]
-    anew = dynamics.evidence(without)
+    anew = dynamics.evidence(without, 0.95)
     assert stored is not None
     assert anew is not None
     assert all(one.stored for one in stored.predictions)
     assert not any(one.stored for one in anew.predictions)
-    for one, other in zip(stored.predictions[-3:], anew.predictions, strict=True):
+    for one, other in zip(stored.predictions[-3:], anew.predictions[-3:], strict=True):
         assert (one.trial, one.distance) == (other.trial, other.distance)
         assert one.median == pytest.approx(other.median, rel=1e-6)
 
@@ -95,7 +98,7 @@ def test_a_plain_run_is_certified_by_predictions_that_are_computed_afterwards() 
     verdict = campaign.verdict(1.2 * largest, certificate=CertificateOptions(Dynamics()))
     assert verdict.certificate is not None
     assert verdict.certificate.details["predictions"]["stored_beforehand"] == 0
-    assert verdict.certificate.details["predictions"]["made"] == 3
+    assert verdict.certificate.details["predictions"]["made"] == 4
 
 
 def test_an_audit_of_a_planned_number_cannot_end_it() -> None:
@@ -141,7 +144,8 @@ def test_the_posterior_bound_predicts_nothing() -> None:
 
 def evidence(upper: float = 1.0, highest: float = 0.9) -> DynamicsEvidence:
     rng = np.random.default_rng(0)
-    covered = StateInputCoverage(0.4, 0.4, 0.4, "x[0]", {"x[0]": 0.0}, {"x[0]": 0.1}, np.array([0.11, 0.22]), 9)
+    gap = StateInputGap(0.4, ("x[0]",), {"x[0]": 0.0})
+    covered = StateInputCoverage(gap, gap, gap, {"x[0]": 0.1}, np.array([0.11, 0.22]), 9)
     return DynamicsEvidence(
         np.linspace(0.5 * upper, upper, 40),
         rng.random((40, 2)),
@@ -163,9 +167,15 @@ def test_what_is_executed_next_depends_on_what_stands_in_the_way() -> None:
     assert asked(contested, known, 0.5) == largest.tolist()
     assert asked(contested, known, 0.95) == at_bound.tolist()
     assert asked(contested, known, 2.0) == farthest.tolist()
-    covered = replace(contested, coverage=replace(contested.coverage, marginal=0.1, beyond=0.0, pair=0.1))
+    gap = StateInputGap(0.0, ("x[0]",), {"x[0]": 0.0})
+    covered = replace(contested, coverage=replace(contested.coverage, marginal=gap, beyond=gap, pair=gap))
     assert asked(covered, known, 2.0, best=0.2) == largest.tolist()
-    assert asked(covered, known, 2.0, best=0.9) == farthest.tolist()
+    held = tuple(CheckedPrediction(k, 0.5, 0.9, 1.0, 0.9) for k in range(3))
+    tested = replace(covered, predictions=held)
+    assert asked(tested, known, 2.0, best=0.9) == at_bound.tolist()
+    assert asked(tested, np.tile(known, (2, 1)), 2.0, best=0.9) == farthest.tolist()
+    load = replace(covered, untried=UntriedParameter("load", 0.5, np.array([0.3, 0.4])))
+    assert asked(load, known, 2.0, best=0.2) == [0.3, 0.4]
     # Every third execution explores, and no task is executed twice.
     assert asked(contested, np.tile(known, (2, 1)), 0.5) == farthest.tolist()
     assert asked(contested, np.array([[0.9, 0.9], [0.8, 0.8], [0.7, 0.7], farthest]), 2.0) == at_bound.tolist()

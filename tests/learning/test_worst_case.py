@@ -39,8 +39,8 @@ class Remembering(DynamicsPosterior):
 
     taken: list[DynamicsDraws] = field(default_factory=list)
 
-    def draw(self, relevant: Array, rng: np.random.Generator) -> DynamicsDraws:
-        self.taken.append(super().draw(relevant, rng))
+    def draw(self, relevant: Array, rng: np.random.Generator, functions: int | None = None) -> DynamicsDraws:
+        self.taken.append(super().draw(relevant, rng, functions))
         return self.taken[-1]
 
 

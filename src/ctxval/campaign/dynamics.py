@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.describe import rounded
 from ctxval._util.representation import call
 from ctxval.certificates.dynamics import PREDICTIONS
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputCoverage
+from ctxval.certificates.dynamics_evidence import (
+    CheckedPrediction,
+    DynamicsEvidence,
+    StateInputCoverage,
+    StateInputGap,
+    UntriedParameter,
+)
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
-from ctxval.errors import CtxvalError
-from ctxval.learning import Coverage, DynamicsStudy, ExecutionPrediction, LearnedDynamics
+from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
+from ctxval.learning.coverage import Coverage, Gap
 from ctxval.storage.store import Store
 
 PREDICTION = "prediction"
@@ -23,7 +33,13 @@ PREDICTION = "prediction"
 AUDIT = "prediction_audit"
 """Key in the note of a trial that tests a prediction at a fresh random task."""
 
-_REMEMBERED = 4
+NEAR = 0.02
+"""A task that differs from an executed one by less than this in every coordinate is no new one."""
+
+_RECOMPUTED = PREDICTIONS + 1
+"""Number of the last trials whose predictions are computed afterwards, if none were stored."""
+
+_REMEMBERED = 6
 """Number of sets of executions whose dynamics are kept."""
 
 
@@ -34,9 +50,15 @@ class CampaignDynamics:
         validation: the map p -> d(p).
         store: the store of the trajectories.
         seed: the seed of the campaign.
+        description: what the experiment is, as the store describes it.
+
+    Attributes:
+        experiment: a digest of the description; a stored prediction belongs to one experiment.
     """
 
-    def __init__(self, validation: Validation, store: Store, seed: int) -> None:
+    def __init__(self, validation: Validation, store: Store, seed: int, description: Mapping[str, Any]) -> None:
+        text = json.dumps(rounded(description.get("validation"), 6), sort_keys=True)
+        self.experiment = hashlib.sha256(text.encode()).hexdigest()[:16]
         self._study = DynamicsStudy(validation, seed)
         self._store = store
         self._trajectories: dict[int, Trajectory | None] = {}
@@ -57,15 +79,27 @@ class CampaignDynamics:
         learned = self.learned(trials)
         try:
             return None if learned is None else learned.predict(point)
-        except (CtxvalError, np.linalg.LinAlgError):
+        except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
             return None
 
-    def evidence(self, trials: Sequence[Trial]) -> DynamicsEvidence | None:
-        """Return what the learned dynamics say about d*; None if nothing can be learned."""
+    def evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
+        """Return what the learned dynamics say about d*; None if nothing can be learned.
+
+        Args:
+            trials: all trials.
+            confidence: the probability with which a bound must hold; it sets the least number of draws.
+        """
         learned = self.learned(trials)
         if learned is None:
             return None
-        worst = learned.worst_case
+        try:
+            return self._evidence(learned, trials, int(np.ceil(confidence / (1 - confidence))))
+        except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
+            return None
+
+    def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int) -> DynamicsEvidence:
+        worst, names = learned.worst_case_of(draws), self._study.validation.space.names
+        untried = learned.untried_parameter
         return DynamicsEvidence(
             worst.maxima,
             worst.points,
@@ -77,13 +111,16 @@ class CampaignDynamics:
             learned.posterior.noise,
             self._checked(trials),
             _coverage(learned.coverage, learned.posterior.data.inputs),
+            groups=len(worst.maxima) // len(learned.posterior.components),
+            unplanned=worst.unplanned,
+            untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
         )
 
     def _learn(self, executed: Sequence[tuple[Trial, Trajectory]]) -> LearnedDynamics | None:
         try:
             return self._study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed])
-        except (CtxvalError, np.linalg.LinAlgError):
-            return None  # a failure of the linear algebra must not end a campaign
+        except Exception:  # the same
+            return None
 
     def _executed(self, trials: Sequence[Trial]) -> list[tuple[Trial, Trajectory]]:
         """Return the completed trials that have a trajectory."""
@@ -97,35 +134,69 @@ class CampaignDynamics:
         return self._trajectories[trial.number]
 
     def _checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:
-        """Return the stored predictions and, for the last trials without one, those from the trials before them."""
-        executed, found = self._executed(trials), []
-        for place, (trial, trajectory) in enumerate(executed):
-            stored = ExecutionPrediction.from_json((trial.note or {}).get(PREDICTION) or {})
+        """Return the predictions of completed trials; of those without a stored one, of the last few only.
+
+        The first trials, before which nothing could be learned, have no prediction.
+        """
+        completed = [trial for trial in trials if trial.state == "completed" and trial.distance is not None]
+        found = []
+        for place, trial in enumerate(completed):
+            before = completed[:place]
+            stored = self._stored(trial)
             prediction = stored
-            if stored is None and place >= len(executed) - PREDICTIONS:
-                prediction = self.predict([one for one, _ in executed[:place]], trial.unit_point)
-            if prediction is None or trial.distance is None:
+            if stored is None and place >= len(completed) - _RECOMPUTED:
+                if self.learned(before) is None:
+                    continue
+                prediction = self.predict(before, trial.unit_point)
+            elif stored is None:
                 continue
-            score = prediction.score(trajectory, trial.distance)
-            if score is not None:
-                facts = (score.z2, score.rank, prediction.median, prediction.upper, trial.distance, stored is not None)
-                found.append(CheckedPrediction(trial.number, *facts, audit=AUDIT in (trial.note or {})))
+            found.append(self._compared(trial, prediction, before, stored is not None))
         return tuple(found)
+
+    def _compared(
+        self, trial: Trial, prediction: ExecutionPrediction | None, before: Sequence[Trial], stored: bool
+    ) -> CheckedPrediction:
+        known = np.array([one.unit_point for one in before]).reshape(-1, len(trial.unit_point))
+        how = {
+            "stored": stored,
+            "audit": AUDIT in (trial.note or {}),
+            "new": not len(known) or float(np.abs(known - trial.unit_point).max(axis=1).min()) > NEAR,
+            "chosen": trial.origin == "manual",
+        }
+        distance = trial.distance or 0.0
+        if prediction is None:
+            return CheckedPrediction(trial.number, np.nan, np.inf, np.inf, distance, **how)
+        trajectory = self._trajectory(trial)
+        score = None if trajectory is None else prediction.score(trajectory, distance)
+        z2, rank = (np.nan, np.nan) if score is None else (score.z2, score.rank)
+        return CheckedPrediction(trial.number, rank, prediction.median, prediction.upper, distance, z2, **how)
+
+    def _stored(self, trial: Trial) -> ExecutionPrediction | None:
+        """Return the prediction that was stored before an execution, if it is one of the present distance."""
+        note = (trial.note or {}).get(PREDICTION)
+        if not isinstance(note, dict) or note.get("experiment") != self.experiment:
+            return None
+        return ExecutionPrediction.from_json(note)
+
+    def to_note(self, prediction: ExecutionPrediction) -> dict[str, Any]:
+        """Return a prediction as it is stored, with what identifies the experiment that it belongs to."""
+        return {PREDICTION: {**prediction.to_json(), "experiment": self.experiment}}
 
     def __repr__(self) -> str:
         return call(self, self._study)
 
 
 def _coverage(found: Coverage, inputs: int) -> StateInputCoverage:
-    states = len(found.place) - inputs
+    states = len(found.resolution) - inputs
     names = [*(f"x[{i}]" for i in range(states)), *(f"u[{i}]" for i in range(inputs))]
+
+    def named(values: Array) -> dict[str, float]:
+        return dict(zip(names, values.tolist(), strict=True))
+
+    def gap(of: Gap) -> StateInputGap:
+        return StateInputGap(of.size, tuple(names[i] for i in of.coordinates), named(of.place))
+
+    pair = None if found.pair is None else gap(found.pair)
     return StateInputCoverage(
-        found.marginal,
-        found.beyond,
-        found.pair,
-        names[found.coordinate],
-        dict(zip(names, found.place.tolist(), strict=True)),
-        dict(zip(names, found.resolution.tolist(), strict=True)),
-        found.task,
-        found.tasks,
+        gap(found.marginal), gap(found.beyond), pair, named(found.resolution), found.task, found.tasks
     )

@@ -46,9 +46,9 @@ class LearnedFromTrials:
         prediction = self._before(before)
         return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
 
-    def dynamics(self) -> DynamicsEvidence | None:
+    def dynamics(self, confidence: float) -> DynamicsEvidence | None:
         """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
-        return self.study.evidence(self.trials)
+        return self.study.evidence(self.trials, confidence)
 
     def tasks(self, count: int, seed: int) -> Array:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""

@@ -13,7 +13,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, lines
 from ctxval._util.texts import shortened, text_of
-from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
+from ctxval.campaign.dynamics import AUDIT, PREDICTION, CampaignDynamics
 from ctxval.campaign.fallback import error_with_fallback
 from ctxval.campaign.history import history_of, predict_from
 from ctxval.campaign.identity import identify
@@ -99,7 +99,7 @@ class TrialRecorder:
         self.store = store
         self.description = description
         self.draws = IndependentDraws(store, validation, seed)
-        self.dynamics = CampaignDynamics(validation, store, seed)
+        self.dynamics = CampaignDynamics(validation, store, seed, description)
         self.predicts = False
         self._seed = seed
         self._executing: set[int] = set()
@@ -178,7 +178,7 @@ class TrialRecorder:
     def redefine(self, validation: Validation, description: dict[str, Any]) -> None:
         """Continue with another distance, after its values were stored."""
         self.validation, self.description = validation, description
-        self.dynamics = CampaignDynamics(validation, self.store, self._seed)
+        self.dynamics = CampaignDynamics(validation, self.store, self._seed, description)
         self.replay()
 
     # Opening
@@ -252,7 +252,7 @@ class TrialRecorder:
         if origin == "iid" and choice.planned_draws is not None:
             note = {**(note or {}), PLANNED: choice.planned_draws}
         if self.predicts and (predicted := self.dynamics.predict(self._trials, unit_point)) is not None:
-            note = {**(note or {}), PREDICTION: predicted.to_json()}
+            note = {**(note or {}), **self.dynamics.to_note(predicted)}
         parameters = self.validation.space.describe_point(self.validation.space.from_unit(unit_point))
         number = len(self._trials)
         return Trial(number, origin, "open", unit_point, parameters, attempts, note=note, because=choice.because)
@@ -397,8 +397,10 @@ def _plain_note(note: Any) -> dict[str, Any] | None:
     """Return a search's note, which is stored as JSON.
 
     Raises:
-        InputError: if it is not a dictionary of plain values.
+        InputError: if it is not a dictionary of plain values, or has a key of the campaign's own.
     """
+    if isinstance(note, dict) and {PREDICTION, AUDIT} & set(note):
+        raise InputError(f"the note of a search must not have the keys {PREDICTION!r} and {AUDIT!r}.")
     try:
         if note is None or (isinstance(note, dict) and json.dumps(note, allow_nan=False)):
             return note

@@ -14,21 +14,21 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import record
-from ctxval.campaign.dynamics import AUDIT
+from ctxval.campaign.dynamics import AUDIT, NEAR
 from ctxval.campaign.trials import Choice, TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
-from ctxval.certificates.dynamics import AUDITED, FEWEST, Dynamics, certify_dynamics, held, uncovered, untested
+from ctxval.certificates.dynamics import AUDITED, FEWEST, GAP, Dynamics, certify_dynamics, held, uncovered, untested
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.verdict import counterexample, require_threshold
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
-_NEAR = 0.02
-"""A task that differs from an executed one by less than this in every coordinate teaches little."""
 _FAILING = 6
-"""Number of the last predictions, of which more than half must hold."""
+"""Number of the last predictions, of which at least half must hold."""
+_PATIENCE = 16
+"""Number of executions after which ``auto`` uses the posterior bound if the dynamics have not decided."""
 _EXPLORE = 3
 """Every so many executions, the task that leads farthest from the records is executed in any case."""
 
@@ -87,6 +87,8 @@ class UntilDecided:
             return self._by_distance(trials)
         if self._decides(trials, evidence):
             return self._audit(evidence) if self.audited else None
+        if isinstance(self.options.kind, Automatic) and self.recorder.executions >= _PATIENCE:
+            return self._by_distance(trials)
         known = _points(trials, self._dimension)
         best = max((trial.distance or 0.0 for trial in trials), default=0.0)
         point = next_task(evidence, known, best, self.threshold, self.options.confidence)
@@ -101,7 +103,7 @@ class UntilDecided:
         """Return what the learned dynamics say; None if the certificate does not use them."""
         if not self.predicts or any(trial.state == "failed" for trial in trials):
             return None
-        return self.recorder.dynamics.evidence(trials)
+        return self.recorder.dynamics.evidence(trials, self.options.confidence)
 
     def _fails(self, evidence: DynamicsEvidence) -> bool:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
@@ -181,17 +183,22 @@ def next_task(
         candidates = [largest, highest, farthest]
     elif exceeds:
         candidates = [highest, farthest]
-    elif uncovered(evidence.coverage) is None and untested(evidence, best) is not None:
-        candidates = [largest, farthest, highest]
-    else:
+    elif uncovered(evidence) is not None:
+        untried = evidence.untried
         candidates = [farthest, highest, largest]
+        if untried is not None and untried.gap > GAP:
+            candidates = [untried.task[None], *candidates]
+    elif untested(evidence, best, threshold) is not None:
+        candidates = [largest, highest, farthest]
+    else:
+        candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]
     return _first_new(np.concatenate(candidates), known)
 
 
 def _first_new(points: Array, known: Array) -> Array | None:
     """Return the first of some points that is not near a known one; None if all are."""
     for point in points:
-        if not len(known) or np.abs(known - point).max(axis=1).min() > _NEAR:
+        if not len(known) or np.abs(known - point).max(axis=1).min() > NEAR:
             return np.asarray(point)
     return None
 

@@ -18,7 +18,13 @@ from ctxval.certificates.covering import (
 )
 from ctxval.certificates.diagnostics import Diagnosis, diagnose
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputCoverage
+from ctxval.certificates.dynamics_evidence import (
+    CheckedPrediction,
+    DynamicsEvidence,
+    StateInputCoverage,
+    StateInputGap,
+    UntriedParameter,
+)
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.learned import LearnedDistance, require_learned
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
@@ -73,9 +79,11 @@ __all__ = [
     "SamplingDiscarding",
     "Scenario",
     "StateInputCoverage",
+    "StateInputGap",
     "StoppingDecision",
     "StoppingRule",
     "TheoremConstants",
+    "UntriedParameter",
     "Verdict",
     "assess",
     "bare_corners",

@@ -76,10 +76,10 @@ class Automatic(CertificateKind):
         by_distance = _tried(self.posterior, sample, threshold, confidence)
         if not isinstance(by_dynamics, tuple):
             return _required(by_distance)
-        if not isinstance(by_distance, tuple):
-            return by_dynamics
+        if not isinstance(by_distance, tuple) or _decides(by_distance[0], threshold):
+            return by_dynamics if not isinstance(by_distance, tuple) else by_distance
         supported = threshold is not None and Dynamics.support(by_dynamics[0], threshold)
-        return by_dynamics if supported and not _decides(by_distance[0], threshold) else by_distance
+        return by_dynamics if by_dynamics[0].doubt is None or supported else by_distance
 
 
 def _tried(

@@ -20,9 +20,10 @@ import numpy as np
 
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import require_probability
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputCoverage
+from ctxval.certificates.bounds import require_probability, with_error
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
 from ctxval.certificates.learned import require_learned
+from ctxval.certificates.posterior import both_outcomes
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.core.space import TaskSpace
 from ctxval.errors import CertificateError
@@ -62,6 +63,9 @@ LEFT_OUT = 0.5
 TESTED = 0.8
 """Least share of the largest distance on the posterior mean that must have been executed: the bound is tested there."""
 
+MATTERS = 0.3
+"""Least distance, as a share of the bound, at which a prediction must have held."""
+
 _RAISE = 0.5
 """Share of the largest excess over predictions by which the bound is raised."""
 
@@ -69,11 +73,27 @@ _RAISE = 0.5
 @part("dynamics")
 @dataclass(frozen=True, repr=False)
 class Dynamics(CertificateKind):
-    """Bound on d* from posterior draws of the residual dynamics, which are learned from the executed trajectories."""
+    """Bound on d* from posterior draws of the residual dynamics, which are learned from the executed trajectories.
+
+    Attributes:
+        stochastic: whether two executions of one task may differ; it must be False.
+
+    Raises:
+        CertificateError: if the system is declared stochastic.
+    """
 
     name: ClassVar[str] = "dynamics"
     needs_model: ClassVar[bool] = True
     evidence: ClassVar[str] = "by a prior on the dynamics"
+
+    stochastic: bool = False
+
+    def __post_init__(self) -> None:
+        if self.stochastic:
+            raise CertificateError(
+                "the dynamics bound is for deterministic systems, and this one is declared stochastic: use --kind "
+                "posterior or an audit."
+            )
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_dynamics` of the trials and of what is learned from their trajectories.
@@ -83,7 +103,7 @@ class Dynamics(CertificateKind):
         """
         learned = require_learned(sample, self.name)
         require_executions(sample)
-        evidence = learned.dynamics()
+        evidence = learned.dynamics(confidence)
         if evidence is None:
             raise CertificateError(
                 "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
@@ -96,7 +116,7 @@ class Dynamics(CertificateKind):
         """Return what it assumes about the system."""
         return [
             "the recorded state being complete",
-            "the system being deterministic",
+            "the system being deterministic and not changing with time",
             f"its dynamics being like what was seen, to a resolution of {_texts(certificate.details['resolution'])}",
         ]
 
@@ -105,9 +125,9 @@ class Dynamics(CertificateKind):
         """Return what speaks for a threshold although the certificate is withdrawn; empty if nothing does."""
         details = certificate.details
         largest = details["largest_draw"]
-        if largest is None or largest > threshold or details["executions"] < FEWEST:
-            return ""
         predictions = details["predictions"]
+        if largest is None or largest > threshold or not predictions["held"]:
+            return ""
         return (
             f"supported by the model: no draw of the learned dynamics exceeds {threshold:.6g} in a search of "
             f"{details['evaluations']} closed loops; {predictions['held']} of the last {predictions['last_ones']} "
@@ -119,7 +139,7 @@ def require_executions(sample: Sample) -> None:
     """Check that the trials allow a bound from learned dynamics.
 
     Raises:
-        CertificateError: if an execution failed or could not be measured.
+        CertificateError: if an execution failed or could not be measured, or if all distances are 0.
     """
     failed = [number for number, distance in zip(sample.numbers, sample.distances, strict=True) if np.isnan(distance)]
     if failed:
@@ -127,6 +147,8 @@ def require_executions(sample: Sample) -> None:
             f"{listed(failed)} failed or has no distance, so d* is not bounded there; execute the task again, or audit."
             f"{advice_to_remeasure(sample)}"
         )
+    if not sample.best > 0:
+        raise CertificateError("all distances are 0, so no prediction of a distance was tested.")
 
 
 def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: float = 0.95) -> Certificate:
@@ -144,25 +166,26 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: flo
     draws = len(evidence.maxima)
     if np.ceil((draws + 1) * confidence - 1e-9) > draws:
         raise CertificateError(f"a confidence of {confidence:g} needs more than the {draws} draws of the dynamics.")
-    raised = bound_of(evidence, sample.best, confidence)
-    if not np.isfinite(raised):
+    raised, error = bound_of(evidence, sample.best, confidence), evidence.error(confidence)
+    if not np.isfinite(raised + error):
         raise CertificateError(
             "the dynamics give no bound: the closed loops of some draws diverge, or an execution could not be "
             "predicted. More executions narrow the draws."
         )
-    doubt = doubt_of(evidence, sample.best, raised)
     return Certificate(
         kind="dynamics",
         statement=(
-            f"With probability {confidence} under the prior on the residual dynamics, d* is at most {raised:.6g}."
+            f"With probability {confidence} under the prior on the residual dynamics, d* is at most "
+            f"{with_error(raised, error)}."
         ),
         upper_bound=raised,
         confidence=confidence,
         volume=0.0,
         trials=len(sample),
         assumptions=(*_assumptions(evidence), *sample.remarks, ONE_CAMPAIGN),
-        details=_details(sample, evidence, raised),
-        doubt=doubt,
+        details=_details(sample, evidence, raised, error),
+        doubt=both_outcomes(sample, stochastic=False) or doubt_of(evidence, sample.best, raised),
+        error=error,
     )
 
 
@@ -186,6 +209,15 @@ def held(prediction: CheckedPrediction, bound: float) -> bool:
     return abs(prediction.distance - prediction.median) <= ACCURATE * bound
 
 
+def counted(evidence: DynamicsEvidence, bound: float) -> list[CheckedPrediction]:
+    """Return the predictions that count: those that failed, and those that held where they could have failed.
+
+    A prediction of a task like an earlier one tells nothing. Nor does one of a run that a person chose to import, if it
+    was made afterwards.
+    """
+    return [one for one in evidence.predictions if not held(one, bound) or (one.new and (one.stored or not one.chosen))]
+
+
 def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
     """Return why the bound is withdrawn, and what would help; None if it is not.
 
@@ -194,13 +226,18 @@ def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
         best: the largest executed distance.
         bound: the bound.
     """
-    checked = evidence.predictions[-PREDICTIONS:]
-    failed = [one for one in checked if not held(one, bound)]
-    coverage = evidence.coverage
+    checked = counted(evidence, bound)
+    last = checked[-PREDICTIONS:]
+    failed = [one for one in last if not held(one, bound)]
     if evidence.executions < FEWEST:
         return (
             f"the dynamics are learned from {evidence.executions} executed trajectories, and the bound needs at least "
             f"{FEWEST}; execute more tasks"
+        )
+    if evidence.unplanned:
+        return (
+            f"for {100 * evidence.unplanned:.2g} % of the tasks no controller can be designed, or the model diverges: "
+            "nothing is known there; make the task space smaller, so that every task can be executed"
         )
     exceeding = [one for one in evidence.predictions if one.audit and one.distance > one.upper + TOLERATED * bound]
     if exceeding:
@@ -210,11 +247,11 @@ def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
             "cause: record more states, or use --kind posterior or an audit"
         )
     if failed:
-        return _failed_predictions(failed)
+        return _failed_predictions(failed, len(last))
     if len(checked) < PREDICTIONS:
         return (
-            f"{len(checked)} executions were predicted beforehand, and the bound needs {PREDICTIONS} predictions that "
-            "hold; execute more tasks"
+            f"{len(checked)} executions of different tasks were predicted from earlier ones, and the bound needs "
+            f"{PREDICTIONS} predictions that hold; execute more tasks"
         )
     if evidence.noise > NOISE:
         return (
@@ -227,43 +264,63 @@ def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
             f"the draws of the dynamics leave out {100 * evidence.left_out:.0f} % of the largest variance, more than "
             f"{100 * LEFT_OUT:g} %; more executions reduce this variance"
         )
-    return uncovered(coverage) or untested(evidence, best)
+    return uncovered(evidence) or untested(evidence, best, bound)
 
 
-def _failed_predictions(failed: Sequence[CheckedPrediction]) -> str:
+def _failed_predictions(failed: Sequence[CheckedPrediction], last: int) -> str:
     worst = max(failed, key=lambda one: abs(one.distance - one.median))
     return (
-        f"of the last {PREDICTIONS} predictions {len(failed)} failed (trial {worst.trial}: distance "
-        f"{worst.distance:.4g} where {worst.median:.4g} was predicted); {PREDICTIONS} must hold in a row. After few "
-        "executions, more of them help. If predictions go on failing, a state that is not recorded, a jump such as a "
-        "contact or dry friction, or noise is the likely cause: record more states, or use --kind posterior or an audit"
+        f"of the last {last} predictions {len(failed)} failed (trial {worst.trial}: distance {worst.distance:.4g} "
+        f"where {worst.median:.4g} was predicted); {PREDICTIONS} must hold in a row. After few executions, more of "
+        "them help. If predictions go on failing, a state that is not recorded, a jump such as a contact or dry "
+        "friction, or noise is the likely cause: record more states, or use --kind posterior or an audit"
     )
 
 
-def uncovered(coverage: StateInputCoverage) -> str | None:
-    """Return what the records do not cover; None if nothing."""
-    if coverage.beyond > (GAP if coverage.pair is None else BEYOND):
-        what = f"{100 * coverage.beyond:.2g} % of its range beyond all records of {coverage.coordinate}"
-    elif coverage.marginal > GAP:
-        what = f"{100 * coverage.marginal:.0f} % of its range away from every record of {coverage.coordinate}"
-    elif coverage.pair is not None and coverage.pair > PAIR_GAP:
-        what = f"{100 * coverage.pair:.0f} % of the ranges away from every record in two coordinates together"
+def uncovered(evidence: DynamicsEvidence) -> str | None:
+    """Return what the records and executions do not cover; None if nothing."""
+    coverage, untried = evidence.coverage, evidence.untried
+    if coverage.beyond.size > (GAP if coverage.pair is None else BEYOND):
+        gap, what = coverage.beyond, "of its range beyond all records of"
+    elif coverage.marginal.size > GAP:
+        gap, what = coverage.marginal, "of its range away from every record of"
+    elif coverage.pair is not None and coverage.pair.size > PAIR_GAP:
+        gap, what = coverage.pair, "of their ranges away from every record of"
+    elif untried is not None and untried.gap > GAP:
+        return (
+            f"the parameter {untried.name} hardly changes the closed loops of the model, so what it changes in the "
+            "system cannot be learned from states and inputs, and some of its values are "
+            f"{100 * untried.gap:.0f} % of its range away from every executed one; an execution there helps "
+            "(--until-decided executes it)"
+        )
     else:
         return None
     return (
-        f"closed loops of the tasks lead {what}, such as to {_texts(coverage.place)}; an execution of a task that "
-        "leads there helps (--until-decided executes it)"
+        f"closed loops of the tasks lead {100 * gap.size:.2g} % {what} {' and '.join(gap.coordinates)}, such as to "
+        f"{_texts(gap.place)}; an execution of a task that leads there helps (--until-decided executes it)"
     )
 
 
-def untested(evidence: DynamicsEvidence, best: float) -> str | None:
-    """Return that the task with the largest predicted distance was not executed; None if a similar distance was."""
-    if best >= TESTED * evidence.highest:
-        return None
-    return (
-        f"the largest distance is predicted to be {evidence.highest:.4g}, but the largest executed one is {best:.4g}: "
-        "the prediction is not tested where it matters; an execution of that task helps (--until-decided executes it)"
-    )
+def untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    """Return that the bound is not tested where distances are large; None if it is.
+
+    Args:
+        evidence: what the learned dynamics say.
+        best: the largest executed distance.
+        bound: the bound.
+    """
+    if best < TESTED * evidence.highest:
+        return (
+            f"the largest distance is predicted to be {evidence.highest:.4g}, but the largest executed one is "
+            f"{best:.4g}: the prediction is not tested where it matters; an execution of that task helps "
+            "(--until-decided executes it)"
+        )
+    if not any(one.distance >= MATTERS * bound and held(one, bound) for one in counted(evidence, bound)):
+        return (
+            f"no prediction held at a distance of at least {100 * MATTERS:g} % of the bound: small distances hardly "
+            "test it; an execution of another task with a large distance helps (--until-decided executes it)"
+        )
+    return None
 
 
 def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
@@ -277,7 +334,7 @@ def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
     )
     return (
         "the recorded state is complete: the next state depends on it and on the input alone",
-        "the system is deterministic",
+        "the system is deterministic, and its dynamics do not change with time or with the task",
         "the residual x' - M(x, u) is a draw from a Gaussian process: a Matern kernel of smoothness 3/2 or 5/2 that "
         "may grow with the inputs, plus a linear function; its hyperparameters are unknown and integrated over",
         "the residual is like what was seen, to a resolution in state and input of "
@@ -289,11 +346,13 @@ def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
     )
 
 
-def _details(sample: Sample, evidence: DynamicsEvidence, bound: float) -> dict[str, Any]:
-    finite, last = evidence.maxima[np.isfinite(evidence.maxima)], evidence.predictions[-PREDICTIONS:]
+def _details(sample: Sample, evidence: DynamicsEvidence, bound: float, error: float) -> dict[str, Any]:
+    finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
+    coverage = evidence.coverage
     return {
         "best": sample.best,
         "gap": bound - sample.best,
+        "error": error,
         "executions": evidence.executions,
         "draws": len(evidence.maxima),
         "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
@@ -307,11 +366,11 @@ def _details(sample: Sample, evidence: DynamicsEvidence, bound: float) -> dict[s
             "audited": sum(one.audit for one in evidence.predictions),
         },
         "checked": [{**one.to_json(), "held": bool(held(one, bound))} for one in evidence.predictions],
-        "coverage_gap": evidence.coverage.marginal,
-        "beyond_the_records": evidence.coverage.beyond,
-        "coverage_gap_of_pairs": evidence.coverage.pair,
-        "largest_gap_at": evidence.coverage.place,
-        "resolution": evidence.coverage.resolution,
+        "coverage_gap": coverage.marginal.size,
+        "beyond_the_records": coverage.beyond.size,
+        "coverage_gap_of_pairs": None if coverage.pair is None else coverage.pair.size,
+        "largest_gap_at": coverage.marginal.place,
+        "resolution": coverage.resolution,
         "noise": evidence.noise,
         "variance_left_out": evidence.left_out,
         "failures": sample.failures,

@@ -10,6 +10,9 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, record
 
+_RESAMPLES = 200
+"""Number of bootstrap samples."""
+
 
 @dataclass(frozen=True)
 class CheckedPrediction:
@@ -17,24 +20,27 @@ class CheckedPrediction:
 
     Attributes:
         trial: the number of the trial.
-        z2: squared standardised error, the larger one of the trajectory and of the distance; infinity if nothing was
-            predicted, because most draws diverged.
-        rank: share of the predicted distances that are below the executed one.
+        rank: share of the predicted distances that are below the executed one; NaN if nothing was predicted.
         median: median of the predicted distances; infinity if nothing was predicted.
         upper: 0.95 quantile of the predicted distances; infinity if more draws than that diverged.
         distance: the executed distance.
+        z2: squared standardised error, the larger one of the trajectory and of the distance; NaN if it is not known.
         stored: whether the prediction was stored before the execution; if not, it was computed afterwards.
         audit: whether the task was a fresh random one of a prediction audit.
+        new: whether the task differs from those that were executed before.
+        chosen: whether a person chose the task or imported the run.
     """
 
     trial: int
-    z2: float
     rank: float
     median: float
     upper: float
     distance: float
-    stored: bool
+    z2: float = np.nan
+    stored: bool = True
     audit: bool = False
+    new: bool = True
+    chosen: bool = False
 
     @property
     def excess(self) -> float:
@@ -42,8 +48,29 @@ class CheckedPrediction:
         return max(self.distance - self.median, 0.0) if np.isfinite(self.median) else np.inf
 
     def to_json(self) -> dict[str, Any]:
-        """Return all attributes, ready for JSON: infinity is None."""
-        return {name: None if value in (np.inf, -np.inf) else value for name, value in asdict(self).items()}
+        """Return all attributes, ready for JSON: numbers that are not finite are None."""
+        return {
+            name: None if isinstance(value, float) and not np.isfinite(value) else value
+            for name, value in asdict(self).items()
+        }
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True, eq=False)
+class StateInputGap:
+    """A gap between the states and inputs that closed loops visit and those that are recorded.
+
+    Attributes:
+        size: its size, as a share of the visited range.
+        coordinates: its coordinates, such as ``x[1]`` or ``u[0]``.
+        place: the visited state and input, by coordinate, in the units of the system.
+    """
+
+    size: float
+    coordinates: tuple[str, ...]
+    place: dict[str, float]
 
     def __repr__(self) -> str:
         return record(self)
@@ -54,28 +81,38 @@ class StateInputCoverage:
     """The largest gaps between the states and inputs that closed loops visit and those that are recorded.
 
     Attributes:
-        marginal: the largest gap in a single coordinate, as a share of the visited range.
-        beyond: how far the loops lead beyond the smallest or the largest record of a single coordinate.
+        marginal: the largest gap in a single coordinate.
+        beyond: the largest excess over the largest record of a single coordinate, or below its smallest one.
         pair: the largest gap in two coordinates together; None if there are too many coordinates to compare pairs.
-        coordinate: the coordinate with the largest gap, such as ``x[1]`` or ``u[0]``.
-        place: state and input where this gap is, by coordinate, in the units of the system.
         resolution: the largest gap of each coordinate, in its unit.
         task: the task whose closed loop leads farthest from the records, a point of the unit cube ``(d,)``.
         tasks: the number of tasks that were compared.
     """
 
-    marginal: float
-    beyond: float
-    pair: float | None
-    coordinate: str
-    place: dict[str, float]
+    marginal: StateInputGap
+    beyond: StateInputGap
+    pair: StateInputGap | None
     resolution: dict[str, float]
     task: Array
     tasks: int
 
-    def to_json(self) -> dict[str, Any]:
-        """Return all attributes, ready for JSON."""
-        return {**asdict(self), "task": self.task.tolist()}
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True, eq=False)
+class UntriedParameter:
+    """A task parameter that hardly changes the closed loops of M.
+
+    Attributes:
+        name: its name.
+        gap: the largest distance of one of its values to the nearest executed one, as a share of its range.
+        task: a task in that gap, a point of the unit cube ``(d,)``.
+    """
+
+    name: str
+    gap: float
+    task: Array
 
     def __repr__(self) -> str:
         return record(self)
@@ -96,6 +133,9 @@ class DynamicsEvidence:
         noise: learned variance of noise, as a share of the mean square of the residual.
         predictions: predictions and executions, in the order of the trials.
         coverage: how well the records cover the closed loops of the tasks.
+        groups: number of draws that share hyperparameters.
+        unplanned: share of the tasks for which no controller can be designed, or on which M diverges.
+        untried: a parameter that M's loops do not depend on; None if there is none.
     """
 
     maxima: Array
@@ -108,6 +148,9 @@ class DynamicsEvidence:
     noise: float
     predictions: tuple[CheckedPrediction, ...]
     coverage: StateInputCoverage
+    groups: int = 2
+    unplanned: float = 0.0
+    untried: UntriedParameter | None = None
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
@@ -116,6 +159,13 @@ class DynamicsEvidence:
     def upper(self, confidence: float) -> float:
         """Return the maximum that d* stays below with this probability."""
         return float(np.sort(self.maxima)[self.rank(confidence)])
+
+    def error(self, confidence: float) -> float:
+        """Return the standard error of :meth:`upper` over draws of the hyperparameters, by a bootstrap over them."""
+        blocks = self.maxima.reshape(-1, self.groups)
+        rows = np.random.default_rng(0).integers(len(blocks), size=(_RESAMPLES, len(blocks)))
+        resampled = np.sort(blocks[rows].reshape(_RESAMPLES, -1), axis=1)[:, self.rank(confidence)]
+        return float(resampled.std(ddof=1)) if np.isfinite(resampled).all() else np.inf
 
     def __repr__(self) -> str:
         return call(self, draws=len(self.maxima), executions=self.executions, evaluations=self.evaluations)

@@ -24,8 +24,12 @@ class LearnedDistance(Protocol):
             before: a number of a trial; only trials with smaller numbers are learned from.
         """
 
-    def dynamics(self) -> DynamicsEvidence | None:
-        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
+    def dynamics(self, confidence: float) -> DynamicsEvidence | None:
+        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned.
+
+        Args:
+            confidence: the probability with which a bound must hold; it sets the least number of draws.
+        """
 
     def tasks(self, count: int, seed: int) -> Array:
         """Return independent draws from the distribution of tasks: points of the unit cube ``(count, d)``.

@@ -177,7 +177,7 @@ def certify_posterior(
             "diagnosis": diagnosis.to_json(),
             "failures": sample.failures,
         },
-        doubt=_both_outcomes(sample, stochastic) or diagnosis.doubt,
+        doubt=both_outcomes(sample, stochastic) or diagnosis.doubt,
         error=error,
     )
 
@@ -193,7 +193,7 @@ def _statement(upper: float, error: float, confidence: float, stochastic: bool) 
 _STANDARD_ERROR = " (plus or minus one standard error of the random draws that it is computed from)"
 
 
-def _both_outcomes(sample: Sample, stochastic: bool) -> str | None:
+def both_outcomes(sample: Sample, stochastic: bool) -> str | None:
     """Return why the bound is withdrawn if a failed task later succeeded for no stated reason; None if none did."""
     unexplained = [one for one in sample.made_good if one.because is None]
     if not unexplained:

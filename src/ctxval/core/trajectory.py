@@ -118,9 +118,9 @@ class Trajectory:
     def transitions(self) -> Transitions:
         """Return all steps of all tasks of the batch as one set of transitions."""
         n, m = self.states.shape[-1], self.inputs.shape[-1]
-        return Transitions(
-            self.states[..., :-1, :].reshape(-1, n), self.inputs.reshape(-1, m), self.states[..., 1:, :].reshape(-1, n)
-        )
+        count = int(np.prod(self.inputs.shape[:-1]))  # a system may have no input
+        before, after = self.states[..., :-1, :].reshape(-1, n), self.states[..., 1:, :].reshape(-1, n)
+        return Transitions(before, self.inputs.reshape(count, m), after)
 
     # Files
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -67,7 +68,7 @@ class LoopPlanner:
     def __init__(self, validation: Validation) -> None:
         self.validation = validation
         self._batched = bool(getattr(validation.synthesizer, "batched", False))
-        self._takes_draws: bool | None = None
+        self._together: bool | None = None
 
     def plan(self, points: Array, together: int = _TASKS) -> list[PlannedTasks]:
         """Return the plans of points ``(q, d)``; tasks for which no controller can be designed are left out.
@@ -81,21 +82,30 @@ class LoopPlanner:
         return [one for first in range(0, len(points), size) for one in self._planned(points, rows[first:][:size])]
 
     def _planned(self, points: Array, rows: Rows) -> Iterator[PlannedTasks]:
-        """Yield the plans of some rows. A batch that fails is halved."""
-        parts = self.validation
+        """Yield the plans of some rows. A batch that fails is halved; one task is then planned without batch axis."""
         try:
-            chosen = points[rows] if self._batched else points[rows[0]]
-            task = parts.task(parts.space.parameters(parts.space.from_unit(chosen)))
-            controller = parts.synthesizer.design(task, parts.model)
-            promised = rollout(parts.model.step, controller, task)
-            if promised.batch_shape != chosen.shape[:-1]:
-                raise ValueError("the task function did not return one task for each point")
-            yield PlannedTasks(rows, task, controller, promised)
+            yield self._plan(points[rows] if self._batched else points[rows[0]], rows)
         except Exception:  # the user's own parts, on tasks that may never be executed
             if len(rows) > 1:
                 half = len(rows) // 2
                 yield from self._planned(points, rows[:half])
                 yield from self._planned(points, rows[half:])
+            elif self._batched:
+                yield from self._alone(points[rows[0]], rows)
+
+    def _alone(self, point: Array, rows: Rows) -> Iterator[PlannedTasks]:
+        """Yield the plan of one task without batch axis, if it can be planned."""
+        with contextlib.suppress(Exception):  # the user's own parts
+            yield self._plan(point, rows)
+
+    def _plan(self, chosen: Array, rows: Rows) -> PlannedTasks:
+        parts = self.validation
+        task = parts.task(parts.space.parameters(parts.space.from_unit(chosen)))
+        controller = parts.synthesizer.design(task, parts.model)
+        promised = rollout(parts.model.step, controller, task)
+        if promised.batch_shape != chosen.shape[:-1]:
+            raise ValueError("the task function did not return one task for each point")
+        return PlannedTasks(rows, task, controller, promised)
 
     def run(self, draws: DynamicsDraws, planned: Sequence[PlannedTasks]) -> list[Loops]:
         """Return the closed loops of all draws on the same tasks."""
@@ -120,51 +130,68 @@ class LoopPlanner:
 
     def _run(self, draws: DynamicsDraws, planned: PlannedTasks) -> Loops:
         task, S = planned.task, len(draws)
-        single = not task.batch_shape
-        start = np.repeat(task.initial_state[None], S, axis=0)
-
-        def step(x: Array, u: Array) -> Array:
-            return draws.step(x[:, None], u[:, None])[:, 0] if single else draws.step(x, u)
-
-        many = Task(start, horizon=task.horizon, dt=task.dt)
-        loops = rollout(step, self._for_draws(planned.controller, start), many)
-        each = (Trajectory(loops.times, loops.states[s], loops.inputs[s]) for s in range(S))
+        if self._takes_draws_together(planned, S):
+            start = np.repeat(task.initial_state[None], S, axis=0)
+            step: Step = draws.step if task.batch_shape else _Single(draws)
+            together = rollout(step, planned.controller, Task(start, horizon=task.horizon, dt=task.dt))
+            loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
+        else:
+            loops = [rollout(draws[s].step, planned.controller, task) for s in range(S)]
+        states, inputs = np.stack([one.states for one in loops]), np.stack([one.inputs for one in loops])
         shape = (S, len(planned.rows))
         return Loops(
-            np.array([self._distances(planned, one) for one in each]).reshape(shape),
-            loops.states.reshape(*shape, *loops.states.shape[-2:]),
-            loops.inputs.reshape(*shape, *loops.inputs.shape[-2:]),
+            np.array([self._distances(planned, one) for one in loops]).reshape(shape),
+            states.reshape(*shape, *states.shape[-2:]),
+            inputs.reshape(*shape, *inputs.shape[-2:]),
         )
+
+    def _takes_draws_together(self, planned: PlannedTasks, draws: int) -> bool:
+        """Return whether controllers take draws as another first axis; if not, one loop is run after the other."""
+        if draws == 1:
+            return False
+        if self._together is None:
+            start = planned.task.initial_state
+            steps = 1e-3 * np.arange(draws).reshape(-1, *[1] * start.ndim)
+            self._together = _same(planned.controller, start + steps)
+        return self._together
 
     def _distances(self, planned: PlannedTasks, loops: Trajectory) -> Array:
         """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does."""
         promised, known = planned.promised.finite, planned.promised.finite & loops.finite
         model, system = (_without_divergence(one, known) for one in (planned.promised, loops))
-        with np.errstate(all="ignore"):
-            values = np.asarray(self.validation.distance(model, system, planned.task), dtype=np.float64)
-        found = np.where(np.isfinite(values) & known, values, np.inf)
+        found = np.where(known, self._measured(planned.task, model, system), np.inf)
         return np.where(promised, found, np.nan).reshape(len(planned.rows))
 
-    def _for_draws(self, controller: Controller, start: Array) -> Controller:
-        """Return a controller that takes states with draws as another first axis."""
-        looped = _Looped(controller)
-        if self._takes_draws is None and len(start) > 1:
-            probe = start + 1e-3 * np.arange(len(start)).reshape(-1, *[1] * (start.ndim - 1))
-            self._takes_draws = _same(controller, looped, probe)
-        return controller if self._takes_draws else looped
+    def _measured(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
+        """Return the distance of each task, ``(...)``, one by one if the distance does not take a batch.
+
+        It is infinity if the distance raises an exception or returns no finite number: nothing is known then.
+        """
+        try:
+            with np.errstate(all="ignore"):
+                values = np.asarray(self.validation.distance(model, system, task), dtype=np.float64)
+            if values.shape == model.batch_shape:
+                return np.where(np.isfinite(values), values, np.inf)
+        except Exception:  # the user's distance
+            if not model.batch_shape:
+                return np.array(np.inf)
+        if not model.batch_shape:
+            return np.array(np.inf)
+        each = (self._measured(task[k], model[k], system[k]) for k in range(model.batch_shape[0]))
+        return np.array([float(one) for one in each])
 
     def __repr__(self) -> str:
         return call(self, self.validation)
 
 
 @dataclass(frozen=True, eq=False)
-class _Looped:
-    """A controller that is called for one draw after the other."""
+class _Single:
+    """The step of draws on one task: shapes ``(S, n), (S, m) -> (S, n)``."""
 
-    controller: Controller
+    draws: DynamicsDraws
 
-    def __call__(self, t: int, x: Array) -> Array:
-        return np.stack([np.asarray(self.controller(t, row), dtype=np.float64) for row in x])
+    def __call__(self, x: Array, u: Array) -> Array:
+        return np.asarray(self.draws.step(x[:, None], u[:, None])[:, 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,11 +235,12 @@ def _without_divergence(loops: Trajectory, finite: Mask) -> Trajectory:
     return Trajectory(loops.times, np.where(kept, loops.states, 0.0), np.where(kept, loops.inputs, 0.0))
 
 
-def _same(controller: Controller, looped: Controller, probe: Array) -> bool:
+def _same(controller: Controller, probe: Array) -> bool:
     """Return whether a controller takes another first axis, with the same result as one call after the other."""
     try:
         with np.errstate(all="ignore"):
-            together, one_by_one = np.asarray(controller(0, probe)), looped(0, probe)
+            together = np.asarray(controller(0, probe))
+            one_by_one = np.stack([np.asarray(controller(0, row), dtype=np.float64) for row in probe])
     except Exception:  # the user's controller, which need not take another axis
         return False
     return together.shape == one_by_one.shape and np.allclose(together, one_by_one, equal_nan=True)

@@ -27,26 +27,40 @@ _TAIL = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
+class Gap:
+    """A gap between what closed loops visit and what is recorded.
+
+    Attributes:
+        size: its size, as a share of the visited range.
+        coordinates: the indices of its coordinates; states come before inputs.
+        place: the visited state-input pair, in the system's units, shape ``(n + m,)``.
+    """
+
+    size: float
+    coordinates: tuple[int, ...]
+    place: Array
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True, eq=False)
 class Coverage:
-    """The largest gaps between what closed loops visit and what is recorded, as shares of the visited range.
+    """The largest gaps between what closed loops visit and what is recorded.
 
     Attributes:
         marginal: the largest gap in a single coordinate.
-        beyond: how far the loops lead beyond the smallest or the largest record of a single coordinate.
+        beyond: the largest excess over the largest record of a single coordinate, or below its smallest one.
         pair: the largest gap in two coordinates together; None if there are too many coordinates to compare pairs.
-        coordinate: the index of the coordinate with the worst of these gaps; states come before inputs.
-        place: the state-input pair where it is, in the system's units, shape ``(n + m,)``.
         task: the task whose closed loop leads farthest from the records, a point of the unit cube ``(d,)``.
         resolution: the largest gap of each coordinate, in the system's units, shape ``(n + m,)``.
         tasks: the number of tasks that were compared with the range of the records; gaps are looked for in a part of
             them.
     """
 
-    marginal: float
-    beyond: float
-    pair: float | None
-    coordinate: int
-    place: Array
+    marginal: Gap
+    beyond: Gap
+    pair: Gap | None
     task: Array
     resolution: Array
     tasks: int
@@ -71,33 +85,42 @@ def coverage(
     width = np.maximum(high - low, 1e-9)
     recorded, scaled = posterior.data.pairs / width, visited / width
     beyond = np.maximum(np.maximum(scaled - recorded.max(axis=0), recorded.min(axis=0) - scaled), 0.0)
-    some = scaled[_some(len(scaled), _TASKS)][:, _some(scaled.shape[1], _STEPS)]
+    compared = _some(len(scaled), _TASKS)
+    some = scaled[compared][:, _some(scaled.shape[1], _STEPS)]
     gaps = np.stack([_nearest(recorded[:, i], some[..., i]) for i in range(len(width))], axis=-1)
-    paired = _pair_gaps(recorded, some)
-    badness = _BEYOND * beyond.max(axis=(1, 2))
-    badness[_some(len(scaled), _TASKS)] += (gaps.max(axis=-1) + (0.0 if paired is None else _PAIR * paired)).max(axis=1)
-    worst = (beyond, scaled) if _BEYOND * beyond.max() > gaps.max() else (gaps, some)
-    at = np.unravel_index(int(worst[0].argmax()), worst[0].shape)
+    pairs = _pair_gaps(recorded, some)
+    far = _BEYOND * beyond.max(axis=(1, 2))
+    far[compared] += (gaps.max(axis=-1) + (0.0 if pairs is None else _PAIR * pairs.max(axis=-1))).max(axis=1)
+
+    def largest(of: Array, coordinates: list[tuple[int, ...]], where: Array) -> Gap:
+        at = np.unravel_index(int(of.argmax()), of.shape)
+        place = where[at[:-1]] * width * posterior.data.scale + posterior.data.shift
+        return Gap(float(of[at]), coordinates[int(at[-1])], place)
+
+    single: list[tuple[int, ...]] = [(i,) for i in range(len(width))]
     return Coverage(
-        float(gaps.max()),
-        float(beyond.max()),
-        None if paired is None else float(paired.max()),
-        int(at[-1]),
-        worst[1][at[:-1]] * width * posterior.data.scale + posterior.data.shift,
-        tasks[rows[int(badness.argmax())]],
+        largest(gaps, single, some),
+        largest(beyond, single, scaled),
+        None if pairs is None else largest(pairs, list(combinations(range(len(width)), 2)), some),
+        tasks[rows[int(far.argmax())]],
         np.maximum(gaps.max(axis=(0, 1)), beyond.max(axis=(0, 1))) * width * posterior.data.scale,
         len(rows),
     )
 
 
 def _visited(planner: LoopPlanner, posterior: DynamicsPosterior, planned: Sequence[PlannedTasks]) -> tuple[Array, Rows]:
-    """Return the standardised pairs ``(q, H, k)`` on loops of the mean, and the rows of their tasks ``(q,)``."""
+    """Return the standardised pairs ``(q, H, k)`` on loops of the mean, and the rows of their tasks ``(q,)``.
+
+    The last pair of a task with a shorter horizon is repeated.
+    """
     parts = [
         posterior.data.standardised(loops.states[0][:, :-1], loops.inputs[0])
         for loops in planner.run(posterior.mean, planned)
     ]
-    visited = np.clip(np.nan_to_num(np.concatenate(parts)), -_FARTHEST, _FARTHEST)
-    return visited, np.concatenate([one.rows for one in planned])
+    horizon = max(part.shape[1] for part in parts)
+    longest = [np.pad(part, ((0, 0), (0, horizon - part.shape[1]), (0, 0)), mode="edge") for part in parts]
+    visited = np.nan_to_num(np.concatenate(longest), nan=_FARTHEST, posinf=_FARTHEST, neginf=-_FARTHEST)
+    return np.clip(visited, -_FARTHEST, _FARTHEST), np.concatenate([one.rows for one in planned])
 
 
 def _some(count: int, most: int) -> Rows:
@@ -113,11 +136,9 @@ def _nearest(recorded: Array, visited: Array) -> Array:
 
 
 def _pair_gaps(recorded: Array, visited: Array) -> Array | None:
-    """Return the largest gap over pairs of coordinates at each visited pair; None if there are too many coordinates."""
+    """Return the gap in each two coordinates at each visited pair; None if there are too many coordinates."""
     k = recorded.shape[1]
     if k > MOST_COORDINATES:
         return None
-    gaps = [
-        cKDTree(recorded[:, list(two)]).query(visited[..., list(two)], p=np.inf)[0] for two in combinations(range(k), 2)
-    ]
-    return np.asarray(np.max(gaps, axis=0))
+    trees = {two: cKDTree(recorded[:, list(two)]) for two in combinations(range(k), 2)}
+    return np.stack([tree.query(visited[..., list(two)], p=np.inf)[0] for two, tree in trees.items()], axis=-1)

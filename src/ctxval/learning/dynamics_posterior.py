@@ -168,7 +168,7 @@ class DynamicsPosterior:
     """The posterior of the dynamics of S, given recorded transitions.
 
     Attributes:
-        model: the model to which residuals are added: M, or the identity if the steps of S are smoother without M.
+        model: the model to which residuals are added.
         data: the standardised residuals.
         components: posteriors of the learned states, one for each draw of the hyperparameters; the first one has the
             most probable hyperparameters.
@@ -185,22 +185,26 @@ class DynamicsPosterior:
         """The model M plus the posterior mean of r for the most probable hyperparameters, as one draw."""
         return DynamicsDraws(self.model, self.data, (self.components[0].mean,), (0.0,))
 
-    def draw(self, relevant: Array, rng: np.random.Generator) -> DynamicsDraws:
+    def draw(self, relevant: Array, rng: np.random.Generator, functions: int | None = None) -> DynamicsDraws:
         """Return draws of the dynamics.
 
         Args:
             relevant: standardised pairs ``(R, k)`` that closed loops visit.
             rng: the source of the draws.
+            functions: number of functions for each draw of the hyperparameters; that of the settings if None.
         """
-        settings = self.settings
+        count = self.settings.functions if functions is None else functions
         with single_threaded():
-            drawn = [one.draw(relevant, settings.functions, settings.pivots, rng) for one in self.components]
+            drawn = [one.draw(relevant, count, self.settings.pivots, rng) for one in self.components]
         return DynamicsDraws(self.model, self.data, *(tuple(part) for part in zip(*drawn, strict=True)))
 
     @property
     def noise(self) -> float:
-        """The largest learned variance of noise, as a share of the mean square of a state's residual."""
-        return float(max((self.components[0].noise ** 2).max(), 0.0))
+        """The learned variance of noise, as a share of the mean square of a state's residual.
+
+        It is the median over the draws of the hyperparameters, of the state in which it is largest.
+        """
+        return float(np.median([(one.noise**2).max() for one in self.components]))
 
     def __repr__(self) -> str:
         return call(self, self.model, components=len(self.components), data=self.data)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.boxes import moves_to_bounds
 from ctxval._util.representation import call
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
@@ -19,6 +20,10 @@ from ctxval.learning.execution_prediction import ExecutionPrediction, predict_ex
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings, loop_pairs
 
+_PROBED = 8
+"""Number of tasks at which each task parameter is moved, to see whether it changes the closed loops of M."""
+_WEAK = 0.02
+"""A change of the loops by less than this many standard deviations of states and inputs is no change."""
 _PAIRS = 300
 """Largest number of pairs from which the pivots of a single task are chosen."""
 
@@ -36,12 +41,38 @@ class DynamicsStudy:
     def __init__(self, validation: Validation, seed: int = 0) -> None:
         self.validation, self.seed = validation, seed
         self.planner = LoopPlanner(validation)
-        self.search = WorstCaseSearch(self.planner, seed, WorstCaseSettings.for_dimension(validation.space.dimension))
+        batched = bool(getattr(validation.synthesizer, "batched", False))
+        settings = WorstCaseSettings.for_dimension(validation.space.dimension, batched)
+        self.search = WorstCaseSearch(self.planner, seed, settings)
 
     @functools.cached_property
     def _loops(self) -> Trajectory | None:
         with single_threaded():
             return closed_loops_on_model(self.validation)
+
+    @functools.cached_property
+    def unseen_parameters(self) -> tuple[int, ...]:
+        """The indices of the task parameters that hardly change the closed loops of M.
+
+        What they change in the system, such as a payload, is no function of state and input.
+        """
+        d = self.validation.space.dimension
+        some = self.search.pool[:_PROBED]
+        ends = moves_to_bounds(some, np.zeros(d), np.ones(d)).reshape(-1, d)
+        loops: dict[int, Array] = {}
+        for one in self.planner.plan(ends):
+            promised = np.concatenate([one.promised.states[..., :-1, :], one.promised.inputs], axis=-1)
+            loops.update(zip(one.rows.tolist(), promised.reshape(len(one.rows), *promised.shape[-2:]), strict=True))
+        if not loops:
+            return ()
+        size = np.maximum(np.nanstd(np.concatenate(list(loops.values())), axis=0), 1e-12)
+        effects = np.zeros(d)
+        for first in range(0, len(ends), 2 * d):
+            for j in range(d):
+                low, high = loops.get(first + j), loops.get(first + d + j)
+                if low is not None and high is not None and low.shape == high.shape:
+                    effects[j] = max(effects[j], float(np.nanmax(np.abs(high - low) / size)))
+        return tuple(np.flatnonzero(effects < _WEAK).tolist())
 
     def learn(self, executed: Sequence[tuple[Array, Trajectory]]) -> LearnedDynamics | None:
         """Return what executions teach.
@@ -82,10 +113,34 @@ class LearnedDynamics:
     posterior: DynamicsPosterior
     executed: Array
 
-    @functools.cached_property
+    _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
+
+    @property
     def worst_case(self) -> WorstCase:
-        """The largest distance over all tasks, for each draw of the dynamics."""
-        return self.study.search.maxima(self.posterior, self.executed, self._rng(1))
+        """The largest distance over all tasks, for each of the usual number of draws."""
+        return self.worst_case_of(self.posterior.settings.functions * len(self.posterior.components))
+
+    def worst_case_of(self, draws: int) -> WorstCase:
+        """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
+        functions = max(self.posterior.settings.functions, -(-draws // len(self.posterior.components)))
+        if functions not in self._worst_cases:
+            found = self.study.search.maxima(self.posterior, self.executed, self._rng(1), functions)
+            self._worst_cases[functions] = found
+        return self._worst_cases[functions]
+
+    @property
+    def untried_parameter(self) -> tuple[int, float, Array] | None:
+        """A parameter that M's loops do not depend on, its largest gap between executions, and a task in the gap.
+
+        The gap is a share of the parameter's range; None if there is no such parameter.
+        """
+        gaps = [(j, *_widest_gap(self.executed[:, j])) for j in self.study.unseen_parameters]
+        if not gaps:
+            return None
+        j, gap, value = max(gaps, key=lambda one: one[1])
+        task = self.coverage.task.copy()
+        task[j] = value
+        return j, gap, task
 
     @functools.cached_property
     def coverage(self) -> Coverage:
@@ -109,3 +164,14 @@ class LearnedDynamics:
 
     def __repr__(self) -> str:
         return call(self, self.posterior, executed=len(self.executed))
+
+
+def _widest_gap(values: Array) -> tuple[float, float]:
+    """Return the largest distance from a number in [0, 1] to the nearest value, and that number."""
+    ordered = np.sort(values)
+    if not len(ordered):
+        return 1.0, 0.5
+    middles = 0.5 * (ordered[1:] + ordered[:-1])
+    places = np.concatenate([[0.0], middles, [1.0]])
+    gaps = np.concatenate([[ordered[0]], 0.5 * np.diff(ordered), [1 - ordered[-1]]])
+    return float(gaps.max()), float(places[gaps.argmax()])

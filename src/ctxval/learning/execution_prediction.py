@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -74,7 +75,7 @@ class ExecutionPrediction:
     def from_json(cls, values: Mapping[str, Any]) -> Self | None:
         """Return the prediction that :meth:`to_json` returned; None if these are not its values."""
         try:
-            return cls(
+            found = cls(
                 int(values["learned_from"]),
                 tuple(np.inf if one is None else float(one) for one in values["quantiles"]),
                 float(values["deviation"]),
@@ -85,6 +86,14 @@ class ExecutionPrediction:
             )
         except (KeyError, TypeError, ValueError):
             return None
+        return found if found._is_consistent else None
+
+    @property
+    def _is_consistent(self) -> bool:
+        widths = {len(row) for row in (*self.states, *self.deviations)}
+        lengths = {len(self.steps), len(self.states), len(self.deviations)}
+        ordered = all(one <= other for one, other in pairwise(self.quantiles))
+        return len(self.quantiles) == len(_QUANTILES) and ordered and len(lengths) == len(widths) == 1
 
     def score(self, executed: Trajectory, distance: float) -> PredictionScore | None:
         """Return how an execution agrees with the prediction; None if they do not fit together.
@@ -146,7 +155,7 @@ def predict_execution(
     steps = np.unique(np.linspace(1, horizon, min(horizon, _STEPS)).astype(int))
     states, distances = found[0].states[:, 0][:, steps], found[0].distances[:, 0]
     size = max(float(np.nanmedian(np.abs(states))), 1e-9)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(all="ignore"):
         kept = np.isfinite(distances) & (np.abs(states) < _DIVERGED * size).all(axis=(1, 2))
     good, values = (states[kept], distances[kept]) if kept.any() else (np.zeros_like(states), np.zeros(len(states)))
     return ExecutionPrediction(

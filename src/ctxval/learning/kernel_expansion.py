@@ -71,7 +71,8 @@ class KernelExpansion:
         r += 1
         decay *= r
         if kernel.growth:
-            growth = z[..., -kernel.inputs :] @ (kernel.growth * self.centres[:, -kernel.inputs :].T)
+            first = z.shape[-1] - kernel.inputs
+            growth = z[..., first:] @ (kernel.growth * self.centres[:, first:].T)
             growth += 1
             decay *= growth
         return np.asarray(decay)

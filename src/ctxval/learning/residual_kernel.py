@@ -41,7 +41,7 @@ class ResidualKernel:
 
     def diagonal(self, theta: Array, X: Array) -> Array:
         """Return the variances k(z, z), shape ``(n,)``."""
-        grown = 1 + self.growth * (X[:, -self.inputs :] ** 2).sum(axis=1)
+        grown = 1 + self.growth * (self._inputs(X) ** 2).sum(axis=1)
         return np.asarray(grown + _LINEAR.diagonal(theta[-2:], X))
 
     def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
@@ -53,7 +53,11 @@ class ResidualKernel:
         return Matern(self.nu, ard=True)(self._unit(theta), X, Z)
 
     def _grown(self, X: Array, Z: Array) -> Array:
-        return np.asarray(1 + self.growth * (X[:, -self.inputs :] @ Z[:, -self.inputs :].T))
+        return np.asarray(1 + self.growth * (self._inputs(X) @ self._inputs(Z).T))
+
+    def _inputs(self, Z: Array) -> Array:
+        """Return the columns of the inputs; a system may have none."""
+        return Z[:, Z.shape[1] - self.inputs :]
 
     @staticmethod
     def _unit(theta: Array) -> Array:

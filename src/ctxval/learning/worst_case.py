@@ -50,6 +50,7 @@ class WorstCaseSettings:
         elites: largest number of tasks from the global search that are run on all draws.
         shared: number of random tasks of the pool that are run on all draws.
         moves: number of random moves in each round of the search on each draw.
+        rounds: number of these rounds, at most 4.
         relevant: number of state-input pairs, on the loops of elites and of random tasks, from which pivots are chosen.
     """
 
@@ -58,11 +59,19 @@ class WorstCaseSettings:
     elites: int = 24
     shared: int = 64
     moves: int = 10
+    rounds: int = 4
     relevant: int = 700
 
     @classmethod
-    def for_dimension(cls, dimension: int) -> WorstCaseSettings:
-        """Return settings with as many tasks as a search of so many task parameters needs."""
+    def for_dimension(cls, dimension: int, batched: bool = True) -> WorstCaseSettings:
+        """Return settings with as many tasks as a search of so many task parameters needs.
+
+        Args:
+            dimension: the number of task parameters.
+            batched: whether controllers are designed in batches; if not, there are far fewer tasks.
+        """
+        if not batched:
+            return cls(pool=48, evaluations=240, elites=6, shared=12, moves=2, rounds=0)
         evaluations = _EVALUATIONS[min(dimension, len(_EVALUATIONS)) - 1]
         return cls(pool=min(1024, evaluations // 4), evaluations=evaluations)
 
@@ -78,6 +87,7 @@ class WorstCase:
         elites: tasks with large distances on the posterior mean, points ``(e, d)``, the largest first.
         evaluations: number of closed loops that were run.
         left_out: largest share of the posterior variance that a draw leaves out between its pivots.
+        unplanned: share of the pool's tasks for which no controller can be designed, or on which M diverges.
     """
 
     maxima: Array
@@ -86,6 +96,7 @@ class WorstCase:
     elites: Array
     evaluations: int
     left_out: float
+    unplanned: float
 
     def __repr__(self) -> str:
         return call(self, draws=len(self.maxima), of_mean=self.of_mean, evaluations=self.evaluations)
@@ -124,18 +135,26 @@ class WorstCaseSearch:
         """The plans of the pool."""
         return self.planner.plan(self.pool)
 
-    def maxima(self, posterior: DynamicsPosterior, known: Array, rng: np.random.Generator) -> WorstCase:
+    @functools.cached_property
+    def _unplanned(self) -> float:
+        planned = sum(int(np.sum(one.promised.finite)) for one in self.plans)
+        return 1 - planned / len(self.pool)
+
+    def maxima(
+        self, posterior: DynamicsPosterior, known: Array, rng: np.random.Generator, functions: int | None = None
+    ) -> WorstCase:
         """Return the largest distances of draws from a posterior.
 
         Args:
             posterior: the posterior of the dynamics.
             known: tasks to look at in any case, such as those of earlier maxima, points ``(k, d)``.
             rng: the source of the draws and of the moves.
+            functions: number of functions for each draw of the hyperparameters; that of the settings if None.
         """
         with single_threaded():
             of_mean, elites, evaluations = self._search_mean(posterior.mean, known, rng)
             tasks = np.concatenate([elites, known, self.pool[rng.permutation(len(self.pool))[: self.settings.shared]]])
-            draws = posterior.draw(self._relevant(posterior, tasks, rng), rng)
+            draws = posterior.draw(self._relevant(posterior, tasks, rng), rng, functions)
             points, maxima, more = self._search_draws(draws, tasks, rng)
         return WorstCase(
             np.where(maxima >= _DIVERGED, np.inf, maxima),
@@ -144,6 +163,7 @@ class WorstCaseSearch:
             elites,
             evaluations + len(draws) * more,
             max(draws.left_out),
+            self._unplanned,
         )
 
     def _search_mean(self, mean: DynamicsDraws, known: Array, rng: np.random.Generator) -> tuple[float, Array, int]:
@@ -173,7 +193,7 @@ class WorstCaseSearch:
         order = np.argsort(-values, axis=1, kind="stable")
         best, points = np.take_along_axis(values, order[:, :1], 1)[:, 0], tasks[order[:, 0]]
         second, loops = _others(tasks, order), len(tasks)
-        for round_, share in enumerate(_SHARES):
+        for round_, share in enumerate(_SHARES[: self.settings.rounds]):
             if round_ == _EXCHANGED:
                 points, best, more = self._exchanged(draws, points, best)
                 loops += more
@@ -205,10 +225,11 @@ class WorstCaseSearch:
 
 def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Array:
     """Return the standardised pairs ``(N, k)`` that the mean's closed loops on tasks visit, without those far away."""
-    parts = []
+    parts = [np.empty((0, posterior.data.pairs.shape[1]))]
     for loops in planner.run(posterior.mean, planner.plan(tasks)):
-        parts.append(posterior.data.standardised(loops.states[..., :-1, :], loops.inputs))
-    pairs = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
+        visited = posterior.data.standardised(loops.states[..., :-1, :], loops.inputs)
+        parts.append(visited.reshape(-1, visited.shape[-1]))
+    pairs = np.concatenate(parts)
     return np.asarray(pairs[(np.abs(pairs) < _FARTHEST).all(axis=1)])
 
 
