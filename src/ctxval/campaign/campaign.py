@@ -262,7 +262,9 @@ class Campaign(CampaignResults):
         """
         if because is not None and (parameters is None or not because.strip()):
             raise InputError('because needs the parameters of an earlier task and a reason, such as "fuse replaced".')
-        with self.store.sole_writer(wait):
+        # An operator's time is worth a prediction: it is stored, and the execution tests it.
+        predicts = self._recorder.search.uses_prediction
+        with self.store.sole_writer(wait), self._recorder.predicting(predicts):
             self._recorder.refresh()
             if parameters is not None:
                 return self._recorder.open(Choice(self._unit_point(parameters), "manual", because))

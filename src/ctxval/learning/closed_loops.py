@@ -67,8 +67,20 @@ class LoopPlanner:
 
     def __init__(self, validation: Validation) -> None:
         self.validation = validation
-        self._batched = bool(getattr(validation.synthesizer, "batched", False))
         self._together: bool | None = None
+
+    @functools.cached_property
+    def batched(self) -> bool:
+        """Whether the task function and the synthesizer take several tasks in one call."""
+        if not getattr(self.validation.synthesizer, "batched", False):
+            return False
+        middle = np.full(self.validation.space.dimension, 0.5)
+        for spread in (0.0, 0.25, 0.5):
+            points = np.stack([middle - spread, middle, middle + spread])
+            with contextlib.suppress(Exception):  # the user's own parts, on tasks that may never be executed
+                self._plan(points, np.arange(3))
+                return True
+        return False
 
     def plan(self, points: Array, together: int = _TASKS) -> list[PlannedTasks]:
         """Return the plans of points ``(q, d)``; tasks for which no controller can be designed are left out.
@@ -77,20 +89,20 @@ class LoopPlanner:
             points: points of the unit cube.
             together: largest number of tasks that are planned in one call, if the synthesizer takes batches.
         """
-        size = together if self._batched else 1
+        size = together if self.batched else 1
         rows = np.arange(len(points))
         return [one for first in range(0, len(points), size) for one in self._planned(points, rows[first:][:size])]
 
     def _planned(self, points: Array, rows: Rows) -> Iterator[PlannedTasks]:
         """Yield the plans of some rows. A batch that fails is halved; one task is then planned without batch axis."""
         try:
-            yield self._plan(points[rows] if self._batched else points[rows[0]], rows)
+            yield self._plan(points[rows] if self.batched else points[rows[0]], rows)
         except Exception:  # the user's own parts, on tasks that may never be executed
             if len(rows) > 1:
                 half = len(rows) // 2
                 yield from self._planned(points, rows[:half])
                 yield from self._planned(points, rows[half:])
-            elif self._batched:
+            elif self.batched:
                 yield from self._alone(points[rows[0]], rows)
 
     def _alone(self, point: Array, rows: Rows) -> Iterator[PlannedTasks]:

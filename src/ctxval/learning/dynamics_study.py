@@ -41,8 +41,7 @@ class DynamicsStudy:
     def __init__(self, validation: Validation, seed: int = 0) -> None:
         self.validation, self.seed = validation, seed
         self.planner = LoopPlanner(validation)
-        batched = bool(getattr(validation.synthesizer, "batched", False))
-        settings = WorstCaseSettings.for_dimension(validation.space.dimension, batched)
+        settings = WorstCaseSettings.for_dimension(validation.space.dimension, self.planner.batched)
         self.search = WorstCaseSearch(self.planner, seed, settings)
 
     @functools.cached_property
