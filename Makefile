@@ -13,7 +13,7 @@ demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
 
 test: check
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto
 
 quick: .venv/.test  ## everything that takes less than half a second, on all cores, for daily work
 	$(BIN)/python -m pytest -q -m "not slow" --numprocesses auto

@@ -19,6 +19,7 @@ from ctxval.certificates import (
     Mean,
     Sample,
     StateInputCoverage,
+    StateInputGap,
     certify_anytime,
     certify_audit,
     certify_convergence,
@@ -85,9 +86,9 @@ def keys(report: Any) -> set[str]:
 
 
 def evidence() -> DynamicsEvidence:
-    place = {"x[0]": 0.0, "u[0]": 1.0}
-    coverage = StateInputCoverage(0.1, 0.0, 0.2, "x[0]", place, place, np.zeros(1), 9)
-    checked = tuple(CheckedPrediction(k, 1.0, 0.5, 2.0, 2.0, stored=True) for k in range(3))
+    gap = StateInputGap(0.01, ("x[0]",), {"x[0]": 0.0, "u[0]": 1.0})
+    coverage = StateInputCoverage(gap, gap, gap, gap.place, np.zeros(1), 9)
+    checked = tuple(CheckedPrediction(k, 0.5, 2.0, 2.1, 2.0) for k in range(3))
     return DynamicsEvidence(
         np.linspace(2, 3, 40), np.zeros((40, 1)), 2.5, np.zeros((2, 1)), 99, 8, 0, 0, checked, coverage
     )

@@ -10,7 +10,11 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PRINTED = {
-    "1_first_verdict": ["12 executions of the cart", "falsified: trial", "validated: the posterior bound"],
+    "1_first_verdict": [
+        "12 executions of the cart",
+        "falsified: trial",
+        "validated: by a prior on the dynamics",
+    ],
     "2_resume_and_inspect": ["Tuesday: 6 executions are stored.", "Tuesday: 15 executions", "The worst task"],
     "3_hardware_by_hand": [
         "Trial 0: load 2.00 kg, go to 1.00 m ... failed: the fuse has blown.",

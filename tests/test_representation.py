@@ -195,10 +195,10 @@ def evidence() -> certificates.DynamicsEvidence:
 
 
 RECORDED = Transitions(DATA.x, DATA.u, nonlinear(DATA.x, DATA.u))
-CHECKED = certificates.CheckedPrediction(3, 1.0, 0.5, 0.52, 0.5, stored=True)
-COVERED = certificates.StateInputCoverage(
-    0.1, 0.01, 0.2, "u[0]", {"x[0]": 1.0, "u[0]": 3.0}, {"x[0]": 0.1, "u[0]": 0.2}, np.zeros(2), 1024
-)
+CHECKED = certificates.CheckedPrediction(3, 0.5, 0.52, 0.53, 0.5)
+LEARNED_GAP = learning.coverage.Gap(0.1, (1,), np.zeros(8))
+GAP = certificates.StateInputGap(0.1, ("u[0]",), {"x[0]": 1.0, "u[0]": 3.0})
+COVERED = certificates.StateInputCoverage(GAP, GAP, None, {"x[0]": 0.1, "u[0]": 0.2}, np.zeros(2), 1024)
 BY_POSTERIOR = certificates.CertificateOptions.posterior()
 
 EXAMPLES: dict[str, Callable[[], object]] = {
@@ -263,7 +263,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "distances.MeanDeviation": distances.MeanDeviation,
     "distances.WholeTrajectory": distances.WholeTrajectory,
     "learning.CorrectedModel": lambda: learning.CorrectedModel(LINEAR, residual()),
-    "learning.Coverage": lambda: learning.Coverage(0.1, 0.02, None, 7, np.zeros(8), np.zeros(11), np.ones(8), 1024),
+    "learning.Coverage": lambda: learning.Coverage(LEARNED_GAP, LEARNED_GAP, None, np.zeros(11), np.ones(8), 1024),
     "learning.DynamicsDraws": lambda: learned().posterior.mean,
     "learning.DynamicsPosterior": lambda: learned().posterior,
     "learning.DynamicsStudy": lambda: learned().study,
@@ -287,6 +287,8 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.SamplingDiscarding": lambda: certificates.SamplingDiscarding(2),
     "certificates.Scenario": certificates.Scenario,
     "certificates.StateInputCoverage": lambda: COVERED,
+    "certificates.StateInputGap": lambda: GAP,
+    "certificates.UntriedParameter": lambda: certificates.UntriedParameter("load", 0.4, np.zeros(2)),
     "certificates.StoppingDecision": lambda: certificates.StoppingDecision(next_point=np.zeros(3)),
     "certificates.StoppingRule": lambda: certificates.StoppingRule(0.5, BY_POSTERIOR),
     "certificates.Diagnosis": diagnosis,

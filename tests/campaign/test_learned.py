@@ -8,7 +8,6 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, searches
 from ctxval.campaign.history import predict_from
-from ctxval.campaign.learned import LearnedFromTrials
 from ctxval.certificates import LearnedDistance, Sample, require_learned
 from ctxval.errors import CertificateError
 
@@ -18,7 +17,8 @@ POINTS = np.linspace(0.05, 0.95, 7)[:, None]
 @pytest.mark.slow
 def test_only_earlier_trials_are_learned_from() -> None:
     campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(8)
-    learned = LearnedFromTrials(campaign.validation, campaign.store, campaign.trials)
+    learned = campaign.provenance.learned
+    assert learned is not None
     assert isinstance(learned, LearnedDistance)
     expected = predict_from(campaign.validation, campaign.store, campaign.trials[:4])
     assert expected is not None

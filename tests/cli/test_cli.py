@@ -375,11 +375,11 @@ def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: 
         ),
         (
             ["--kind", "audit", "--stochastic"],
-            "stochastic is for certificates of the kind posterior; the kind here is audit",
+            "stochastic is for certificates of the kind auto or dynamics or posterior; the kind here is audit",
         ),
         (
             ["--audit", "5", "--resolution", "1"],
-            "resolution is for certificates of the kind posterior; the kind here is audit",
+            "resolution is for certificates of the kind auto or posterior; the kind here is audit",
         ),
         (["--kind", "scenario", "--theorem", "1,2,3,4,5"], "theorem is for certificates of the kind convergence"),
         (

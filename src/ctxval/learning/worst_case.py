@@ -13,7 +13,6 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import qmc
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.boxes import moves_to_bounds, separated_rows
@@ -125,6 +124,8 @@ class WorstCaseSearch:
     def pool(self) -> Array:
         """Tasks that are spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``."""
         rng = np.random.default_rng([self._seed, 0])
+        from scipy.stats import qmc  # imported here, because it is slow to load
+
         points = qmc.Sobol(self.dimension, rng=rng).random(self.settings.pool)
         ends = rng.random(points.shape) < rng.random((len(points), 1))
         ends[::2] = False
