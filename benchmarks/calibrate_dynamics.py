@@ -116,9 +116,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("groups", nargs="*", default=["reporting", "paper", "development"], help=", ".join(GROUPS))
     parser.add_argument("--seeds", type=int, default=SEEDS)
+    parser.add_argument("--shares", nargs="*", type=float, default=[*FALSE, *TRUE], help="thresholds, as shares of d*")
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    for result in all_of(decide, missing(arguments.groups, arguments.seeds), arguments.workers):
+    runs = [one for one in missing(arguments.groups, arguments.seeds) if one.share in arguments.shares]
+    for result in all_of(decide, runs, arguments.workers):
         STORED.append(result)
         print(*(result[key] for key in ("entry", "seed", "share", "answer", "executions", "seconds")), flush=True)
 
