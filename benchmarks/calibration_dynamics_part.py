@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibrate_dynamics import BUDGETS, FALSE, GROUPS, RULE, STORED, TRUE
+from calibrate_dynamics import BUDGETS, FALSE, GROUPS, RULE, STORED, TRUE, wanted
 from calibration_verdicts_part import false_of, table
 from ctxval.certificates import dynamics as rule
 
@@ -22,6 +22,8 @@ upper limit of this share with confidence 97.5 %. The kind may say `validated` a
 false, with a limit of at most 7.5 %.
 
 ### Reporting systems
+
+{run} of {planned} planned campaigns have been run.
 
 At 0.95 d*: {at_95}. At 0.99 d*: {at_99}. Of the misleading systems at 0.95 d*: {misleading_95}.
 
@@ -62,6 +64,8 @@ def by_dynamics() -> str:
     return TEXT.format(
         budget=BUDGETS["reporting"],
         budget_paper=BUDGETS["paper"],
+        run=len(reported),
+        planned=len(list(wanted("reporting"))),
         accurate=rule.ACCURATE,
         predictions=rule.PREDICTIONS,
         gap=rule.GAP,
