@@ -1,7 +1,4 @@
-"""Iterative LQR (Li and Todorov 2004; regularisation and line search after Tassa, Erez and Todorov 2012).
-
-Input limits after control-limited differential dynamic programming (Tassa, Mansard and Todorov 2014).
-"""
+"""Iterative LQR (Li and Todorov 2004; regularisation and line search after Tassa, Erez and Todorov 2012)."""
 
 from __future__ import annotations
 
@@ -13,26 +10,23 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
 from ctxval._util.registry import part
 from ctxval._util.representation import call, record
+from ctxval.controllers.backward_pass import Expansion, Policy, minimise
 from ctxval.controllers.cost import QuadraticCost
-from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
+from ctxval.core.controller import AffineFeedback, Limits, LimitsLike, fed_back
 from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task
 from ctxval.errors import DesignError, InputError
 
 _STEP_LENGTHS = 0.5 ** np.arange(12)
 """Step lengths of the line search, the longest first."""
+_TOGETHER = 256
+"""Number of loops on the model up to which one more costs little, so that several step lengths are tried at once."""
 _SUFFICIENT_DECREASE = 1e-4
 """Share of the expected decrease of the cost that a step must reach."""
 _DAMPING_MIN = 1e-6
 """Smallest damping that is not zero."""
 _DAMPING_MAX = 1e10
 """Damping above which the iteration of a task stops, because no step improves its cost."""
-_NEWTON_STEPS = 50
-"""Largest number of projected Newton steps for inputs with limits."""
-_NEWTON_DECREASE = 0.1
-"""Share of its linear decrease that a projected Newton step must reach."""
-_NEWTON_SETTLED = 1e-26
-"""Share of the largest decrease so far at which projected Newton steps have converged."""
 _ROUNDING = 1e12
 """Largest ratio of the old cost to the new one in one step; beyond it rounding errors call for another step.
 
@@ -147,14 +141,20 @@ class _Descent:
         self.U = self._clipped(np.zeros((task.horizon, batch, m)))
         self.X = np.empty((task.horizon + 1, batch, n))
         self.X[0] = task.initial_state.reshape(-1, n)
-        self.K = np.zeros((task.horizon, batch, m, n))
-        self.X, self.U, self.J = self._forward(np.arange(batch), _Policy(self.K, self.U), np.zeros(batch))
+        for t in range(task.horizon):
+            self.X[t + 1] = model.step(self.X[t], self.U[t])
+        self.J = self._costs(np.arange(batch), self.X, self.U)
         if not np.isfinite(self.J).all():
             raise DesignError("iLQR cannot start: the model diverges under zero input within the horizon.")
+        self.K = np.zeros((task.horizon, batch, m, n))
         self.damping = np.zeros(batch)
         self.refused = np.zeros(batch, dtype=bool)  # the line search has failed at the present iterate
+        self.shortened = np.zeros(batch, dtype=bool)  # the last step was not the full one
         self.iterations = np.zeros(batch, dtype=int)
         self.converged = np.zeros(batch, dtype=bool)
+        # Steps of a plain function cost as much in a batch as one by one, so step lengths are not tried together.
+        self.together = _TOGETHER if getattr(model, "vectorized", True) else 0
+        self.linearised: tuple[Rows, Array, Array] | None = None
 
     def active_rows(self) -> Rows:
         """Return the tasks whose iteration continues."""
@@ -163,90 +163,95 @@ class _Descent:
 
     def advance(self, rows: Rows) -> None:
         """Take one step for these tasks, or mark them as converged."""
-        A, B = linearize(self.model, self.X[:-1, rows], self.U[:, rows])
-        policy, change = self._backward(rows, A, B)
+        X, U = self.X[:, rows], self.U[:, rows]
+        A, B = self._linearised(rows, X, U)
+        around = Expansion(X - self.reference[:, rows], U, A, B)
+        policy = minimise(self.cost, around, self.limits, self.damping[rows])
         self.K[:, rows] = policy.K if policy.K.ndim == 4 else policy.K[:, None]
-        gain = -change.at(np.ones(len(rows)))
+        gain = -policy.change.at(1.0)
         arrived = gain <= self.settings.tolerance * (np.abs(self.J[rows]) + self.settings.tolerance)
         # A damped step is always small, so only an undamped step may mark a task as converged.
         self.converged[rows] = arrived & (self.damping[rows] == 0)
         # If the line search has already refused the undamped step, no step improves the cost.
         self.damping[rows[arrived]] = np.where(self.refused[rows[arrived]], np.inf, 0.0)
         before = self.J[rows]
-        moved = self._line_search(rows, policy, change, ~arrived)
-        if A.ndim == 2 and B.ndim == 2 and self.limits is None:
+        moved = self._line_search(rows, policy, np.flatnonzero(~arrived))
+        if around.linear and self.limits is None:
             # The model is linear, so the step was the exact minimiser, and its gains hold everywhere. If the cost was
             # far larger before, as on an unstable model, rounding errors call for another step.
             self.converged[rows[moved]] = (before <= _ROUNDING * self.J[rows])[moved]
 
-    def _backward(self, rows: Rows, A: Array, B: Array) -> tuple[_Policy, _Change]:
-        """Minimise the quadratic expansion of the cost-to-go ``v'dx + 1/2 dx'V dx``, from the horizon to the start."""
-        deviations = self.X[:, rows] - self.reference[:, rows]
-        inputs = self.U[:, rows]
-        damping = self.damping[rows]
-        ridge = damping[:, None, None] * np.eye(inputs.shape[-1]) if damping.any() else 0.0
-        v, V = deviations[-1] @ self.cost.Q_final, self.cost.Q_final
-        slope, curvature = np.zeros(len(rows)), np.zeros(len(rows))
-        gains, feedforward = [], []
-        for t in reversed(range(len(inputs))):
-            A_t, B_t = A if A.ndim == 2 else A[t], B if B.ndim == 2 else B[t]
-            VA, VB = V @ A_t, V @ B_t
-            Q_x, Q_u = deviations[t] @ self.cost.Q + _times(v, A_t), inputs[t] @ self.cost.R + _times(v, B_t)
-            Q_ux, Q_uu = _T(B_t) @ VA, self.cost.R + _T(B_t) @ VB
-            if self.limits is None:
-                inverse = np.linalg.inv(Q_uu + ridge)
-                K, k = -inverse @ Q_ux, -_times(Q_u, inverse)
-            else:
-                box = self.limits.low - inputs[t], self.limits.high - inputs[t]
-                K, k = _within(box, Q_uu + ridge, Q_u, Q_ux)
-            Q_uu_k = _times(k, Q_uu)
-            slope += (k * Q_u).sum(axis=-1)
-            curvature += (k * Q_uu_k).sum(axis=-1)
-            v = Q_x + _times(Q_uu_k + Q_u, K) + _times(k, Q_ux)
-            V = self.cost.Q + _T(A_t) @ VA + _T(K) @ (Q_uu @ K + Q_ux) + _T(Q_ux) @ K
-            V = 0.5 * (V + _T(V))
-            gains.append(K)
-            feedforward.append(k)
-        return _Policy(np.stack(gains[::-1]), np.stack(feedforward[::-1])), _Change(slope, curvature)
+    def _linearised(self, rows: Rows, X: Array, U: Array) -> tuple[Array, Array]:
+        """Return the derivatives along the iterates of these tasks; those of unchanged iterates are kept."""
+        if self.linearised is not None and self.refused[rows].all() and np.array_equal(self.linearised[0], rows):
+            return self.linearised[1:]
+        self.linearised = rows, *linearize(self.model, X[:-1], U)
+        return self.linearised[1:]
 
-    def _line_search(self, rows: Rows, policy: _Policy, change: _Change, wanted: Mask) -> Rows:
-        """Accept for each wanted task the longest step that lowers its cost; return the tasks with such a step."""
-        waiting = np.flatnonzero(wanted)
-        for length in _STEP_LENGTHS:
-            if not len(waiting):
-                break
-            lengths = np.full(len(waiting), length)
-            X, U, J = self._forward(rows[waiting], policy.of(waiting), lengths)
-            expected = change.at(length)[waiting]
-            accepted = self.J[rows[waiting]] - J >= -_SUFFICIENT_DECREASE * expected
-            self._accept(rows[waiting[accepted]], X[:, accepted], U[:, accepted], J[accepted])
-            waiting = waiting[~accepted]
-        failed = rows[waiting]
-        self.damping[failed] = np.maximum(_DAMPING_MIN, 10 * self.damping[failed])
-        self.refused[failed] = True
-        moved = wanted.copy()
-        moved[waiting] = False
-        return np.flatnonzero(moved)
+    def _line_search(self, rows: Rows, policy: Policy, waiting: Rows) -> Rows:
+        """Accept for each waiting task the longest step that lowers its cost; return the tasks with such a step.
 
-    def _accept(self, rows: Rows, X: Array, U: Array, J: Array) -> None:
-        self.X[:, rows], self.U[:, rows], self.J[rows] = X, U, J
-        self.iterations[rows] += 1
-        self.refused[rows] = False
-        self.damping[rows] = np.where(self.damping[rows] > _DAMPING_MIN, self.damping[rows] / 10, 0.0)
+        A task whose last step was the full one tries only this at first. Others try several lengths in one call.
+        """
+        moved, tried = [waiting[:0]], np.zeros(len(waiting), dtype=int)
+        while len(waiting):
+            several = self.shortened[rows[waiting]] | (tried > 0)
+            width = int(np.clip(self.together // max(1, several.sum()), 1, len(_STEP_LENGTHS)))
+            counts = np.minimum(np.where(several, width, 1), len(_STEP_LENGTHS) - tried)
+            accepted = self._try(rows, policy, waiting, tried, counts)
+            moved.append(waiting[accepted])
+            waiting, tried = waiting[~accepted], (tried + counts)[~accepted]
+            exhausted = tried == len(_STEP_LENGTHS)
+            self._refuse(rows[waiting[exhausted]])
+            waiting, tried = waiting[~exhausted], tried[~exhausted]
+        return np.concatenate(moved)
 
-    def _forward(self, rows: Rows, policy: _Policy, lengths: Array) -> tuple[Array, Array, Array]:
-        """Run the model under ``u = u_old + length * k + K (x - x_old)``; return states, inputs and costs."""
-        X_old, U_old = self.X[:, rows], self.U[:, rows]
-        X, U = np.empty_like(X_old), np.empty_like(U_old)
+    def _try(self, rows: Rows, policy: Policy, waiting: Rows, tried: Rows, counts: Rows) -> Mask:
+        """Try the next ``counts`` step lengths of each waiting task in one call; return which tasks have moved."""
+        of = np.repeat(np.arange(len(waiting)), counts)
+        index = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts - tried, counts)
+        lengths, tasks = _STEP_LENGTHS[index], waiting[of]
+        X, U, J = self._forward(rows[tasks], policy, tasks, lengths)
+        expected = lengths * policy.change.slope[tasks] + 0.5 * lengths**2 * policy.change.curvature[tasks]
+        good = np.flatnonzero(self.J[rows[tasks]] - J >= -_SUFFICIENT_DECREASE * expected)
+        moved, first = np.unique(of[good], return_index=True)
+        chosen, to = good[first], rows[waiting[moved]]
+        self.X[:, to], self.U[:, to], self.J[to] = X[:, chosen], U[:, chosen], J[chosen]
+        self.iterations[to] += 1
+        self.refused[to] = False
+        self.shortened[to] = index[chosen] > 0
+        self.damping[to] = np.where(self.damping[to] > _DAMPING_MIN, self.damping[to] / 10, 0.0)
+        return np.isin(np.arange(len(waiting)), moved)
+
+    def _refuse(self, rows: Rows) -> None:
+        """Damp the next step of tasks for which no step length lowers the cost."""
+        self.damping[rows] = np.maximum(_DAMPING_MIN, 10 * self.damping[rows])
+        self.refused[rows] = self.shortened[rows] = True
+
+    def _forward(self, rows: Rows, policy: Policy, tasks: Rows, lengths: Array) -> tuple[Array, Array, Array]:
+        """Run the model under ``u = u_old + length * k + K (x - x_old)``; return states, inputs and costs.
+
+        Args:
+            rows: the task of each loop, shape ``(L,)``.
+            policy: the step of the active tasks.
+            tasks: the place of each loop's task among the active tasks, shape ``(L,)``.
+            lengths: shape ``(L,)``.
+        """
+        X_old = self.X[:, rows]
+        U = self.U[:, rows] + lengths[:, None] * policy.k[:, tasks]
+        K = policy.K[:, tasks] if policy.K.ndim == 4 else policy.K
+        X = np.empty_like(X_old)
         X[0] = X_old[0]
         for t in range(len(U)):
-            U[t] = U_old[t] + lengths[:, None] * policy.k[t]
-            if lengths.any():
-                U[t] += _times(X[t] - X_old[t], _T(policy.K[t]))
+            U[t] += fed_back(K[t], X[t] - X_old[t])
             U[t] = self._clipped(U[t])
             X[t + 1] = self.model.step(X[t], U[t])
+        return X, U, self._costs(rows, X, U)
+
+    def _costs(self, rows: Rows, X: Array, U: Array) -> Array:
+        """Return the costs of the loops of these tasks; infinity if one is not finite."""
         J = self.cost.value(X - self.reference[:, rows], U)
-        return X, U, np.where(np.isfinite(J), J, np.inf)
+        return np.where(np.isfinite(J), J, np.inf)
 
     def _clipped(self, inputs: Array) -> Array:
         return inputs if self.limits is None else self.limits.clip(inputs)
@@ -265,66 +270,3 @@ class _Descent:
             self.iterations.reshape(batch_shape),
             self.converged.reshape(batch_shape),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _Policy:
-    """Gains K ``(H, N, m, n)``, or ``(H, m, n)`` if all tasks share them, and feedforward k ``(H, N, m)``."""
-
-    K: Array
-    k: Array
-
-    def of(self, rows: Rows) -> _Policy:
-        return _Policy(self.K if self.K.ndim == 3 else self.K[:, rows], self.k[:, rows])
-
-
-@dataclass(frozen=True, eq=False)
-class _Change:
-    """The expected change of the cost, ``length * slope + length^2 / 2 * curvature``."""
-
-    slope: Array
-    curvature: Array
-
-    def at(self, length: float | Array) -> Array:
-        return length * self.slope + 0.5 * length**2 * self.curvature
-
-
-def _within(box: tuple[Array, Array], Q_uu: Array, Q_u: Array, Q_ux: Array) -> tuple[Array, Array]:
-    """Minimise ``Q_u'k + 1/2 k'Q_uu k`` over ``low <= k <= high``; return the gains K ``(N, m, n)`` and k ``(N, m)``.
-
-    Projected Newton steps (Bertsekas 1982; Tassa, Mansard and Todorov 2014, Sec. III). Inputs at a limit have no gain.
-    """
-    (low, high), (N, m) = box, Q_u.shape
-    Q_uu, Q_ux = np.broadcast_to(Q_uu, (N, m, m)), np.broadcast_to(Q_ux, (N, *Q_ux.shape[-2:]))
-    k = np.zeros((N, m))  # within the box, as the inputs are
-    largest = 0.0
-    for _ in range(_NEWTON_STEPS):
-        slope = Q_u + _times(k, Q_uu)
-        free = ~(((k <= low) & (slope > 0)) | ((k >= high) & (slope < 0)))
-        inverse = np.linalg.inv(np.where(free[:, :, None] & free[:, None, :], Q_uu, np.eye(m)))
-        direction = -_times(np.where(free, slope, 0.0), inverse)
-        decrease = float(-np.where(free, slope * direction, 0.0).sum(axis=-1).min(initial=0.0))
-        largest = max(largest, decrease)
-        if decrease <= _NEWTON_SETTLED * largest:
-            break
-        k = _projected(k, direction, slope, Q_uu, box)
-    return -inverse @ np.where(free[:, :, None], Q_ux, 0.0), k
-
-
-def _projected(k: Array, direction: Array, slope: Array, Q_uu: Array, box: tuple[Array, Array]) -> Array:
-    """Return for each row the longest of several steps, projected onto the box, that lowers its value enough."""
-    moves = np.clip(k + _STEP_LENGTHS[:, None, None] * direction, *box) - k
-    linear = (moves * slope).sum(axis=-1)
-    change = linear + 0.5 * (moves * (moves[..., None, :] @ Q_uu)[..., 0, :]).sum(axis=-1)
-    enough = change <= _NEWTON_DECREASE * linear
-    chosen = moves[enough.argmax(axis=0), np.arange(len(k))]
-    return k + np.where(enough.any(axis=0)[:, None], chosen, 0.0)
-
-
-def _times(rows: Array, matrix: np.ndarray[Any, np.dtype[np.floating[Any]]]) -> Array:
-    """Return ``row' M`` for rows ``(N, a)`` and one matrix ``(a, b)`` or N of them."""
-    return np.asarray(rows @ matrix if matrix.ndim == 2 else (rows[:, None, :] @ matrix)[:, 0, :])
-
-
-def _T(matrix: Array) -> Array:
-    return np.swapaxes(matrix, -1, -2)

@@ -10,6 +10,7 @@ from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.controllers.cost import QuadraticCost
+from ctxval.controllers.riccati import LinearGains, linear_gains
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
 from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task
@@ -53,7 +54,11 @@ class LQR:
         A, B = linearize(model, x0, u0)
         _require_inputs(self.cost, B)
         offset = model.step(x0, u0) - (A @ x0[..., None])[..., 0]
-        gains, feedforward = _riccati(self.cost, A, B, offset, task.reference)
+        if A.ndim == 2 and B.ndim == 2:
+            known = linear_gains(self.cost, A, B, task.horizon)
+            gains, feedforward = known.gains, _feedforward(self.cost, known, B, offset, task.reference)
+        else:
+            gains, feedforward = _riccati(self.cost, A, B, offset, task.reference)
         return AffineFeedback(gains, feedforward, np.zeros_like(task.reference[..., :-1, :]), self.limits)
 
     def describe(self) -> dict[str, Any]:
@@ -164,3 +169,20 @@ def _riccati(cost: QuadraticCost, A: Array, B: Array, offset: Array, reference: 
         gains.append(K)
         feedforward.append(k)
     return np.stack(gains[::-1], axis=-3), np.stack(feedforward[::-1], axis=-2)
+
+
+def _feedforward(
+    cost: QuadraticCost, known: LinearGains, B: Array, offset: Array, reference: Array
+) -> Array:
+    """Return k_t ``(..., H, m)`` for gains that are known, with the slope p of the cost-to-go as in ``_riccati``."""
+    horizon, n = len(known.gains), len(B)
+    pulls = -np.moveaxis(reference, -2, 0).reshape(horizon + 1, -1, n)
+    pulls[:-1], pulls[-1] = pulls[:-1] @ cost.Q, pulls[-1] @ cost.Q_final
+    offsets = offset.reshape(-1, n) @ known.curvatures
+    slopes = np.empty_like(pulls[:-1])
+    p = pulls[-1]
+    for t in reversed(range(horizon)):
+        slopes[t] = p + offsets[t]
+        p = pulls[t] + slopes[t] @ known.closed[t]
+    k = -slopes @ (B @ known.inverses)
+    return np.moveaxis(k, 0, 1).reshape(*reference.shape[:-2], horizon, -1)

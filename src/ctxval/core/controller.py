@@ -169,6 +169,12 @@ def describe_limits(limits: float | Limits | None) -> Any:
     return [limits.low.tolist(), limits.high.tolist()]
 
 
+def fed_back(K: Array, deviations: Array) -> Array:
+    """Return ``K dx``, shape ``(..., m)``, for gains ``(m, n)``, or ``(..., m, n)``, and deviations ``(..., n)``."""
+    # One product of two matrices is far faster than many small ones.
+    return np.asarray(deviations @ K.T if K.ndim == 2 else np.einsum("...ij,...j->...i", K, deviations))
+
+
 @dataclass(frozen=True, eq=False)
 class AffineFeedback:
     """Time-varying affine feedback ``u = v_t + K_t (x - x_t)``, clipped to its limits if it has any.
@@ -188,7 +194,7 @@ class AffineFeedback:
     def __call__(self, t: int, x: Array) -> Array:
         """Return the input at step t, shape ``(..., m)``."""
         deviation = x - self.states[..., t, :]
-        u = self.inputs[..., t, :] + (self.gains[..., t, :, :] @ deviation[..., None])[..., 0]
+        u = self.inputs[..., t, :] + fed_back(self.gains[..., t, :, :], deviation)
         return u if self.limits is None else self.limits.clip(u)
 
     def __getitem__(self, index: int) -> AffineFeedback:
