@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -9,16 +10,26 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.registry import part
 from ctxval._util.representation import call, name_of
+from ctxval.core.model import central_differences
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
+from ctxval.models.regressors import smooth_map
+from ctxval.models.smooth_maps import SmoothMap, jacobian
+
+_BLOCK = 1024
+"""Number of rows in one call of a formula: enough to be fast, few enough for the cache."""
+_AGREEMENT = 1e-6
+"""Largest relative difference of a formula from what the regressor predicts."""
 
 
 @part()
 class ScikitLearn:
     """A fitted scikit-learn regressor as a model: a pipeline, a forest, ridge regression, a Gaussian process.
 
-    Its features are the state, then the input. Its Jacobian is taken by central differences, so the regressor must be
-    smooth for LQR and iLQR: a forest or nearest neighbours are piecewise constant, and their Jacobian is zero.
+    Its features are the state, then the input. Networks, Gaussian processes, kernel ridge regression, linear models,
+    and pipelines of these with scalers and polynomial features, have an exact Jacobian from their formula. All others
+    are differentiated by central differences. The regressor must be smooth for LQR and iLQR: a forest or nearest
+    neighbours are piecewise constant, and their Jacobian is zero.
 
     Args:
         regressor: the fitted regressor, whose ``predict`` maps features ``(N, n + m)`` to ``(N, n)``.
@@ -37,6 +48,7 @@ class ScikitLearn:
         if features is None or not callable(getattr(regressor, "predict", None)):
             raise InputError(f"the regressor must be fitted and have predict and n_features_in_, got {regressor!r}.")
         self.features = int(features)
+        self._known = _predicts_the_same(regressor, smooth_map(regressor), self.features)
 
     @classmethod
     def fit(cls, regressor: Any, data: Transitions, *, increments: bool = True) -> ScikitLearn:
@@ -66,13 +78,43 @@ class ScikitLearn:
                 f"the regressor was fitted on {self.features} features, got {n} states and {width - n} inputs."
             )
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        pairs = np.empty((*batch, width))
-        pairs[..., :n], pairs[..., n:] = x, u
-        output = np.asarray(self.regressor.predict(pairs.reshape(-1, width)), dtype=np.float64)
-        if output.shape not in ((int(np.prod(batch)), n), *([(int(np.prod(batch)),)] if n == 1 else [])):
+        output = self._predicted(_pairs(x, u))
+        if output.shape[1] != n:
             raise ShapeError(f"the regressor must predict as many states as it takes, {n}, got shape {output.shape}.")
         output = output.reshape(*batch, n)
         return x + output if self.increments else output
+
+    def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """Return A ``(..., n, n)`` and B ``(..., n, m)``, without batch axes if the model is linear."""
+        formula = self._formula()
+        if formula is None:
+            return central_differences(self.step, x, u)
+        n, batch = x.shape[-1], np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+        rows = _pairs(x, u)
+        if formula.constant:
+            rows, batch = np.zeros((1, self.features)), ()
+        whole = np.concatenate([jacobian(formula, block) for block in _blocks(rows)])
+        whole = whole.reshape(*batch, *whole.shape[1:])
+        A, B = whole[..., :n], whole[..., n:]
+        return (A + np.eye(n) if self.increments else A), B
+
+    def _predicted(self, rows: Array) -> Array:
+        """Return the outputs ``(N, n)`` for rows ``(N, n + m)``; NaN for rows that are not finite.
+
+        The formula gives what ``predict`` gives, without its checks, which take longer than the formula on few rows.
+        """
+        formula = self._formula()
+        if formula is not None:
+            return np.concatenate([formula.value(block) for block in _blocks(rows)])
+        finite = np.isfinite(rows).all(axis=-1)
+        if finite.all():
+            return _as_columns(self.regressor.predict(rows))
+        output = _as_columns(self.regressor.predict(np.where(finite[:, None], rows, 0.0)))
+        return np.where(finite[:, None], output, np.nan)
+
+    def _formula(self) -> SmoothMap | None:
+        # It is read again each time, because a regressor may be fitted again.
+        return smooth_map(self.regressor) if self._known else None
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this model in a store: its kind and its predictions at some points."""
@@ -88,3 +130,36 @@ class ScikitLearn:
         learned = None if self.data is None else len(self.data)
         regressor = name_of(type(self.regressor))
         return call(self, regressor, features=self.features, increments=self.increments, transitions=learned)
+
+
+def _pairs(x: Array, u: Array) -> Array:
+    """Return states and inputs side by side, shape ``(N, n + m)``."""
+    n = x.shape[-1]
+    pairs = np.empty((*np.broadcast_shapes(x.shape[:-1], u.shape[:-1]), n + u.shape[-1]))
+    pairs[..., :n], pairs[..., n:] = x, u
+    return pairs.reshape(-1, pairs.shape[-1])
+
+
+def _blocks(rows: Array) -> list[Array]:
+    return [rows[first : first + _BLOCK] for first in range(0, max(1, len(rows)), _BLOCK)]
+
+
+def _as_columns(output: Any) -> Array:
+    values = np.asarray(output, dtype=np.float64)
+    return values[:, None] if values.ndim == 1 else values
+
+
+def _predicts_the_same(regressor: Any, formula: SmoothMap | None, features: int) -> bool:
+    """Return whether a formula gives what the regressor predicts, at some points.
+
+    It guards against releases of scikit-learn with another meaning of the numbers.
+    """
+    if formula is None:
+        return False
+    rows = np.random.default_rng(0).normal(size=(8, features))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of feature names
+        predicted = _as_columns(regressor.predict(rows))
+    found = formula.value(rows)
+    scale = float(np.abs(predicted).max())
+    return found.shape == predicted.shape and np.allclose(found, predicted, rtol=_AGREEMENT, atol=_AGREEMENT * scale)
