@@ -92,5 +92,9 @@ class BoundOnnxPolicy:
         u = self.settings.network(np.asarray(observations, dtype=np.float64)) * self.settings.scale
         return u if limits is None else Limits.of(limits, u.shape[-1]).clip(u)
 
+    def __getitem__(self, index: int) -> BoundOnnxPolicy:
+        """Return the controller of one task of the batch."""
+        return BoundOnnxPolicy(self.settings, self.task[index])
+
     def __repr__(self) -> str:
         return record(self)

@@ -23,7 +23,9 @@ Controller = Callable[[int, Array], Array]
 class Synthesizer(Protocol):
     """A method that designs a controller for a task on a model.
 
-    A synthesizer that can design for a batch of tasks in one call has an attribute ``batched = True``.
+    A synthesizer that can design for a batch of tasks in one call has an attribute ``batched = True``. If its
+    controllers of a batch have ``__getitem__``, which returns the controller of one task, tasks are also designed in a
+    batch if the system executes them one at a time.
     """
 
     def design(self, task: Task, model: Model) -> Controller:
@@ -254,6 +256,10 @@ class _BoundPolicy:
     def __call__(self, t: int, x: Array) -> Array:
         u = np.asarray(self.policy(t, x, self.task), dtype=np.float64)
         return u if self.limits is None else Limits.of(self.limits, u.shape[-1]).clip(u)
+
+    def __getitem__(self, index: int) -> _BoundPolicy:
+        """Return the controller of one task of the batch."""
+        return _BoundPolicy(self.policy, self.task[index], self.limits)
 
     def __repr__(self) -> str:
         return record(self)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from ctxval._util.representation import call, lines, shown
 from ctxval.core.controller import Controller
@@ -26,6 +27,15 @@ class Plan:
     task: Task
     controller: Controller
     model_trajectory: Trajectory
+
+    def of(self, index: int, parameters: Parameters) -> Plan:
+        """Return the plan of one task of a batch, whose parameters are given.
+
+        Raises:
+            TypeError: if the controller of the batch has no ``__getitem__``.
+        """
+        controller: Any = self.controller
+        return Plan(parameters, self.task[index], controller[index], self.model_trajectory[index])
 
     def __repr__(self) -> str:
         fields = ("parameters", "task", "controller", "model_trajectory")

@@ -36,6 +36,8 @@ START = 0.05
 
 _CHUNK = 4096
 """Number of tasks in one batched call: large enough for speed, small enough for the memory."""
+_PLANNED = 256
+"""Number of tasks that are planned in one call if S executes one at a time: more would hardly be faster."""
 
 
 class Validation:
@@ -238,24 +240,67 @@ class Validation:
         """Whether system and synthesizer take a batch of tasks in one call."""
         return bool(getattr(self.system, "batched", False) and getattr(self.synthesizer, "batched", False))
 
+    def plans(self, points: ArrayLike) -> list[Plan]:
+        """Return the plans of the tasks at ``(N, d)``, as :meth:`plan` makes them one by one.
+
+        If the synthesizer takes batches, the controllers of many tasks are designed in one call, and the results agree
+        with those of single designs up to rounding.
+
+        Raises:
+            InputError, DesignError, ModelError: as in :meth:`plan`.
+        """
+        rows = require_shape("points", as_floats("points", points), (self.space.dimension,))
+        chunks = [rows[i : i + _PLANNED] for i in range(0, len(rows), _PLANNED)]
+        return [plan for chunk in chunks for plan in self._planned_together(chunk) or map(self.plan, chunk)]
+
+    def _planned_together(self, points: Array) -> list[Plan] | None:
+        """Return the plans of points ``(N, d)`` from one design; None if they must be made one by one.
+
+        That is so if a part takes no batches, and if a task fails: only its own plan shows the reason.
+        """
+        if len(points) == 1 or not getattr(self.synthesizer, "batched", False):
+            return None
+        try:
+            whole = self._plan(self.space.parameters(points))
+        except CtxvalError:
+            return None
+        if whole.task.batch_shape != (len(points),) or not whole.model_trajectory.finite.all():
+            return None
+        if not hasattr(whole.controller, "__getitem__"):
+            return None
+        return [whole.of(k, self.space.parameters(point)) for k, point in enumerate(points)]
+
     def distances(self, points: ArrayLike) -> Array:
         """Return d at points ``(N, d)``, shape ``(N,)``; NaN if the execution fails. Executes S N times.
+
+        Tasks are planned together if the synthesizer takes batches, and executed together if S does, too.
 
         Raises:
             InputError, DesignError, ModelError: as in :meth:`plan`.
             DistanceError: if the distance function raises an exception or returns the wrong shape.
         """
         rows = require_shape("points", as_floats("points", points), (self.space.dimension,))
-        if not self.batched or not len(rows):
-            return np.array([self._distance_or_nan(row) for row in rows])
-        chunks = [rows[i : i + _CHUNK] for i in range(0, len(rows), _CHUNK)]
-        return np.concatenate([self._batch_distances(chunk) for chunk in chunks])
+        if not len(rows):
+            return np.array([])
+        measured, size = (self._batch_distances, _CHUNK) if self.batched else (self._single_distances, _PLANNED)
+        return np.concatenate([measured(rows[i : i + size]) for i in range(0, len(rows), size)])
+
+    def _single_distances(self, points: Array) -> Array:
+        """Return the distances of points ``(N, d)``, with one execution after the other."""
+        plans = self._planned_together(points)
+        if plans is None:
+            return np.array([self._distance_or_nan(point) for point in points])
+        return np.array([self._executed_or_nan(plan) for plan in plans])
 
     def _distance_or_nan(self, point: Array) -> float:
+        return self._executed_or_nan(self.plan(point))
+
+    def _executed_or_nan(self, plan: Plan) -> float:
         try:
-            return self.outcome(point).distance
+            trajectory = self.execute(plan)
         except ExecutionError:
             return np.nan
+        return self.measure(plan, trajectory)
 
     def _batch_distances(self, points: Array) -> Array:
         plan = self._plan(self.space.parameters(points))
