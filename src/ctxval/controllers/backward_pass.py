@@ -18,6 +18,8 @@ from ctxval.core.controller import Limits
 
 _STEP_LENGTHS = 0.5 ** np.arange(12)
 """Step lengths of projected Newton steps, the longest first."""
+_FEW = 200
+"""Number of entries below which LAPACK inverts matrices of two rows faster than the closed form."""
 _NEWTON_STEPS = 50
 """Largest number of projected Newton steps for inputs with limits."""
 _NEWTON_DECREASE = 0.1
@@ -93,12 +95,12 @@ def minimise(cost: QuadraticCost, around: Expansion, limits: Limits | None, damp
         limits: limits of the inputs, if any.
         damping: added to the curvature of the inputs of each task, shape ``(N,)``.
     """
-    if limits is None and not damping.any():
-        return _linear(cost, around) if around.linear else _recursion(cost, around, _Unlimited(0.0))
-    ridge = damping[:, None, None] * np.eye(len(cost.R))
-    if limits is None:
-        return _recursion(cost, around, _Unlimited(ridge))
-    return _recursion(cost, around, _Limited(ridge, limits.low - around.inputs, limits.high - around.inputs))
+    damped = bool(damping.any())
+    if limits is None and around.linear and not damped:
+        return _linear(cost, around)
+    ridge = damping[:, None, None] * np.eye(len(cost.R)) if damped else None
+    box = None if limits is None else (limits.low - around.inputs, limits.high - around.inputs)
+    return _recursion(cost, around, _Stage(ridge, box))
 
 
 def _linear(cost: QuadraticCost, around: Expansion) -> Policy:
@@ -114,11 +116,11 @@ def _linear(cost: QuadraticCost, around: Expansion) -> Policy:
         v = pulls[t] + v @ known.closed[t]
     Q_u = weighed + slopes @ around.B
     k = -Q_u @ known.inverses
-    slope = np.einsum("tni,tni->n", k, Q_u)
+    slope = _inner(k, Q_u)
     return Policy(known.gains, k, Change(slope, -slope))
 
 
-def _recursion(cost: QuadraticCost, around: Expansion, stage: _Unlimited | _Limited) -> Policy:
+def _recursion(cost: QuadraticCost, around: Expansion, stage: _Stage) -> Policy:
     """Expand the cost-to-go as ``v'dx + 1/2 dx'V dx`` from the horizon to the start.
 
     With z = (x, u) and F = (A, B), its expansion in z is ``q'dz + 1/2 dz'M dz`` with q = (Q_x, Q_u) and M of the blocks
@@ -130,7 +132,7 @@ def _recursion(cost: QuadraticCost, around: Expansion, stage: _Unlimited | _Limi
     weights = np.block([[cost.Q, np.zeros((n, m))], [np.zeros((m, n)), cost.R]])
     own = np.concatenate([around.deviations[:-1] @ cost.Q, around.inputs @ cost.R], axis=-1)
     v, V = around.deviations[-1] @ cost.Q_final, cost.Q_final
-    slope, curvature = np.zeros(batch), np.zeros(batch)
+    slopes, Q_uu_k = np.empty((horizon, batch, m)), np.empty((horizon, batch, m))
     k_all, K_all = np.empty((horizon, batch, m)), np.empty((horizon, batch, m, n))
     for t in reversed(range(horizon)):
         M = (F_T[t] @ V) @ F[t]
@@ -138,18 +140,13 @@ def _recursion(cost: QuadraticCost, around: Expansion, stage: _Unlimited | _Limi
         q = own[t] + times(v, F[t])
         Q_u, Q_ux, Q_uu = q[:, n:], M[..., n:, :n], M[..., n:, n:]
         K, k = stage.solve(t, Q_uu, Q_u, Q_ux)
-        Q_uu_k = times(k, Q_uu)
-        slope += (k * Q_u).sum(axis=-1)
-        curvature += (k * Q_uu_k).sum(axis=-1)
-        K_T = _T(K)
-        if stage.exact:  # Q_uu K = -Q_ux and Q_uu k = -Q_u
-            v, V = q[:, :n] + times(Q_u, K), M[..., :n, :n] + K_T @ Q_ux
-        else:
-            v = q[:, :n] + times(Q_uu_k + Q_u, K) + times(k, Q_ux)
-            V = M[..., :n, :n] + K_T @ (Q_uu @ K + Q_ux) + _T(Q_ux) @ K
+        slopes[t], Q_uu_k[t], k_all[t], K_all[t] = Q_u, times(k, Q_uu), k, K
+        v, V = q[:, :n] + times(k, Q_ux), M[..., :n, :n] + _T(Q_ux) @ K
+        if not stage.exact:  # otherwise K'(Q_uu k + Q_u) and K'(Q_uu K + Q_ux) are zero
+            v += times(Q_uu_k[t] + Q_u, K)
+            V = V + _T(K) @ (Q_uu @ K + Q_ux)
         V = 0.5 * (V + _T(V))
-        k_all[t], K_all[t] = k, K
-    return Policy(K_all, k_all, Change(slope, curvature))
+    return Policy(K_all, k_all, Change(_inner(k_all, slopes), _inner(k_all, Q_uu_k)))
 
 
 def _joined(around: Expansion, shape: tuple[int, int]) -> tuple[Array, Array]:
@@ -165,71 +162,54 @@ def _joined(around: Expansion, shape: tuple[int, int]) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Unlimited:
-    """Minimisation over inputs without limits.
+class _Stage:
+    """The minimisation over the inputs of one step.
 
     Attributes:
-        ridge: the damping, ``(N, m, m)``, or zero.
+        ridge: the damping, shape ``(N, m, m)``; None if there is none.
+        box: the lower and upper limits of k, shapes ``(H, N, m)``; None if there are none.
     """
 
-    ridge: Array | float
+    ridge: Array | None
+    box: tuple[Array, Array] | None
 
     @property
     def exact(self) -> bool:
-        """Whether the step minimises the expansion itself, without damping and limits."""
-        return isinstance(self.ridge, float)
+        """Whether the step minimises the expansion itself, without damping."""
+        return self.ridge is None
 
     def solve(self, t: int, Q_uu: Array, Q_u: Array, Q_ux: Array) -> tuple[Array, Array]:
-        """Return the gains K ``(N, m, n)``, or ``(m, n)``, and k ``(N, m)``."""
-        opposite = -_inverses(Q_uu if self.exact else Q_uu + self.ridge)
-        return opposite @ Q_ux, times(Q_u, opposite)
-
-
-@dataclass(frozen=True, eq=False)
-class _Limited:
-    """Minimisation over inputs within limits.
-
-    Attributes:
-        ridge: the damping, ``(N, m, m)``.
-        low, high: the limits of the step k, shape ``(H, N, m)``.
-    """
-
-    ridge: Array
-    low: Array
-    high: Array
-
-    exact = False
-
-    def solve(self, t: int, Q_uu: Array, Q_u: Array, Q_ux: Array) -> tuple[Array, Array]:
-        """Return the gains K ``(N, m, n)`` and k ``(N, m)``; inputs at a limit have no gain."""
-        N, m = Q_u.shape
-        Q_uu = np.broadcast_to(Q_uu + self.ridge, (N, m, m))
+        """Return the gains K ``(N, m, n)``, or ``(m, n)``, and k ``(N, m)``; inputs at a limit have no gain."""
+        Q_uu = Q_uu if self.ridge is None else Q_uu + self.ridge
         opposite = -_inverses(Q_uu)
-        k, K = times(Q_u, opposite), opposite @ Q_ux
-        low, high = self.low[t], self.high[t]
+        K, k = opposite @ Q_ux, times(Q_u, opposite)
+        if self.box is None:
+            return K, k
+        low, high = self.box[0][t], self.box[1][t]
         beyond = np.flatnonzero(((k <= low) | (k >= high)).any(axis=-1))
         if len(beyond):
-            Q_ux = np.broadcast_to(Q_ux, (N, *Q_ux.shape[-2:]))[beyond]
-            K = np.array(np.broadcast_to(K, (N, *K.shape[-2:])))
-            K[beyond], k[beyond] = _within((low[beyond], high[beyond]), Q_uu[beyond], Q_u[beyond], Q_ux)
+            N = len(k)
+            K, Q_uu, Q_ux = (np.broadcast_to(part, (N, *part.shape[-2:])) for part in (K, Q_uu, Q_ux))
+            K, box = K.copy(), (low[beyond], high[beyond])
+            K[beyond], k[beyond] = _within(box, k[beyond], Q_uu[beyond], Q_u[beyond], Q_ux[beyond])
         return K, k
 
 
-def _within(box: tuple[Array, Array], Q_uu: Array, Q_u: Array, Q_ux: Array) -> tuple[Array, Array]:
+def _within(box: tuple[Array, Array], best: Array, Q_uu: Array, Q_u: Array, Q_ux: Array) -> tuple[Array, Array]:
     """Minimise ``Q_u'k + 1/2 k'Q_uu k`` over ``low <= k <= high``; return the gains K ``(N, m, n)`` and k ``(N, m)``.
 
-    Projected Newton steps (Bertsekas 1982; Tassa, Mansard and Todorov 2014, Sec. III). Inputs at a limit have no gain.
+    Projected Newton steps (Bertsekas 1982; Tassa, Mansard and Todorov 2014, Sec. III) from the minimum without limits,
+    ``best``, projected onto the box. Inputs at a limit have no gain.
     """
     (low, high), m = box, Q_u.shape[-1]
-    k = np.zeros_like(Q_u)  # within the box, as the inputs are
-    largest = 0.0
+    k = np.clip(best, low, high)
+    largest = float(-(Q_u * best).sum(axis=-1).min())
     for _ in range(_NEWTON_STEPS):
         slope = Q_u + times(k, Q_uu)
         free = ~(((k <= low) & (slope > 0)) | ((k >= high) & (slope < 0)))
         inverse = _inverses(np.where(free[:, :, None] & free[:, None, :], Q_uu, np.eye(m)))
         direction = -times(np.where(free, slope, 0.0), inverse)
-        decrease = float(-np.where(free, slope * direction, 0.0).sum(axis=-1).min(initial=0.0))
-        largest = max(largest, decrease)
+        decrease = float(-np.where(free, slope * direction, 0.0).sum(axis=-1).min())
         if decrease <= _NEWTON_SETTLED * largest:
             break
         k = _projected(k, direction, slope, Q_uu, box)
@@ -238,12 +218,24 @@ def _within(box: tuple[Array, Array], Q_uu: Array, Q_u: Array, Q_ux: Array) -> t
 
 def _projected(k: Array, direction: Array, slope: Array, Q_uu: Array, box: tuple[Array, Array]) -> Array:
     """Return for each row the longest of several steps, projected onto the box, that lowers its value enough."""
+    whole = np.clip(k + direction, *box) - k
+    if (_value(whole, slope, Q_uu) <= _NEWTON_DECREASE * (whole * slope).sum(axis=-1)).all():
+        return k + whole
     moves = np.clip(k + _STEP_LENGTHS[:, None, None] * direction, *box) - k
     linear = (moves * slope).sum(axis=-1)
-    change = linear + 0.5 * (moves * (moves[..., None, :] @ Q_uu)[..., 0, :]).sum(axis=-1)
-    enough = change <= _NEWTON_DECREASE * linear
+    enough = _value(moves, slope, Q_uu) <= _NEWTON_DECREASE * linear
     chosen = moves[enough.argmax(axis=0), np.arange(len(k))]
     return k + np.where(enough.any(axis=0)[:, None], chosen, 0.0)
+
+
+def _value(moves: Array, slope: Array, Q_uu: Array) -> Array:
+    """Return ``slope'k + 1/2 k'Q_uu k`` for moves k ``(..., N, m)``."""
+    return np.asarray((moves * (slope + 0.5 * (moves[..., None, :] @ Q_uu)[..., 0, :])).sum(axis=-1))
+
+
+def _inner(first: Array, second: Array) -> Array:
+    """Return the sums over time and inputs of products, ``(N,)``."""
+    return np.asarray(np.einsum("tni,tni->n", first, second))
 
 
 def _inverses(matrices: Array) -> Array:
@@ -251,7 +243,7 @@ def _inverses(matrices: Array) -> Array:
     m = matrices.shape[-1]
     if m == 1:
         return 1.0 / matrices
-    if m > 2:
+    if m > 2 or matrices.size < _FEW:
         return np.linalg.inv(matrices)
     a, b, c, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 0], matrices[..., 1, 1]
     share = 1.0 / (a * d - b * c)
