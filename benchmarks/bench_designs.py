@@ -15,11 +15,23 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-import landed
 import numpy as np
 
-from ctxval import Campaign, Task, TaskSpace, Trajectory, Transitions, Validation
-from ctxval import cases, controllers, distances, models, searches, systems
+import landed
+from ctxval import (
+    Campaign,
+    Task,
+    TaskSpace,
+    Trajectory,
+    Transitions,
+    Validation,
+    cases,
+    controllers,
+    distances,
+    models,
+    searches,
+    systems,
+)
 from ctxval.core.rollout import rollout
 
 DT = 0.05
@@ -44,9 +56,7 @@ def quadrotor(limits: object) -> Validation:
         task=lambda p: Task([0, 0, p.tilt, p.rate, 0, 0], goal=[p.x, p.z, 0, 0, 0, 0], horizon=40, dt=DT),
         system=systems.Simulated(planar_quadrotor(0.55, 0.0045, 0.3), vectorized=True),
         model=models.Function(planar_quadrotor(0.5, 0.004, 0.0), vectorized=True),
-        synthesizer=controllers.ILQR(
-            [1, 1, 0.5, 0.1, 0.1, 0.05], [0.05, 0.05], [50, 50, 5, 5, 5, 1], limits=limits
-        ),
+        synthesizer=controllers.ILQR([1, 1, 0.5, 0.1, 0.1, 0.05], [0.05, 0.05], [50, 50, 5, 5, 5, 1], limits=limits),
         distance=distances.WholeTrajectory(norm=2, per_step=True),
     )
 

@@ -244,7 +244,7 @@ def _inverses(matrices: Array) -> Array:
     if m == 1:
         return 1.0 / matrices
     if m > 2 or matrices.size < _FEW:
-        return np.linalg.inv(matrices)
+        return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
     a, b, c, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 0], matrices[..., 1, 1]
     share = 1.0 / (a * d - b * c)
     found = np.empty(matrices.shape)

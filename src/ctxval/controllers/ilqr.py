@@ -17,7 +17,7 @@ from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task
 from ctxval.errors import DesignError, InputError
 
-_STEP_LENGTHS = 0.5 ** np.arange(12)
+_STEP_LENGTHS: Array = np.asarray(0.5 ** np.arange(12), dtype=np.float64)
 """Step lengths of the line search, the longest first."""
 _TOGETHER = 256
 """Number of loops on the model up to which one more costs little, so that several step lengths are tried at once."""

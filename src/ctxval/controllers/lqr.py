@@ -171,9 +171,7 @@ def _riccati(cost: QuadraticCost, A: Array, B: Array, offset: Array, reference: 
     return np.stack(gains[::-1], axis=-3), np.stack(feedforward[::-1], axis=-2)
 
 
-def _feedforward(
-    cost: QuadraticCost, known: LinearGains, B: Array, offset: Array, reference: Array
-) -> Array:
+def _feedforward(cost: QuadraticCost, known: LinearGains, B: Array, offset: Array, reference: Array) -> Array:
     """Return k_t ``(..., H, m)`` for gains that are known, with the slope p of the cost-to-go as in ``_riccati``."""
     horizon, n = len(known.gains), len(B)
     pulls = -np.moveaxis(reference, -2, 0).reshape(horizon + 1, -1, n)

@@ -63,7 +63,7 @@ def _recursion(contents: tuple[bytes, ...], shape: tuple[int, int], horizon: int
     steps: list[tuple[Array, Array, Array, Array]] = []
     for _ in range(horizon):
         PB = P @ B
-        inverse = np.linalg.inv(R + B.T @ PB)
+        inverse: Array = np.asarray(np.linalg.inv(R + B.T @ PB), dtype=np.float64)
         K = -inverse @ (PB.T @ A)
         closed = A + B @ K
         steps.append((K, inverse, closed, P))

@@ -58,9 +58,11 @@ class KernelSum:
     constant = False
 
     def value(self, Z: Array) -> Array:
+        """Return the values ``(N, o)`` at rows ``(N, k)``."""
         return self._matrix(self.kernel(Z, self.centres)[0], Z) @ self.weights
 
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
+        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
         covariances, slopes = self.kernel(Z, self.centres)
 
         def pull_back(G: Array) -> Array:

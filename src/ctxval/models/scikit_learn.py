@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Mask
 from ctxval._util.registry import part
 from ctxval._util.representation import call, name_of
 from ctxval.core.model import central_differences
@@ -106,11 +106,10 @@ class ScikitLearn:
         formula = self._formula()
         if formula is not None:
             return np.concatenate([formula.value(block) for block in _blocks(rows)])
-        finite = np.isfinite(rows).all(axis=-1)
+        finite: Mask = np.asarray(np.isfinite(rows).all(axis=-1, keepdims=True))
         if finite.all():
             return _as_columns(self.regressor.predict(rows))
-        output = _as_columns(self.regressor.predict(np.where(finite[:, None], rows, 0.0)))
-        return np.where(finite[:, None], output, np.nan)
+        return np.where(finite, _as_columns(self.regressor.predict(np.where(finite, rows, 0.0))), np.nan)
 
     def _formula(self) -> SmoothMap | None:
         # It is read again each time, because a regressor may be fitted again.

@@ -50,9 +50,11 @@ class Affine:
     constant = True
 
     def value(self, Z: Array) -> Array:
+        """Return the values ``(N, o)`` at rows ``(N, k)``."""
         return np.asarray(Z @ self.W + self.b)
 
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
+        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
         return self.value(Z), lambda G: np.asarray(G @ self.W.T)
 
     def __repr__(self) -> str:
@@ -69,9 +71,11 @@ class Scaled:
     constant = True
 
     def value(self, Z: Array) -> Array:
+        """Return the values ``(N, o)`` at rows ``(N, k)``."""
         return np.asarray(self.scale * Z + self.shift)
 
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
+        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
         return self.value(Z), lambda G: np.asarray(G * self.scale)
 
     def __repr__(self) -> str:
@@ -90,12 +94,15 @@ class Monomials:
 
     @property
     def constant(self) -> bool:
+        """Whether the derivative is the same everywhere."""
         return bool((self.powers.sum(axis=1) <= 1).all())
 
     def value(self, Z: Array) -> Array:
+        """Return the values ``(N, o)`` at rows ``(N, k)``."""
         return self._products(self._table(Z), self.powers)
 
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
+        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
         table = self._table(Z)
 
         def pull_back(G: Array) -> Array:
@@ -136,7 +143,7 @@ ACTIVATIONS: dict[str, Activation] = {
     "tanh": (np.tanh, lambda a: 1 - a * a),
     "relu": (lambda z: np.maximum(z, 0), lambda a: (a > 0).astype(np.float64)),
 }
-"""The functions of units of networks by the names that scikit-learn gives them. At its kink, ReLU counts as inactive."""
+"""The functions of units of networks by scikit-learn's names. At its kink, a ReLU counts as inactive."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,12 +162,15 @@ class Network:
 
     @property
     def constant(self) -> bool:
+        """Whether the derivative is the same everywhere."""
         return self.activation == "identity" or len(self.weights) == 1
 
     def value(self, Z: Array) -> Array:
+        """Return the values ``(N, o)`` at rows ``(N, k)``."""
         return self._layers(Z)[-1]
 
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
+        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
         *hidden, output = self._layers(Z)
         slope = ACTIVATIONS[self.activation][1]
 
@@ -194,14 +204,17 @@ class Chain:
 
     @property
     def constant(self) -> bool:
+        """Whether the derivative is the same everywhere."""
         return all(part.constant for part in self.parts)
 
     def value(self, Z: Array) -> Array:
+        """Return the values ``(N, o)`` at rows ``(N, k)``."""
         for part in self.parts:
             Z = part.value(Z)
         return Z
 
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
+        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
         pulls: list[PullBack] = []
         for part in self.parts:
             Z, pull = part.linearised(Z)
@@ -226,18 +239,21 @@ class SideBySide:
 
     @property
     def constant(self) -> bool:
+        """Whether the derivative is the same everywhere."""
         return all(part.constant for part in self.parts)
 
     def value(self, Z: Array) -> Array:
+        """Return the values ``(N, o)`` at rows ``(N, k)``."""
         return np.concatenate([part.value(Z) for part in self.parts], axis=1)
 
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
+        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
         found = [part.linearised(Z) for part in self.parts]
         ends = np.cumsum([values.shape[1] for values, _ in found])
 
         def pull_back(G: Array) -> Array:
             pieces = np.split(G, ends[:-1], axis=2)
-            return np.sum([pull(piece) for (_, pull), piece in zip(found, pieces, strict=True)], axis=0)
+            return np.asarray(np.sum([pull(piece) for (_, pull), piece in zip(found, pieces, strict=True)], axis=0))
 
         return np.concatenate([values for values, _ in found], axis=1), pull_back
 
