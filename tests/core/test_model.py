@@ -87,6 +87,25 @@ def test_differences_of_a_linear_model_are_its_matrices() -> None:
     np.testing.assert_allclose(B, np.broadcast_to(model.B, B.shape), atol=1e-9)
 
 
+def test_differences_of_a_horizon_and_a_batch_take_one_call_and_many_points_take_several() -> None:
+    sizes = []
+
+    def counted(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        sizes.append(len(x))
+        return bend(x, u)
+
+    model = Function(counted, vectorized=True)
+    linearize(model, *batch((40, 8)))
+    assert sizes == [40 * 8 * 2 * 3]
+    x, u = batch((2000,))
+    A, B = linearize(model, x, u)
+    assert max(sizes) <= 4096
+    for i in (0, 681, 682, 683, 1999):
+        expected = bend_jacobian(x[i], u[i])
+        np.testing.assert_allclose(A[i], expected[0], atol=1e-8)
+        np.testing.assert_allclose(B[i], expected[1], atol=1e-8)
+
+
 def test_the_own_jacobian_of_a_model_is_taken() -> None:
     class Own:
         def step(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:

@@ -158,6 +158,75 @@ def test_what_takes_no_batch_is_looped(part: str) -> None:
     np.testing.assert_allclose(looped.distances(points()), whole.distances(points()), rtol=0, atol=1e-10)
 
 
+class Recording:
+    """A synthesizer that notes the batch shape of each design, with controllers that may not be divisible."""
+
+    batched = True
+
+    def __init__(self, inner: object, divisible: bool = True) -> None:
+        self._inner, self._divisible, self.shapes = inner, divisible, []
+
+    def design(self, task: Task, model: object) -> object:
+        self.shapes.append(task.batch_shape)
+        controller = self._inner.design(task, model)
+        return controller if self._divisible else lambda t, x: controller(t, x)
+
+
+@pytest.mark.parametrize("synthesizer", SYNTHESIZERS)
+def test_tasks_are_planned_together_and_executed_singly(synthesizer: object) -> None:
+    whole = make(synthesizer=synthesizer)
+    recording = Recording(synthesizer)
+    values = make(synthesizer=recording, system=Looped(whole.system)).distances(points())
+    assert recording.shapes == [(7,)]
+    np.testing.assert_allclose(values, whole.distances(points()), rtol=0, atol=1e-9)
+
+
+def test_plans_of_many_tasks_are_those_of_single_ones() -> None:
+    validation = make(synthesizer=ILQR([1.0, 0.1], [0.01], [10.0, 1.0]))
+    for plan, point in zip(validation.plans(points()), points(), strict=True):
+        alone = validation.plan(point)
+        assert (plan.parameters.goal, plan.task.batch_shape) == (alone.parameters.goal, ())
+        for name in ("states", "inputs"):
+            ours, theirs = getattr(plan.model_trajectory, name), getattr(alone.model_trajectory, name)
+            np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
+        state = alone.task.initial_state + 0.1
+        np.testing.assert_allclose(plan.controller(3, state), alone.controller(3, state), rtol=0, atol=1e-9)
+    assert validation.plans(np.empty((0, 2))) == []
+
+
+def test_controllers_that_cannot_be_divided_are_designed_one_by_one() -> None:
+    whole = make()
+    recording = Recording(LQR([1.0, 0.1], [0.01], [10.0, 1.0]), divisible=False)
+    values = make(synthesizer=recording, system=Looped(whole.system)).distances(points(4))
+    assert recording.shapes == [(4,), (), (), (), ()]
+    np.testing.assert_allclose(values, whole.distances(points(4)), rtol=0, atol=1e-10)
+
+
+def test_a_task_function_for_single_tasks_is_called_for_each() -> None:
+    def regulate_one(p: Parameters) -> Task:
+        return Task([float(p.start), 0.0], goal=[float(p.goal), 0.0], horizon=HORIZON, dt=DT)
+
+    whole = make()
+    values = make(task=regulate_one, system=Looped(whole.system)).distances(points(4))
+    np.testing.assert_allclose(values, whole.distances(points(4)), rtol=0, atol=1e-10)
+
+
+def test_a_design_that_fails_is_reported_after_the_executions_before_it() -> None:
+    executed = []
+
+    def goals_up_to_one(task: Task, model: object) -> object:
+        if (task.goal[..., 0] > 1).any():
+            raise DesignError("the goal is out of reach")
+        return LQR([1.0, 0.1], [0.01]).design(task, model)
+
+    synthesizer = Recording(LQR([1.0, 0.1], [0.01]))
+    synthesizer.design = goals_up_to_one
+    validation = make(synthesizer=synthesizer, system=Rig(lambda whole: executed.append(0) or whole))
+    with pytest.raises(DesignError, match=r"^the goal is out of reach$"):
+        validation.distances([[0.0, 0.0], [0.5, 0.0], [1.5, 0.0], [0.2, 0.0]])
+    assert len(executed) == 2
+
+
 def test_a_plain_function_serves_as_model_and_as_system() -> None:
     def slow(x: np.ndarray, u: np.ndarray) -> list[float]:
         return [float(v) for v in STEP(x, u)]

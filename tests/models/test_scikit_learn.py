@@ -34,9 +34,9 @@ def test_linear_regression_finds_the_linear_model(increments: bool) -> None:
     model = ScikitLearn.fit(LinearRegression(), recorded(), increments=increments)
     x, u = np.random.default_rng(1).normal(size=(5, 2)), np.random.default_rng(2).normal(size=(5, 1))
     np.testing.assert_allclose(model.step(x, u), TRUTH.step(x, u), atol=1e-12)
-    A, B = linearize(model, x, u)
-    np.testing.assert_allclose(A[0], TRUTH.A, atol=1e-8)
-    np.testing.assert_allclose(B[0], TRUTH.B, atol=1e-8)
+    A, B = linearize(model, x, u)  # without batch axes, so that gains are computed once
+    np.testing.assert_allclose(A, TRUTH.A, atol=1e-12)
+    np.testing.assert_allclose(B, TRUTH.B, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -92,3 +92,82 @@ def test_what_cannot_be_used_is_refused() -> None:
         model.step(np.zeros(2), np.zeros(2))
     with pytest.raises(ShapeError, match=r"must predict as many states as it takes, 1, got shape \(1, 2\)"):
         model.step(np.zeros(1), np.zeros(2))
+
+
+class Counted:
+    """A regressor that counts its predictions; its class is not known, so it has no formula."""
+
+    def __init__(self, inner: Any) -> None:
+        self.inner, self.n_features_in_, self.calls = inner, inner.n_features_in_, 0
+
+    def predict(self, rows: np.ndarray) -> np.ndarray:
+        self.calls += 1
+        return np.asarray(self.inner.predict(rows))
+
+
+@pytest.mark.parametrize("increments", [True, False])
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
+def test_the_exact_jacobian_agrees_with_differences_of_predictions(increments: bool, shape: tuple[int, ...]) -> None:
+    regressor = make_pipeline(StandardScaler(), PolynomialFeatures(3), Ridge(1e-3))
+    model = ScikitLearn.fit(regressor, recorded(), increments=increments)
+    rng = np.random.default_rng(3)
+    x, u = rng.normal(size=(*shape, 2)), rng.normal(size=(*shape, 1))
+    plain = ScikitLearn(Counted(regressor), increments=increments)
+    for found, expected in zip(linearize(model, x, u), linearize(plain, x, u), strict=True):
+        assert found.shape == expected.shape
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(model.step(x, u), plain.step(x, u), rtol=0, atol=1e-12)
+
+
+def test_differences_over_a_horizon_and_a_batch_take_one_prediction() -> None:
+    counted = Counted(Ridge().fit(np.eye(3), np.eye(3)[:, :2]))
+    linearize(ScikitLearn(counted), np.zeros((40, 8, 2)), np.zeros((40, 8, 1)))
+    assert counted.calls == 1
+
+
+def test_many_rows_are_differentiated_in_blocks_with_the_same_result() -> None:
+    model = ScikitLearn.fit(GaussianProcessRegressor(optimizer=None, alpha=1e-3), recorded())
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(2500, 2)), rng.normal(size=(2500, 1))
+    A, B = model.jacobian(x, u)
+    for k in (0, 1023, 1024, 2499):
+        alone = model.jacobian(x[k], u[k])
+        np.testing.assert_allclose(A[k], alone[0], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(B[k], alone[1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("regressor", [RandomForestRegressor(2, random_state=0), GaussianProcessRegressor(alpha=1e-3)])
+def test_a_loop_that_diverges_does_not_stop_the_others(regressor: Any) -> None:
+    model = ScikitLearn.fit(regressor, recorded())
+    x, u = np.array([[np.nan, 0.0], [0.1, 0.2], [np.inf, 0.0]]), np.full((3, 1), 0.3)
+    with np.errstate(all="ignore"):
+        found = model.step(x, u)
+    np.testing.assert_array_equal(np.isfinite(found).all(axis=-1), [False, True, False])
+    np.testing.assert_allclose(found[1], model.step(x[1], u[1]), rtol=0, atol=1e-12)
+
+
+class Refitted(Ridge):
+    """A class of scikit-learn in name, whose numbers mean something else."""
+
+    __module__ = "sklearn.linear_model._ridge"
+
+    def predict(self, rows: np.ndarray) -> np.ndarray:
+        return np.asarray(super().predict(rows) + 1.0)
+
+
+def test_a_formula_that_does_not_predict_the_same_is_not_used() -> None:
+    Refitted.__name__ = "Ridge"
+    data = recorded()
+    model = ScikitLearn.fit(Refitted(), data)
+    expected = model.regressor.predict(np.concatenate([data.x, data.u], axis=1))
+    np.testing.assert_allclose(model.step(data.x, data.u), data.x + expected, rtol=0, atol=1e-12)
+    assert model.jacobian(data.x, data.u)[0].shape == (60, 2, 2)
+
+
+def test_a_regressor_that_is_fitted_again_has_its_new_jacobian() -> None:
+    regressor = Ridge(1e-9)
+    model = ScikitLearn.fit(regressor, recorded())
+    ScikitLearn.fit(regressor, recorded(Linear(0.5 * TRUTH.A, 2 * TRUTH.B)))
+    A, B = model.jacobian(np.zeros(2), np.zeros(1))
+    np.testing.assert_allclose(A, 0.5 * TRUTH.A, atol=1e-6)
+    np.testing.assert_allclose(B, 2 * TRUTH.B, atol=1e-6)

@@ -18,7 +18,7 @@ from ctxval.models.smooth_maps import SmoothMap, jacobian
 
 _BLOCK = 1024
 """Number of rows in one call of a formula: enough to be fast, few enough for the cache."""
-_AGREEMENT = 1e-6
+_AGREEMENT = 1e-4
 """Largest relative difference of a formula from what the regressor predicts."""
 
 

@@ -119,13 +119,13 @@ class Monomials:
 
     def _table(self, Z: Array) -> Array:
         """Return the powers of the columns from 0 to the largest, shape ``(largest + 1, N, k)``."""
-        table = np.ones((int(self.powers.max(initial=0)) + 1, *Z.shape))
+        table = np.ones((int(self.powers.max(initial=0)) + 1, *Z.shape), dtype=Z.dtype)
         for power in range(1, len(table)):
             table[power] = table[power - 1] * Z
         return table
 
     def _products(self, table: Array, powers: Array) -> Array:
-        found = np.ones((table.shape[1], len(powers)))
+        found = np.ones((table.shape[1], len(powers)), dtype=table.dtype)
         for j in np.flatnonzero(powers.any(axis=0)):
             found *= table[powers[:, j], :, j].T
         return found
