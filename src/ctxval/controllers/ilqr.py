@@ -19,8 +19,10 @@ from ctxval.errors import DesignError, InputError
 
 _STEP_LENGTHS: Array = np.asarray(0.5 ** np.arange(12), dtype=np.float64)
 """Step lengths of the line search, the longest first."""
-_TOGETHER = 256
-"""Number of loops on the model up to which one more costs little, so that several step lengths are tried at once."""
+_TOGETHER = 4
+"""Largest number of step lengths that are tried in one call; most tasks that need a shorter step need one of these."""
+_LOOPS = 256
+"""Number of loops on a model that takes batches, up to which one more costs little."""
 _SUFFICIENT_DECREASE = 1e-4
 """Share of the expected decrease of the cost that a step must reach."""
 _DAMPING_MIN = 1e-6
@@ -153,7 +155,7 @@ class _Descent:
         self.iterations = np.zeros(batch, dtype=int)
         self.converged = np.zeros(batch, dtype=bool)
         # Steps of a plain function cost as much in a batch as one by one, so step lengths are not tried together.
-        self.together = _TOGETHER if getattr(model, "vectorized", True) else 0
+        self.together = _TOGETHER if getattr(model, "vectorized", True) else 1
         self.linearised: tuple[Rows, Array, Array] | None = None
 
     def active_rows(self) -> Rows:
@@ -196,7 +198,7 @@ class _Descent:
         moved, tried = [waiting[:0]], np.zeros(len(waiting), dtype=int)
         while len(waiting):
             several = self.shortened[rows[waiting]] | (tried > 0)
-            width = int(np.clip(self.together // max(1, several.sum()), 1, len(_STEP_LENGTHS)))
+            width = int(np.clip(_LOOPS // max(1, several.sum()), 1, self.together))
             counts = np.minimum(np.where(several, width, 1), len(_STEP_LENGTHS) - tried)
             accepted = self._try(rows, policy, waiting, tried, counts)
             moved.append(waiting[accepted])
