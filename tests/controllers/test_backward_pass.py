@@ -98,6 +98,7 @@ def test_damping_shortens_the_step_of_its_task_only() -> None:
     assert np.abs(damped.k[:, 1]).max() < 0.2 * np.abs(free.k[:, 1]).max()
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 4), st.integers(1, 5))
 def test_a_stage_with_limits_is_the_bounded_minimum(seed: int, m: int, tasks: int) -> None:

@@ -215,9 +215,10 @@ def test_a_batch_of_tasks_is_the_loop_over_them(batch: tuple[int, ...]) -> None:
             np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_step_lengths_tried_together_are_those_tried_one_after_the_other() -> None:
     # With a heavy last state and costly torque, full steps overshoot. A plain function is tried with one length a call.
-    task = swing(horizon=30, goal=np.linspace(-3, 3, 5))
+    task = swing(horizon=20, goal=np.linspace(-3, 3, 4))
     regulator = ILQR([1.0, 0.1], [3.0], [1000.0, 100.0])
     together = regulator.solve(task, PENDULUM)
     one_by_one = regulator.solve(task, Function(PENDULUM.step))

@@ -156,7 +156,7 @@ class _Descent:
         self.converged = np.zeros(batch, dtype=bool)
         # Steps of a plain function cost as much in a batch as one by one, so step lengths are not tried together.
         self.together = _TOGETHER if getattr(model, "vectorized", True) else 1
-        self.linearised: tuple[Rows, Array, Array] | None = None
+        self.latest: tuple[Rows, Array, Array] | None = None  # the latest derivatives, and their tasks
 
     def active_rows(self) -> Rows:
         """Return the tasks whose iteration continues."""
@@ -185,10 +185,10 @@ class _Descent:
 
     def _linearised(self, rows: Rows, X: Array, U: Array) -> tuple[Array, Array]:
         """Return the derivatives along the iterates of these tasks; those of unchanged iterates are kept."""
-        if self.linearised is not None and self.refused[rows].all() and np.array_equal(self.linearised[0], rows):
-            return self.linearised[1:]
-        self.linearised = rows, *linearize(self.model, X[:-1], U)
-        return self.linearised[1:]
+        known = self.latest
+        if known is None or not self.refused[rows].all() or not np.array_equal(known[0], rows):
+            known = self.latest = rows, *linearize(self.model, X[:-1], U)
+        return known[1:]
 
     def _line_search(self, rows: Rows, policy: Policy, waiting: Rows) -> Rows:
         """Accept for each waiting task the longest step that lowers its cost; return the tasks with such a step.

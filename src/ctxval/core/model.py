@@ -91,9 +91,9 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
 def central_differences(step: Step, x: Array, u: Array) -> tuple[Array, Array]:
     """Return A ``(..., n, n)`` and B ``(..., n, m)`` at states ``(..., n)`` and inputs ``(..., m)`` by differences.
 
-    All differences are taken in one batch, in blocks that fit into the processor's cache. With complex steps a model
-    would be evaluated half as often, but they are silently wrong wherever a model uses ``abs``, ``maximum`` or a
-    branch, and NumPy's complex functions are several times slower.
+    All differences are taken in one batch, in blocks that fit into the processor's cache. Complex steps would halve the
+    evaluations, but NumPy's complex functions take two to three times as long, and the result is silently wrong
+    wherever a model uses ``abs``, ``maximum`` or a branch.
     """
     n, width, batch = x.shape[-1], x.shape[-1] + u.shape[-1], x.shape[:-1]
     z = np.concatenate([x, u], axis=-1).reshape(-1, width)

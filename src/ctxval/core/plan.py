@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from ctxval._util.representation import call, lines, shown
 from ctxval.core.controller import Controller
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory
+from ctxval.core.trajectory import Trajectory, require_times
+from ctxval.errors import InputError, ShapeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,3 +80,35 @@ class Measurement:
 
     distance: float | None
     unusable: str | None = None
+
+
+def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> None:
+    """Check that a complete trajectory belongs to the task of a plan.
+
+    Args:
+        plan: the plan of the task.
+        trajectory: the trajectory.
+        start_tolerance: the largest difference between the first state and the initial state of the task, as a fraction
+            of the range of each state in the trajectory of the model, or of its initial value if that is larger.
+
+    Raises:
+        InputError: if its dimensions, its times or its first state differ.
+    """
+    expected = plan.model_trajectory
+    require_times(trajectory, plan.task.times)
+    if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:
+        raise ShapeError(
+            f"the trajectory must have states {expected.states.shape} and inputs {expected.inputs.shape}, "
+            f"got {trajectory.states.shape} and {trajectory.inputs.shape}."
+        )
+    start = plan.task.initial_state
+    ranges = np.ptp(expected.states, axis=0)
+    scale = np.maximum(np.maximum(ranges, np.abs(start)), max(0.05 * ranges.max(), 1e-6))
+    misses = np.abs(trajectory.states[0] - start)
+    if not (misses <= start_tolerance * scale).all():
+        i = int(np.argmax(~(misses <= start_tolerance * scale)))
+        raise InputError(
+            f"the trajectory starts elsewhere: state {i} must start at {start[i]:g} within "
+            f"{start_tolerance * scale[i]:.3g}, got {trajectory.states[0, i]:g}. "
+            "Check that it belongs to this trial."
+        )

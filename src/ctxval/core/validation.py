@@ -15,12 +15,12 @@ from ctxval._util.texts import reason_of, text_of
 from ctxval.core.controller import Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model, Step, as_model
-from ctxval.core.plan import Measurement, Outcome, Plan
+from ctxval.core.plan import Measurement, Outcome, Plan, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.system import System
 from ctxval.core.task import Task
-from ctxval.core.trajectory import COMPLETE, Trajectory, require_times
+from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import (
     CtxvalError,
     DesignError,
@@ -181,7 +181,7 @@ class Validation:
             raise ExecutionError(trajectory.ended)
         if not trajectory.finite.all():
             raise ExecutionError("the system's trajectory is not finite")
-        _require_task(plan, trajectory, self.start_tolerance if start_tolerance is None else start_tolerance)
+        require_execution(plan, trajectory, self.start_tolerance if start_tolerance is None else start_tolerance)
         return trajectory
 
     def accept(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Measurement:
@@ -262,13 +262,12 @@ class Validation:
             return None
         try:
             whole = self._plan(self.space.parameters(points))
-        except CtxvalError:
+            if whole.task.batch_shape != (len(points),) or not whole.model_trajectory.finite.all():
+                return None
+            plans = [whole.of(k, self.space.parameters(point)) for k, point in enumerate(points)]
+        except Exception:  # the user's own parts, which need not take a batch
             return None
-        if whole.task.batch_shape != (len(points),) or not whole.model_trajectory.finite.all():
-            return None
-        if not hasattr(whole.controller, "__getitem__"):
-            return None
-        return [whole.of(k, self.space.parameters(point)) for k, point in enumerate(points)]
+        return plans if all(callable(plan.controller) for plan in plans) else None
 
     def distances(self, points: ArrayLike) -> Array:
         """Return d at points ``(N, d)``, shape ``(N,)``; NaN if the execution fails. Executes S N times.
@@ -374,27 +373,6 @@ class Validation:
             f"model: {shown(self.model)}",
             f"synthesizer: {shown(self.synthesizer)}",
             f"distance: {shown(self.distance)}, task: {shown(self.task)}",
-        )
-
-
-def _require_task(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> None:
-    expected = plan.model_trajectory
-    require_times(trajectory, plan.task.times)
-    if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:
-        raise ShapeError(
-            f"the trajectory must have states {expected.states.shape} and inputs {expected.inputs.shape}, "
-            f"got {trajectory.states.shape} and {trajectory.inputs.shape}."
-        )
-    start = plan.task.initial_state
-    ranges = np.ptp(expected.states, axis=0)
-    scale = np.maximum(np.maximum(ranges, np.abs(start)), max(0.05 * ranges.max(), 1e-6))
-    misses = np.abs(trajectory.states[0] - start)
-    if not (misses <= start_tolerance * scale).all():
-        i = int(np.argmax(~(misses <= start_tolerance * scale)))
-        raise InputError(
-            f"the trajectory starts elsewhere: state {i} must start at {start[i]:g} within "
-            f"{start_tolerance * scale[i]:.3g}, got {trajectory.states[0, i]:g}. "
-            "Check that it belongs to this trial."
         )
 
 
