@@ -88,10 +88,11 @@ def test_what_cannot_be_used_is_refused() -> None:
     with pytest.raises(InputError, match="finite transitions"):
         ScikitLearn.fit(Ridge(), Transitions(data.x * np.nan, data.u, data.x_next))
     model = ScikitLearn.fit(Ridge(), data)
-    with pytest.raises(ShapeError, match="fitted on 3 features, got 2 states and 2 inputs"):
-        model.step(np.zeros(2), np.zeros(2))
-    with pytest.raises(ShapeError, match=r"must predict as many states as it takes, 1, got shape \(1, 2\)"):
-        model.step(np.zeros(1), np.zeros(2))
+    for method in (model.step, model.jacobian):
+        with pytest.raises(ShapeError, match="fitted on 3 features, got 2 states and 2 inputs"):
+            method(np.zeros(2), np.zeros(2))
+        with pytest.raises(ShapeError, match=r"must predict as many states as it takes, 1, got shape \(1, 2"):
+            method(np.zeros(1), np.zeros(2))
 
 
 class Counted:

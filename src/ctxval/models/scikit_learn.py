@@ -72,20 +72,21 @@ class ScikitLearn:
         Raises:
             ShapeError: if the regressor was fitted on other numbers of states and inputs.
         """
-        n, width = x.shape[-1], x.shape[-1] + u.shape[-1]
-        if width != self.features:
-            raise ShapeError(
-                f"the regressor was fitted on {self.features} features, got {n} states and {width - n} inputs."
-            )
+        self._require_features(x, u)
+        n = x.shape[-1]
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
         output = self._predicted(_pairs(x, u))
-        if output.shape[1] != n:
-            raise ShapeError(f"the regressor must predict as many states as it takes, {n}, got shape {output.shape}.")
+        _require_states(output, n)
         output = output.reshape(*batch, n)
         return x + output if self.increments else output
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return A ``(..., n, n)`` and B ``(..., n, m)``, without batch axes if the model is linear."""
+        """Return A ``(..., n, n)`` and B ``(..., n, m)``, without batch axes if the model is linear.
+
+        Raises:
+            ShapeError: if the regressor was fitted on other numbers of states and inputs.
+        """
+        self._require_features(x, u)
         formula = self._formula()
         if formula is None:
             return central_differences(self.step, x, u)
@@ -94,9 +95,15 @@ class ScikitLearn:
         if formula.constant:
             rows, batch = np.zeros((1, self.features)), ()
         whole = np.concatenate([jacobian(formula, block) for block in _blocks(rows)])
+        _require_states(whole, n)
         whole = whole.reshape(*batch, *whole.shape[1:])
         A, B = whole[..., :n], whole[..., n:]
         return (A + np.eye(n) if self.increments else A), B
+
+    def _require_features(self, x: Array, u: Array) -> None:
+        n, m = x.shape[-1], u.shape[-1]
+        if n + m != self.features:
+            raise ShapeError(f"the regressor was fitted on {self.features} features, got {n} states and {m} inputs.")
 
     def _predicted(self, rows: Array) -> Array:
         """Return the outputs ``(N, n)`` for rows ``(N, n + m)``; NaN for rows that are not finite.
@@ -129,6 +136,11 @@ class ScikitLearn:
         learned = None if self.data is None else len(self.data)
         regressor = name_of(type(self.regressor))
         return call(self, regressor, features=self.features, increments=self.increments, transitions=learned)
+
+
+def _require_states(outputs: Array, n: int) -> None:
+    if outputs.shape[1] != n:
+        raise ShapeError(f"the regressor must predict as many states as it takes, {n}, got shape {outputs.shape}.")
 
 
 def _pairs(x: Array, u: Array) -> Array:
