@@ -26,18 +26,22 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 
 def beside_landed(script: str | Path, *arguments: str, revision: str = LANDED) -> tuple[Any, Any]:
-    """Return the figures that a script reports with the earlier package, and with the present one.
+    """Return the figures that a script reports with the earlier package, and with the present one."""
+    return figures(script, *arguments, revision=revision), figures(script, *arguments)
+
+
+def figures(script: str | Path, *arguments: str, revision: str | None = None) -> Any:
+    """Return the figures that a script reports with the package of one revision.
 
     Args:
         script: the file of the script.
         arguments: its command line.
-        revision: the earlier revision.
+        revision: the revision; None for this checkout.
 
     Raises:
         RuntimeError: if the revision is not in this repository, or the script fails; the message has its output.
     """
-    earlier = _figures(Path(_tree(revision).name), script, arguments)
-    return earlier, _figures(_ROOT, script, arguments)
+    return _figures(_ROOT if revision is None else Path(_tree(revision).name), script, arguments)
 
 
 def report(figures: Any) -> None:
