@@ -12,6 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.describe import rounded
 from ctxval._util.representation import call
+from ctxval.campaign.history import executed_trials
 from ctxval.certificates.dynamics import PREDICTIONS
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
@@ -64,12 +65,11 @@ class CampaignDynamics:
         self.experiment = hashlib.sha256(text.encode()).hexdigest()[:16]
         self._study = DynamicsStudy(validation, seed)
         self._store = store
-        self._trajectories: dict[int, Trajectory | None] = {}
         self._learned: dict[tuple[int, ...], LearnedDynamics | None] = {}
 
     def learned(self, trials: Sequence[Trial]) -> LearnedDynamics | None:
         """Return what the completed trials teach; None if they teach nothing."""
-        executed = self._executed(trials)
+        executed = executed_trials(self._store, trials)
         key = tuple(trial.number for trial, _ in executed)
         if key not in self._learned:
             if len(self._learned) == _REMEMBERED:
@@ -125,17 +125,6 @@ class CampaignDynamics:
         except Exception:  # the same
             return None
 
-    def _executed(self, trials: Sequence[Trial]) -> list[tuple[Trial, Trajectory]]:
-        """Return the completed trials that have a trajectory."""
-        completed = [trial for trial in trials if trial.state == "completed"]
-        found = ((trial, self._trajectory(trial)) for trial in completed)
-        return [(trial, trajectory) for trial, trajectory in found if trajectory is not None]
-
-    def _trajectory(self, trial: Trial) -> Trajectory | None:
-        if trial.number not in self._trajectories:
-            self._trajectories[trial.number] = self._store.trajectory(trial.number, "system")
-        return self._trajectories[trial.number]
-
     def _checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:
         """Return the predictions of completed trials; of those without a stored one, of the last few only.
 
@@ -169,7 +158,7 @@ class CampaignDynamics:
         distance = trial.distance or 0.0
         if prediction is None:
             return CheckedPrediction(trial.number, np.nan, np.inf, np.inf, distance, **how)
-        trajectory = self._trajectory(trial)
+        trajectory = self._store.trajectory(trial.number, "system")
         score = None if trajectory is None else prediction.score(trajectory, distance)
         z2, rank = (np.nan, np.nan) if score is None else (score.z2, score.rank)
         return CheckedPrediction(trial.number, rank, prediction.median, prediction.upper, distance, z2, **how)

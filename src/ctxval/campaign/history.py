@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
+from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
+from ctxval.learning.error_vectors import ErrorVectors
 from ctxval.learning.prediction import predict_distance
 from ctxval.searches import Prediction
 from ctxval.storage.store import Store
@@ -32,20 +34,27 @@ def history_of(trials: Sequence[Trial]) -> list[Trial]:
     return history
 
 
-def predict_from(validation: Validation, store: Store, trials: Sequence[Trial]) -> Prediction | None:
+def executed_trials(store: Store, trials: Sequence[Trial]) -> list[tuple[Trial, Trajectory]]:
+    """Return the completed trials that have a trajectory of the system, with these trajectories."""
+    completed = [trial for trial in trials if trial.state == "completed"]
+    found = store.trajectories([trial.number for trial in completed], "system")
+    return [(trial, found[trial.number]) for trial in completed if trial.number in found]
+
+
+def predict_from(
+    validation: Validation, store: Store, trials: Sequence[Trial], errors: ErrorVectors | None = None
+) -> Prediction | None:
     """Return the distance predicted from the executed trajectories; None if no prediction is possible.
 
     Args:
         validation: the map p -> d(p).
         store: the store of the trajectories.
         trials: all trials.
+        errors: keeps the vectors of earlier executions.
     """
-    executed = [
-        (trial, trajectory)
-        for trial in trials
-        if trial.state == "completed" and (trajectory := store.trajectory(trial.number, "system")) is not None
-    ]
-    prediction = predict_distance(validation, [(trial.unit_point, trajectory) for trial, trajectory in executed])
+    executed = executed_trials(store, trials)
+    pairs = [(trial.unit_point, trajectory) for trial, trajectory in executed]
+    prediction = predict_distance(validation, pairs, errors)
     known = [trial for trial in history_of(trials) if trial.distance is not None]
     if prediction is None or [trial.number for trial in known] == [trial.number for trial, _ in executed]:
         return prediction

@@ -25,6 +25,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Origin, State, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError, StoreError
+from ctxval.learning.error_vectors import ErrorVectors
 from ctxval.searches import BaseSearch, Search
 from ctxval.storage.store import Store
 
@@ -101,6 +102,7 @@ class TrialRecorder:
         self.draws = IndependentDraws(store, validation, seed)
         self.dynamics = CampaignDynamics(validation, store, seed, description)
         self.predicts = False
+        self._errors = ErrorVectors(validation)
         self._seed = seed
         self._executing: set[int] = set()
         self.replay()
@@ -179,6 +181,7 @@ class TrialRecorder:
         """Continue with another distance, after its values were stored."""
         self.validation, self.description = validation, description
         self.dynamics = CampaignDynamics(validation, self.store, self._seed, description)
+        self._errors = ErrorVectors(validation)
         self.replay()
 
     # Opening
@@ -260,7 +263,7 @@ class TrialRecorder:
     def _proposal(self) -> Array:
         """Return the search's next point ``(d,)``."""
         if self.search.uses_prediction:
-            self.search.use_prediction(predict_from(self.validation, self.store, self._trials))
+            self.search.use_prediction(predict_from(self.validation, self.store, self._trials, self._errors))
         asked = self.search.ask(1)
         try:
             point: Array = np.asarray(asked, dtype=np.float64) if np.isrealobj(asked) else np.array(np.nan)

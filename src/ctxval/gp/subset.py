@@ -13,14 +13,14 @@ LONG = 1000
 """Length of a history from which on only a subset is kept."""
 
 
-def kept_rows(points: Array, values: Array, count: int) -> Rows:
+def kept_rows(points: Array, values: Array, count: int, long: int = LONG) -> Rows:
     """Return the rows that represent a history of points ``(n, d)`` and values ``(n,)``, in their order.
 
-    Below 1,000 points these are all rows. From then on, a quarter of ``count`` rows have the largest values, a quarter
-    are the latest, including pending and failed ones, and the others are far from those and from each other. So the
-    surrogate keeps its knowledge of all regions that the history has explored.
+    Below ``long`` points these are all rows. From then on, a quarter of ``count`` rows have the largest values, a
+    quarter are the latest, including pending and failed ones, and the others are far from those and from each other.
+    So the surrogate keeps its knowledge of all regions that the history has explored.
     """
-    if len(values) < LONG:
+    if len(values) < long:
         return np.arange(len(values))
     largest = np.argsort(-np.nan_to_num(values, nan=-np.inf), kind="stable")[: count // 4]
     latest = np.arange(len(values) - count // 4, len(values))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,9 +16,9 @@ from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.cores import on_all_cores
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.rollout import rollout
-from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.dynamics import CorrectedModel, learn_corrected
+from ctxval.learning.error_vectors import ErrorVectors, Executed
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.vector import predict_composed
 from ctxval.searches import Prediction
@@ -36,7 +35,9 @@ _SLOW = 0.02
 """Seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores."""
 
 
-def predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
+def predict_distance(
+    validation: Validation, executed: Executed, errors: ErrorVectors | None = None
+) -> Prediction | None:
     """Return a prediction of d at other points, from the executions so far and the data that the model was made from.
 
     Returns None if there are no recorded transitions, if M already explains them, or if no task can be planned.
@@ -49,36 +50,23 @@ def predict_distance(validation: Validation, executed: Sequence[tuple[Array, Tra
     Args:
         validation: the map p -> d(p).
         executed: points of the unit cube ``(d,)`` with the system's trajectories there.
+        errors: keeps the vectors of earlier executions, so that a further suggestion computes only new ones.
     """
-    otherwise = functools.partial(_predict_vectors, validation, executed)
+    otherwise = functools.partial(_predict_vectors, validation, executed, errors or ErrorVectors(validation))
     with single_threaded():
         found = _predict_distance(validation, executed)
         return otherwise() if found is None else replace(found, otherwise=otherwise)
 
 
-def _predict_vectors(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
-    """Return the prediction from the vectors of which distances are composed.
-
-    Returns None if the distance is not composed of a vector, or if the vectors are not known for two executions.
-    """
-    distance = validation.distance
-    if not isinstance(distance, ComposedDistance) or len(executed) < 2:
+def _predict_vectors(validation: Validation, executed: Executed, errors: ErrorVectors) -> Prediction | None:
+    """Return the prediction from the vectors of which distances are composed; None if they are not known."""
+    distance, vectors = validation.distance, errors.of(executed)
+    if vectors is None or not isinstance(distance, ComposedDistance):
         return None
-    try:
-        errors = np.array([_vector(validation, distance, *pair) for pair in executed])
-    except Exception:  # the user's own parts: a distance may reject even tasks that were executed
-        return None
-    if errors.ndim != 2 or not np.isfinite(errors).all():
-        return None
-    return predict_composed(np.array([point for point, _ in executed]), errors, distance.compose)
+    return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)
 
 
-def _vector(validation: Validation, distance: ComposedDistance, point: Array, trajectory: Trajectory) -> Array:
-    plan = validation.plan(validation.space.from_unit(point))
-    return distance.error(plan.model_trajectory, trajectory, plan.task)
-
-
-def _predict_distance(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> Prediction | None:
+def _predict_distance(validation: Validation, executed: Executed) -> Prediction | None:
     started = time.perf_counter()
     loops = closed_loops_on_model(validation)
     seconds = time.perf_counter() - started
@@ -113,7 +101,7 @@ class _PredictedDistance:
     validation: Validation
     corrected: CorrectedModel
     batched: bool
-    executed: Sequence[tuple[Array, Trajectory]]
+    executed: Executed
     in_parallel: bool
 
     def __call__(self, points: Array) -> tuple[Array, Array]:

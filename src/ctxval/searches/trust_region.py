@@ -14,14 +14,16 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
-from ctxval._util.arrays import Array, Mask, single_threaded
+from ctxval._util.arrays import Array, Mask, Rows, single_threaded
 from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.gp.acquisition import Box
 from ctxval.gp.ascent import Ascent
 from ctxval.gp.kernels import Matern
 from ctxval.gp.regression import GaussianProcess, condition
+from ctxval.gp.subset import kept_rows
 from ctxval.gp.surrogate import fit_surrogate
 from ctxval.searches.base import Note, Prediction, SequentialSearch, best_first
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
@@ -36,6 +38,10 @@ _NOISE = 1e-4
 """Noise variance of the discrepancy, as a share of its variance."""
 _CALIBRATED = 3
 """Number of executions from which on the optimism is estimated from their errors."""
+_REPRESENTING = 150
+"""Largest number of known values from which the discrepancy and the surrogate's errors are computed."""
+_FIRST = 16
+"""Number of the best points of an ascent that are compared with the history first."""
 _ENGINE = "climb"
 """The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
 
@@ -178,7 +184,9 @@ class TrustRegion(SequentialSearch):
         error = _log_error(prediction.left_out(rows), values[rows])
         if error <= self._settings.good_enough:
             return None
-        surrogate = _log_error(_left_out(self.points[known], values)[rows], values[rows])
+        kept = _represented(self.points[known], values)  # it ends with the latest values, which are compared
+        by_surrogate = _left_out(self.points[known][kept], values[kept])[-len(rows) :]
+        surrogate = _log_error(by_surrogate, values[rows])
         if error <= surrogate:
             return None
         return f"leaving one out, the prediction errs by {error:.2g} where the surrogate errs by {surrogate:.2g}"
@@ -220,6 +228,8 @@ class TrustRegion(SequentialSearch):
         if not self._settings.correct_discrepancy or not known.any():
             return None
         points, values = self.points[known], self.values[known]
+        kept = _represented(points, values)
+        points, values = points[kept], values[kept]
         expected = prediction.expected(points)[0]
         floor = max(_LOG_OFFSET * float(np.median(values)), 1e-12)
         ratio = np.log(values + floor) - np.log(np.maximum(expected, 0.0) + floor)
@@ -246,8 +256,13 @@ class TrustRegion(SequentialSearch):
         budget = min(value.prediction.budget, self._settings.points * self.dimension)
         ascent = Ascent(value, *region.box(self.dimension), budget)
         points, promised = ascent.run(best_first(self.points, self.values)[:8], rng)
-        new = self._is_new(points) & np.isfinite(promised)
-        return np.asarray(points[np.argmax(new)]) if new.any() else None
+        usable = points[np.isfinite(promised)]
+        # The first few suffice almost always, and a long history makes each comparison costly.
+        for some in np.split(usable, [_FIRST]):
+            new = self._is_new(some)
+            if new.any():
+                return np.asarray(some[np.argmax(new)])
+        return None
 
     def _noted(self, prediction: Prediction, point: Array | None, region: _Region) -> Array | None:
         """Return the next point of a region unchanged, and record the prediction for it in the note."""
@@ -264,13 +279,11 @@ class TrustRegion(SequentialSearch):
         return point
 
     def _is_new(self, points: Array) -> Mask:
-        known = np.isfinite(self.values)
-        new = np.ones(len(points), dtype=bool)
-        for point, is_known in zip(self.points, known, strict=True):
-            gap = np.abs(points - point).max(axis=1)
-            far = np.linalg.norm(points - point, axis=1) > self._settings.apart * np.sqrt(self.dimension)
-            new &= gap > self._settings.distinct if is_known else far
-        return new
+        """Return which of some points ``(m, d)`` are far enough from all known, pending and failed ones."""
+        known, reach = np.isfinite(self.values), self._settings.apart * np.sqrt(self.dimension)
+        gaps = cdist(points, self.points[known], "chebyshev").min(axis=1, initial=np.inf)
+        others = cdist(points, self.points[~known]).min(axis=1, initial=np.inf)
+        return np.asarray((gaps > self._settings.distinct) & (others > reach))
 
     def _state(self) -> _Region:
         """Return the state of the last region."""
@@ -331,6 +344,11 @@ def _log_error(expected: Array, values: Array) -> float:
         return np.inf
     floor = max(_ERROR_OFFSET * float(np.median(values)), 1e-12)
     return float(np.abs(np.log(np.maximum(expected, 0.0) + floor) - np.log(values + floor)).mean())
+
+
+def _represented(points: Array, values: Array) -> Rows:
+    """Return the rows of a long history that represent all of it, in their order; they end with the latest ones."""
+    return kept_rows(points, values, _REPRESENTING, long=_REPRESENTING)
 
 
 def _left_out(points: Array, values: Array) -> Array:

@@ -22,7 +22,8 @@ from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError, InputError, StoreAccessError
 from ctxval.storage import schema
 from ctxval.storage.rows import CHECKED, COLUMNS, read_json, read_trajectory, read_trial, trial_checksum
-from ctxval.storage.store import Side, Store
+from ctxval.storage.store import Store
+from ctxval.storage.trajectories import Side
 
 _PROBED = 10_000
 """Number of row numbers to try if the file does not tell how many rows there are."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from ctxval._util.representation import Shown, call
 from ctxval.core.trajectory import Trajectory
@@ -18,16 +18,13 @@ from ctxval.storage.database import Database, now
 from ctxval.storage.rows import (
     COLUMNS,
     ENDED,
-    checksum_of,
     ended_row,
-    read_trajectory,
     read_trial,
     real,
     row_of,
     trial_checksum,
 )
-
-Side = Literal["model", "system"]
+from ctxval.storage.trajectories import Side, StoredTrajectories
 
 _DRAWS = "draws"
 """Key in the table experiment that is not part of the description of the experiment."""
@@ -48,6 +45,7 @@ class Store:
 
     def __init__(self, path: str | Path | None = None) -> None:
         self._database = self._opened(path)
+        self._trajectories = StoredTrajectories(self._database)
 
     def _opened(self, path: str | Path | None) -> Database:
         return Database(path)
@@ -329,27 +327,24 @@ class Store:
         Raises:
             ForeignStoreError: if the trajectory is damaged.
         """
-        where = "FROM trajectories {} WHERE trial = ? AND side = ?"
-        with self._database.translated_errors():
-            row = self._database.execute(f"SELECT npz, checksum {where.format('')}", (number, side)).fetchone()
-            # A damaged index may hide a row. The search without the index is slower, so it runs only if none is found.
-            hidden = (
-                row is None
-                and self._database.execute(f"SELECT 1 {where.format('NOT INDEXED')}", (number, side)).fetchone()
-            )
-        if row is None and not hidden:
-            return None
-        found = None if row is None else read_trajectory(number, side, *row)
-        if found is None:
-            raise self._database.damaged(f"the {side}'s trajectory of its trial {number} cannot be read")
-        return found
+        return self.trajectories([number], side).get(number)
+
+    def trajectories(self, numbers: Iterable[int], side: Side) -> dict[int, Trajectory]:
+        """Return stored trajectories by the numbers of their trials; a trial without one is left out.
+
+        Those of the system are kept in memory, up to 512 MiB, so that they are read once. Their arrays are read-only.
+
+        Args:
+            numbers: the numbers of the trials.
+            side: ``"model"`` or ``"system"``.
+
+        Raises:
+            ForeignStoreError: if a trajectory is damaged.
+        """
+        return self._trajectories.read(numbers, side)
 
     def _write_trajectory(self, number: int, side: Side, trajectory: Trajectory) -> None:
-        npz = trajectory.to_npz()
-        self._database.execute(
-            "INSERT INTO trajectories (trial, side, npz, checksum) VALUES (?, ?, ?, ?)",
-            (number, side, npz, checksum_of((number, side, npz))),
-        )
+        self._trajectories.write(number, side, trajectory)
 
     def __repr__(self) -> str:
         place = Shown("in memory") if self.path is None else self.path

@@ -1,0 +1,56 @@
+"""The vectors of which the distances of executions are composed, such as errors of the final state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import call
+from ctxval.core.distance import ComposedDistance
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.validation import Validation
+
+Executed = Sequence[tuple[Array, Trajectory]]
+"""Points of the unit cube ``(d,)`` with the system's trajectories there."""
+
+
+class ErrorVectors:
+    """Computes the vectors of executions; each needs the design of a controller, so they are kept.
+
+    A vector is kept as long as its trajectory is.
+
+    Args:
+        validation: the map p -> d(p).
+    """
+
+    def __init__(self, validation: Validation) -> None:
+        self.validation = validation
+        self._known: WeakKeyDictionary[Trajectory, Array] = WeakKeyDictionary()
+
+    def of(self, executed: Executed) -> Array | None:
+        """Return the vectors of executions ``(n, k)``.
+
+        Returns None if the distance is not composed of a vector, or if there are fewer than two executions, or if a
+        vector cannot be computed.
+        """
+        distance = self.validation.distance
+        if not isinstance(distance, ComposedDistance) or len(executed) < 2:
+            return None
+        try:
+            errors = np.array([self._of(distance, *pair) for pair in executed])
+        except Exception:  # the user's own parts: a distance may reject even tasks that were executed
+            return None
+        return errors if errors.ndim == 2 and np.isfinite(errors).all() else None
+
+    def _of(self, distance: ComposedDistance, point: Array, trajectory: Trajectory) -> Array:
+        known = self._known.get(trajectory)
+        if known is None:
+            plan = self.validation.plan(self.validation.space.from_unit(point))
+            known = self._known[trajectory] = distance.error(plan.model_trajectory, trajectory, plan.task)
+        return known
+
+    def __repr__(self) -> str:
+        return call(self, self.validation)
