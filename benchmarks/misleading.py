@@ -29,14 +29,13 @@ from ctxval import (
     distances,
     models,
     search_truth,
-    searches,
     systems,
 )
 from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
 from ctxval.core.controller import Controller
 from ctxval.systems.integrate import Derivative
-from study_auto import Result, add_options, campaign, print_table, stored
+from study_auto import Result, add_options, campaign, print_table, search_named, stored
 
 HORIZON, DT = 60, 0.05
 """Steps, and s."""
@@ -248,7 +247,7 @@ def run(case: str, seed: int, search: str, results: JsonLines, truths: Path) -> 
 
     def compute() -> Result:
         found = CASES[case](seed)
-        return campaign(found.validation, searches.by_name(search), seed, BUDGET, truth(found, truths))
+        return campaign(found.validation, search_named(search), seed, BUDGET, truth(found, truths))
 
     return stored(results, case, seed, search, compute)
 

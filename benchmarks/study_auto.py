@@ -88,6 +88,11 @@ def campaign(validation: Validation, search: searches.Search, seed: int, budget:
     }
 
 
+def search_named(name: str) -> searches.Search:
+    """Return a search; ``auto`` thinks thoroughly, so that its choices do not depend on the speed of the machine."""
+    return searches.by_name(name, **({"thinking": "thorough"} if name == "auto" else {}))
+
+
 def results_of(study: str) -> JsonLines:
     """Return the stored results of a study: of this one, ``scalar``, ``ablations`` or ``misleading``."""
     return JsonLines(RESULTS / f"{study}.jsonl", KEY)
@@ -107,7 +112,7 @@ def run(case: str, seed: int, search: str, results: JsonLines, truths: Path) -> 
     def compute() -> Result:
         found = experiment(case, seed)
         best_known = truth(case, found, truths)
-        result = campaign(found.validation, searches.by_name(search), seed, CASES[case][3], best_known)
+        result = campaign(found.validation, search_named(search), seed, CASES[case][3], best_known)
         random = best_of_random(found.validation, seed) if case.startswith("dubins") else None
         return {**result, "random": random}
 

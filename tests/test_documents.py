@@ -53,7 +53,7 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_the_experiment_file_of_the_readme_is_valid() -> None:
     settings = Settings.model_validate(tomllib.loads(block("README.md", "toml", "experiment")))
-    assert settings.search.build().designs == 500  # type: ignore[attr-defined]
+    assert settings.search.build().thinking == "balanced"  # type: ignore[attr-defined]
 
 
 def test_the_search_of_the_contributing_guide_conforms() -> None:

@@ -222,6 +222,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "searches.Auto": searches.Auto,
     "searches.BayesianOptimisation": searches.BayesianOptimisation,
     "searches.CMAES": searches.CMAES,
+    "searches.Costs": lambda: searches.Costs(0.01, 2.0),
     "searches.GPUCB": searches.GPUCB,
     "searches.Prediction": lambda: searches.Prediction(lambda points: (points, points), lambda rows: rows, 150),
     "searches.Random": searches.Random,
@@ -419,7 +420,7 @@ def test_a_campaign_shows_how_far_it_is() -> None:
     assert worst is not None
     head, search, trials, largest, store = repr(campaign()).splitlines()
     assert head == "Campaign(TaskSpace(goal=(-3, 3, 'rad')), name='pendulum', seed=1)"
-    assert search.startswith("  search: Auto(optimism=2, misses=3, ")
+    assert search.startswith("  search: Auto(thinking='balanced', optimism=2, misses=3, ")
     assert trials == "  trials: 7 (7 executions, 7 completed)"
     assert largest == f"  worst: trial {worst.number} with distance {worst.distance:.4g} at goal={_goal(worst):.4g} rad"
     assert store == "  store: Store(in memory, trials=7, open=0)"

@@ -17,7 +17,7 @@ from peers.recorder import Recorder, Suggest, Suggesting
 def auto(values: Recorder, dimension: int, budget: int, seed: int) -> None:
     """Maximise with whole trajectories, the model and its data: a campaign as a user has it."""
     validation = values.function.validation
-    campaign = Campaign(validation, search=searches.Auto(), seed=seed)
+    campaign = Campaign(validation, search=searches.Auto("thorough"), seed=seed)
     for known in values.outcomes:
         named = validation.space.describe_point(known.plan.parameters.points)
         campaign.tell(campaign.ask(named), known.system_trajectory)

@@ -50,9 +50,11 @@ def test_running_in_pieces_equals_running_at_once(tmp_path: Path, with_data: boo
     def validation() -> Validation:
         return make_validation() if with_data else no_data(make_validation())
 
-    whole = Campaign(validation(), search=searches.Auto(), seed=2).run(7)
+    whole = Campaign(validation(), search=searches.Auto("thorough"), seed=2).run(7)
     for budget in (1, 2, 4, 7):
-        pieces = Campaign(validation(), search=searches.Auto(), seed=2, store=tmp_path / "a.sqlite").run(budget)
+        pieces = Campaign(validation(), search=searches.Auto("thorough"), seed=2, store=tmp_path / "a.sqlite").run(
+            budget
+        )
     assert facts(pieces) == facts(whole)
     assert any(t.note is not None and t.note["engine"] == "climb" for t in whole.trials)
 
@@ -71,12 +73,16 @@ def test_an_interrupted_execution_and_failures_change_nothing_that_is_chosen(tmp
         def describe(self) -> dict[str, object]:
             return {}
 
-    whole = Campaign(make_validation(system=Rig(make_validation().system, {2: "raise"})), search=searches.Auto()).run(6)
+    whole = Campaign(
+        make_validation(system=Rig(make_validation().system, {2: "raise"})), search=searches.Auto("thorough")
+    ).run(6)
     rig = Rig(make_validation().system, {2: "raise"})
     rig.interrupt = True
     with pytest.raises(KeyboardInterrupt):
-        Campaign(make_validation(system=rig), search=searches.Auto(), store=tmp_path / "a.sqlite").run(6)
-    resumed = Campaign(make_validation(system=rig), search=searches.Auto(), store=tmp_path / "a.sqlite").run(6)
+        Campaign(make_validation(system=rig), search=searches.Auto("thorough"), store=tmp_path / "a.sqlite").run(6)
+    resumed = Campaign(make_validation(system=rig), search=searches.Auto("thorough"), store=tmp_path / "a.sqlite").run(
+        6
+    )
     assert facts(resumed) == facts(whole)
     assert [t.attempts for t in resumed.trials] == [1] * 4 + [2] + [1]
 

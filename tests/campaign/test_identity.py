@@ -258,6 +258,7 @@ def with_older_names(path: Path) -> str:
         (text,) = connection.execute("SELECT value FROM experiment WHERE key = 'search'").fetchone()
         for present, old in (("BayesianOptimisation", "Scalar"), ("TrustRegion", "Climbs")):
             text = text.replace(f'"{present}"', f'"{old}"').replace(f'"ctxval.{present}', f'"ctxval.{old}')
+        text = text.replace('"thinking": "balanced"', '"designs": null').replace('"thinking": 40', '"designs": 40')
         connection.execute("UPDATE experiment SET value = ? WHERE key = 'search'", (text,))
         connection.commit()
     return str(text)
@@ -270,6 +271,9 @@ def with_older_names(path: Path) -> str:
         (searches.BayesianOptimisation, '"type": "Scalar"'),
         (searches.TrustRegion, '"type": "Climbs"'),
         (lambda: searches.Repeated(searches.Scalar(), 2), '{"type": "Scalar"'),
+        (searches.Auto, '"designs": null'),
+        (lambda: searches.Auto(40), '"designs": 40'),
+        (lambda: searches.Repeated(searches.Auto(40), 2), '"designs": 40'),
         (Own, '"ctxval.Scalar'),
     ],
 )
@@ -294,13 +298,14 @@ def test_a_store_with_the_older_name_of_a_search_goes_on(
     "search",
     [
         SEARCH(beta=3.0, noise=(1e-6, 0.5)),
-        searches.Auto(designs=40),
+        searches.Auto(40),
+        searches.Auto("fast"),
         searches.Random(),
         searches.SamplingDiscarding(2),
         searches.Annealing(cooling=0.9),
         searches.Repeated(searches.Scalar(initial=2), 2),
     ],
-    ids=lambda search: type(search).__name__,
+    ids=repr,
 )
 def test_a_campaign_goes_on_with_the_search_that_its_store_was_made_with(tmp_path: Path, search: Any) -> None:
     whole = Campaign(make_validation(), search=search, seed=2).run(6)

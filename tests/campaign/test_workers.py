@@ -20,7 +20,7 @@ import pytest
 import rig_cluster
 from conftest import make_validation
 from ctxval import Campaign, Store, Task, Trajectory, Trial, controllers, searches
-from ctxval.campaign.trials import Choice
+from ctxval.campaign.choices import Choice
 from ctxval.errors import CampaignError, InputError, ModelError
 from ctxval.testing import FaultyRig
 from rig_workers import Logging

@@ -223,6 +223,6 @@ def test_without_its_correction_a_prediction_is_taken_as_it_is() -> None:
 
 def test_a_store_has_the_settings_if_they_are_not_the_usual_ones() -> None:
     assert describe(TrustRegion()) == {"type": "TrustRegion", "optimism": 2.0, "misses": 3}
-    assert describe(Auto()) == {"type": "Auto", "optimism": 2.0, "misses": 3, "designs": None}
+    assert describe(Auto()) == {"type": "Auto", "optimism": 2.0, "misses": 3, "thinking": "balanced"}
     other = describe(TrustRegion(settings=TrustRegionSettings(first_radius=0.3)))
     assert other["settings"]["first_radius"] == 0.3

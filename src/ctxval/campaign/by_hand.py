@@ -13,8 +13,8 @@ from typing import Any
 
 from ctxval._util.files import csv_rows
 from ctxval._util.texts import unguarded
+from ctxval.campaign.choices import OpenTrial
 from ctxval.campaign.known import KnownExecution, TrialResult, check_known
-from ctxval.campaign.trials import OpenTrial
 from ctxval.core.controller import AffineFeedback
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.experiment import Experiment, labels_of

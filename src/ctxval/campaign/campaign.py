@@ -11,11 +11,12 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.campaign import display, remeasuring
+from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.identity import description_of, identify, search_of
 from ctxval.campaign.known import KnownExecution, TrialResult, check_known, measurement_of
 from ctxval.campaign.results import CampaignResults
-from ctxval.campaign.trials import Choice, OpenTrial, TrialRecorder
+from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.until_decided import UntilDecided
 from ctxval.campaign.workers import WorkerPool, worker_pool
 from ctxval.certificates import RESOLUTION, CertificateOptions

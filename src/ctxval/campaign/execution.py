@@ -7,8 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ctxval._util.interrupts import Interrupts, exits_as_exceptions
+from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.remeasuring import remeasure
-from ctxval.campaign.trials import Choice, OpenTrial, TrialRecorder
+from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import ExecutionResult, WorkerPool, execute_task
 from ctxval.core.plan import Measurement, Plan
 from ctxval.core.trial import Trial

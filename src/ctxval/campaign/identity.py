@@ -15,7 +15,8 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Change, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreMismatchError
-from ctxval.searches import DEFAULT, NAMES, Repeated, Search, by_name
+from ctxval.searches import DEFAULT, NAMES, Auto, Repeated, Search, by_name
+from ctxval.searches.auto import present_options
 from ctxval.storage.store import Store
 
 VERSION = 2
@@ -58,7 +59,7 @@ def search_of(store: Store) -> Search:
 
 
 def _search_described(described: Any) -> Search | None:
-    """Return a search of this package from its description; None if it is another one or an option is not a number."""
+    """Return a search of this package from its description; None if it is another one or has other options."""
     if not isinstance(described, dict):
         return None
     if described.get("type") == Repeated.__name__:
@@ -79,7 +80,7 @@ def _ready_made(described: Any) -> Search | None:
         return None
     default = _plain(kind())
     options = {name: value for name, value in described.items() if value != default.get(name)}
-    if not all(_is_numeric(value) for value in options.values()):
+    if not all(_is_numeric(value) or isinstance(default.get(name), str) for name, value in options.items()):
         return None
     try:
         search: Search = kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in options.items()})
@@ -250,14 +251,15 @@ _RENAMED = {"Scalar": "BayesianOptimisation", "Climbs": "TrustRegion"}
 
 
 def _with_present_names(stored: dict[str, Any]) -> dict[str, Any]:
-    """Return a stored description with the present names of the classes of searches; the store keeps the old ones.
+    """Return a stored description with the present names of searches and their options; the store keeps the old ones.
 
     A search may be inside another one, such as ``Repeated``, or in the code of a user's search.
     """
 
     def renamed(value: Any, key: str = "") -> Any:
         if isinstance(value, dict):
-            return {name: renamed(item, name) for name, item in value.items()}
+            items = {name: renamed(item, name) for name, item in value.items()}
+            return present_options(items) if items.get("type") == Auto.__name__ else items
         if isinstance(value, list):
             return [renamed(item) for item in value]
         if not isinstance(value, str):

@@ -2,74 +2,31 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call, lines
-from ctxval._util.texts import shortened, text_of
-from ctxval.campaign.dynamics import AUDIT, PREDICTION, CampaignDynamics
+from ctxval._util.texts import text_of
+from ctxval.campaign.choices import Choice, OpenTrial
+from ctxval.campaign.dynamics import CampaignDynamics
 from ctxval.campaign.fallback import error_with_fallback
-from ctxval.campaign.history import history_of, predict_from
+from ctxval.campaign.history import history_of
 from ctxval.campaign.identity import identify
 from ctxval.campaign.independent_draws import IndependentDraws
 from ctxval.campaign.known import KnownExecution, is_execution_of
+from ctxval.campaign.proposals import Proposals
 from ctxval.certificates import PLANNED
 from ctxval.core.plan import Measurement, Plan
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Origin, State, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError, StoreError
-from ctxval.learning.error_vectors import ErrorVectors
 from ctxval.searches import BaseSearch, Search
 from ctxval.storage.store import Store
-
-
-@dataclass(frozen=True, eq=False)
-class OpenTrial:
-    """A trial to be executed, with everything that an operator needs for the execution.
-
-    Attributes:
-        trial: the stored trial.
-        plan: its task, its controller and the trajectory of the model.
-    """
-
-    trial: Trial
-    plan: Plan
-
-    @property
-    def number(self) -> int:
-        """The number of the trial."""
-        return self.trial.number
-
-    def __repr__(self) -> str:
-        parts = repr(self.plan).splitlines()[1:]
-        return lines(call(self, self.number, origin=self.trial.origin), *(part.strip() for part in parts))
-
-
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """The task of a new trial.
-
-    Attributes:
-        unit_point: point of the unit cube, shape ``(d,)``; None if the search chooses it.
-        origin: the reason for this point; not used if the search chooses the point.
-        because: the change that was made to the system since the task was executed before.
-        planned_draws: the planned number of independent draws, which is stored with each draw; 0 if the results decide
-            the number, None if it is not known.
-        note: what is recorded about the choice, in types that JSON has.
-    """
-
-    unit_point: Array | None = None
-    origin: Origin = "acquisition"
-    because: str | None = None
-    planned_draws: int | None = None
-    note: dict[str, Any] | None = None
 
 
 class TrialRecorder:
@@ -102,7 +59,7 @@ class TrialRecorder:
         self.draws = IndependentDraws(store, validation, seed)
         self.dynamics = CampaignDynamics(validation, store, seed, description)
         self.predicts = False
-        self._errors = ErrorVectors(validation)
+        self._proposals = Proposals(validation, self.search, store)
         self._seed = seed
         self._executing: set[int] = set()
         self.replay()
@@ -181,7 +138,7 @@ class TrialRecorder:
         """Continue with another distance, after its values were stored."""
         self.validation, self.description = validation, description
         self.dynamics = CampaignDynamics(validation, self.store, self._seed, description)
-        self._errors = ErrorVectors(validation)
+        self._proposals = Proposals(validation, self.search, self.store)
         self.replay()
 
     # Opening
@@ -247,8 +204,8 @@ class TrialRecorder:
             # The points of such a search are uniform, and the tasks are not.
             choice = replace(choice, unit_point=self.draw(), origin="iid")
         if choice.unit_point is None:
-            unit_point, origin = self._proposal(), self._origin()
-            note = _plain_note(self.search.note())
+            origin = self._origin()
+            unit_point, note = self._proposals.next(self._trials)
         else:
             unit_point, origin, note = choice.unit_point, choice.origin, choice.note
             self.search.tell(unit_point[None], [np.nan])
@@ -259,22 +216,6 @@ class TrialRecorder:
         parameters = self.validation.space.describe_point(self.validation.space.from_unit(unit_point))
         number = len(self._trials)
         return Trial(number, origin, "open", unit_point, parameters, attempts, note=note, because=choice.because)
-
-    def _proposal(self) -> Array:
-        """Return the search's next point ``(d,)``."""
-        if self.search.uses_prediction:
-            self.search.use_prediction(predict_from(self.validation, self.store, self._trials, self._errors))
-        asked = self.search.ask(1)
-        try:
-            point: Array = np.asarray(asked, dtype=np.float64) if np.isrealobj(asked) else np.array(np.nan)
-        except (TypeError, ValueError):
-            point = np.array(np.nan)
-        if point.shape != (1, self.validation.space.dimension) or not ((point >= 0) & (point <= 1)).all():
-            raise InputError(
-                f"a search must return points of the unit cube, shape (1, {self.validation.space.dimension}), "
-                f"got {shortened(repr(asked), 200)}."
-            )
-        return np.asarray(point[0])
 
     def _origin(self) -> Origin:
         if self.search.iid:
@@ -394,19 +335,3 @@ class TrialRecorder:
                 raise InputError(refusal) from error
             self.refresh()
             yield
-
-
-def _plain_note(note: Any) -> dict[str, Any] | None:
-    """Return a search's note, which is stored as JSON.
-
-    Raises:
-        InputError: if it is not a dictionary of plain values, or has a key of the campaign's own.
-    """
-    if isinstance(note, dict) and {PREDICTION, AUDIT} & set(note):
-        raise InputError(f"the note of a search must not have the keys {PREDICTION!r} and {AUDIT!r}.")
-    try:
-        if note is None or (isinstance(note, dict) and json.dumps(note, allow_nan=False)):
-            return note
-    except (TypeError, ValueError):
-        pass
-    raise InputError(f"the note of a search must be a dictionary of plain values for JSON, got {note!r}.")

@@ -14,8 +14,9 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import record
+from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import AUDIT, NEAR
-from ctxval.campaign.trials import Choice, TrialRecorder
+from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic

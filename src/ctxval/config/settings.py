@@ -23,6 +23,7 @@ from ctxval.errors import InputError, UnknownNameError
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH
 from ctxval.searches import REGISTRY as SEARCHES
 from ctxval.searches import Search, by_name
+from ctxval.searches.auto import present_options
 from ctxval.storage.store import Store
 
 
@@ -308,8 +309,11 @@ def _of_store(kept: dict[str, Any]) -> Settings:
             "the store does not name its experiment, because it was not made by a command: name the experiment with "
             "--experiment FILE.toml."
         )
+    plain, search = unsigned(kept), kept.get("search")
+    if isinstance(search, dict) and search.get("name") == "auto":
+        plain = {**plain, "search": present_options(search)}
     try:
-        return Settings.model_validate(unsigned(kept))
+        return Settings.model_validate(plain)
     except ValidationError as error:
         raise InputError(_sentence("the store's settings", error)) from error
 

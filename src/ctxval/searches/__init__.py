@@ -7,7 +7,7 @@ from typing import Any
 from ctxval._util.registry import Registry
 from ctxval.searches.annealing import Annealing
 from ctxval.searches.auto import Auto
-from ctxval.searches.base import BaseSearch, Note, Prediction, Search, SequentialSearch
+from ctxval.searches.base import BaseSearch, Costs, Note, Prediction, Search, SequentialSearch
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 from ctxval.searches.cma_es import CMAES
 from ctxval.searches.gp_ucb import GPUCB
@@ -26,6 +26,7 @@ __all__ = [
     "BaseSearch",
     "BayesianOptimisation",
     "Climbs",
+    "Costs",
     "Note",
     "Prediction",
     "Random",

@@ -3,11 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, Literal
 
+import numpy as np
+
+from ctxval._util.arrays import Array
 from ctxval._util.registry import part
 from ctxval.errors import InputError
-from ctxval.searches.base import Prediction
+from ctxval.searches.base import Costs, Prediction
 from ctxval.searches.trust_region import TrustRegion
+
+Thinking = Literal["balanced", "fast", "thorough"]
+
+_SHARES = (1.0, 0.4, 0.15)
+"""Shares of the largest number of points that are predicted for one choice, from thorough to fast."""
+_SHORT = 1.0
+"""Seconds for which a search may think in any case."""
+_SUPPOSED = 10.0
+"""Seconds of an execution that are supposed before one was timed."""
+
+DESIGNS = "designs"
+"""Key in a note: the number of points that are predicted for each choice of the campaign."""
 
 
 @part("auto")
@@ -15,25 +31,84 @@ class Auto(TrustRegion):
     """Trust-region search on the distance that executed trajectories predict; Bayesian optimisation without them.
 
     Args:
-        designs: largest number of controllers that are designed for one suggestion; by default 2,000 if they are
-            designed in batches, and 150 if they are designed one after the other.
+        thinking: how many tasks are predicted for one suggestion; each needs the design of a controller.
+            ``"thorough"``: at most 2,000 if controllers are designed in batches and 150 if they are designed one after
+            the other, and at most 400 for each task parameter. ``"fast"``: 15 % of that. ``"balanced"``: 15 %, 40 % or
+            all of that, whichever is the largest number that takes no longer than one execution or 1 s. This is
+            measured once, after the first execution, and stored in a note; so another campaign with the same seed may
+            make other choices. A whole number: at most so many, whatever they cost.
         optimism, misses: see :class:`TrustRegion`.
 
     Raises:
-        InputError: if designs or misses is below 1, or the optimism is negative or infinite.
+        InputError: if the thinking is none of these, misses is below 1, or the optimism is negative or infinite.
     """
 
-    def __init__(self, designs: int | None = None, optimism: float = 2.0, misses: int = 3) -> None:
+    def __init__(self, thinking: Thinking | int = "balanced", optimism: float = 2.0, misses: int = 3) -> None:
         super().__init__(optimism, misses)
-        if designs is not None and designs < 1:
-            raise InputError(f"designs must be at least 1, got {designs}.")
-        self.designs = designs
+        self.thinking = _checked(thinking)
+        self._fixed_now: int | None = None
 
     def use_prediction(self, prediction: Prediction | None) -> None:
         """Take the prediction for the point that is asked for next; None if there is none."""
+        self._fixed_now = None
         super().use_prediction(prediction if prediction is None else self._afforded(prediction))
 
+    def propose(self, rng: np.random.Generator) -> Array:
+        """Return the next point; if the number of designs is fixed at this choice, its note contains the number."""
+        point = super().propose(rng)
+        if self._fixed_now is not None:
+            self._last_note = {**(self._last_note or {}), DESIGNS: self._fixed_now}
+        return point
+
     def _afforded(self, prediction: Prediction) -> Prediction:
-        if self.designs is None:
-            return prediction
-        return replace(prediction, budget=min(self.designs, prediction.budget))
+        """Return the prediction with a budget for this thinking."""
+        most = min(prediction.budget, self._settings.points * self.dimension)
+        if isinstance(self.thinking, int):
+            return replace(prediction, budget=min(self.thinking, prediction.budget))
+        if self.thinking != "balanced":
+            return replace(prediction, budget=_designs(_SHARES[0 if self.thinking == "thorough" else -1], most))
+        designs = self._noted_designs() or self._measured_designs(prediction, most)
+        return replace(prediction, budget=min(designs, prediction.budget))
+
+    def _measured_designs(self, prediction: Prediction, most: int) -> int:
+        """Return the number of designs for the measured costs; it is fixed once an execution was timed."""
+        if prediction.costs is None:
+            return most
+        costs = prediction.costs()
+        designs = _balanced(costs, most)
+        self._fixed_now = None if costs.evaluation is None else designs
+        return designs
+
+    def _noted_designs(self) -> int | None:
+        """Return the number of designs that was fixed at an earlier choice; None if there was none."""
+        noted = (note.get(DESIGNS) for note in self.notes if note is not None)
+        return next((number for number in noted if isinstance(number, int) and number >= 1), None)
+
+
+def present_options(options: dict[str, Any]) -> dict[str, Any]:
+    """Return stored options of ``auto``, in which older versions had ``designs`` in place of ``thinking``."""
+    if "designs" not in options or "thinking" in options:
+        return options
+    others = {name: value for name, value in options.items() if name != "designs"}
+    return {**others, "thinking": "balanced" if options["designs"] is None else options["designs"]}
+
+
+def _checked(thinking: Thinking | int) -> Thinking | int:
+    if thinking in ("balanced", "fast", "thorough"):
+        return thinking
+    if isinstance(thinking, int | np.integer) and not isinstance(thinking, bool) and thinking >= 1:
+        return int(thinking)
+    raise InputError(
+        f"thinking must be 'balanced', 'fast', 'thorough' or a number of designs of at least 1, got {thinking!r}."
+    )
+
+
+def _designs(share: float, most: int) -> int:
+    return max(1, round(share * most))
+
+
+def _balanced(costs: Costs, most: int) -> int:
+    """Return the largest number of designs that takes no longer than one evaluation, or than is always short."""
+    seconds = max(_SHORT, _SUPPOSED if costs.evaluation is None else costs.evaluation)
+    numbers = [_designs(share, most) for share in _SHARES]
+    return next((number for number in numbers if number * costs.prediction <= seconds), numbers[-1])

@@ -19,6 +19,19 @@ Note = dict[str, Any]
 """What a search records about the choice of a point, in types that JSON has."""
 
 
+@dataclass(frozen=True)
+class Costs:
+    """What one prediction and one evaluation cost.
+
+    Attributes:
+        prediction: seconds of the prediction of one point.
+        evaluation: seconds of one evaluation; infinity if people make it, and None if none was timed.
+    """
+
+    prediction: float
+    evaluation: float | None
+
+
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """A prediction of values at points of the unit cube that have not been evaluated.
@@ -33,12 +46,14 @@ class Prediction:
             cost the design of a controller.
         otherwise: returns another prediction to use if leave-one-out errors show that this one is not good; None if
             there is no other.
+        costs: measures the costs, which takes some predictions; None if they cannot be measured.
     """
 
     expected: Callable[[Array], tuple[Array, Array]]
     left_out: Callable[[Rows], Array]
     budget: int
     otherwise: Callable[[], Prediction | None] | None = None
+    costs: Callable[[], Costs] | None = None
 
     def with_rows(self, left_out_of: Callable[[Prediction], Callable[[Rows], Array]]) -> Prediction:
         """Return the prediction with other rows, also in those that it may turn to.

@@ -1,0 +1,53 @@
+"""The task that is chosen for a new trial, and the trial that is opened for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import call, lines
+from ctxval.core.plan import Plan
+from ctxval.core.trial import Origin, Trial
+
+
+@dataclass(frozen=True, eq=False)
+class OpenTrial:
+    """A trial to be executed, with everything that an operator needs for the execution.
+
+    Attributes:
+        trial: the stored trial.
+        plan: its task, its controller and the trajectory of the model.
+    """
+
+    trial: Trial
+    plan: Plan
+
+    @property
+    def number(self) -> int:
+        """The number of the trial."""
+        return self.trial.number
+
+    def __repr__(self) -> str:
+        parts = repr(self.plan).splitlines()[1:]
+        return lines(call(self, self.number, origin=self.trial.origin), *(part.strip() for part in parts))
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The task of a new trial.
+
+    Attributes:
+        unit_point: point of the unit cube, shape ``(d,)``; None if the search chooses it.
+        origin: the reason for this point; not used if the search chooses the point.
+        because: the change that was made to the system since the task was executed before.
+        planned_draws: the planned number of independent draws, which is stored with each draw; 0 if the results decide
+            the number, None if it is not known.
+        note: what is recorded about the choice, in types that JSON has.
+    """
+
+    unit_point: Array | None = None
+    origin: Origin = "acquisition"
+    because: str | None = None
+    planned_draws: int | None = None
+    note: dict[str, Any] | None = None
