@@ -13,6 +13,8 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+from ctxval._util.progress import advance, mute
+
 Part = TypeVar("Part")
 Result = TypeVar("Result")
 
@@ -30,7 +32,7 @@ def on_all_cores(function: Callable[[Part], Result], parts: Sequence[Part]) -> l
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _inherit, (function,))
     try:
         with pool, forking():
-            return list(pool.map(_call, parts))
+            return list(_counted(pool.map(_call, parts)))
     except BrokenProcessPool:  # the system may have ended a process because memory was short
         return [function(part) for part in parts]
 
@@ -56,7 +58,15 @@ def _inherit(function: Callable[[Any], Any]) -> None:
     global _inherited
     # Ctrl-C reaches every process of a terminal, but the campaign alone decides what ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    mute()
     _inherited = function
+
+
+def _counted(results: Iterator[Result]) -> Iterator[Result]:
+    """Yield results as they come, and report each."""
+    for result in results:
+        advance()
+        yield result
 
 
 def _call(part: Any) -> Any:

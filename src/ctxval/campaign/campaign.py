@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display, remeasuring
 from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
@@ -94,6 +95,7 @@ class Campaign(CampaignResults):
         timeout: float | None = None,
         retries: int = 2,
         retry_failures: int = 0,
+        progress: bool | None = None,
     ) -> Campaign:
         """Execute tasks until the total number of executions is ``budget``, including earlier ones.
 
@@ -113,6 +115,7 @@ class Campaign(CampaignResults):
                 system is executed in a separate process.
             retries: largest number of repetitions of an execution if its worker is lost.
             retry_failures: largest number of repetitions of an execution if the system fails.
+            progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
 
         Raises:
             InputError: if a value cannot be used, or the system cannot be sent to the workers.
@@ -129,7 +132,8 @@ class Campaign(CampaignResults):
         pool, retry = self._pool(workers, executor, timeout), RetryPolicy(retries, retry_failures)
         if retry_failures and pool is None:
             raise InputError("retry_failures needs workers, an executor or a timeout.")
-        return self._execute(Schedule(self._recorder, rule, total), pool, on_trial, retry)
+        with progress_shown(progress):
+            return self._execute(Schedule(self._recorder, rule, total), pool, on_trial, retry)
 
     def run_until_decided(
         self,
@@ -145,6 +149,7 @@ class Campaign(CampaignResults):
         workers: int | None = None,
         executor: cf.Executor | None = None,
         timeout: float | None = None,
+        progress: bool | None = None,
     ) -> Campaign:
         """Execute tasks until the model is validated or falsified for a threshold, or the budget is spent.
 
@@ -162,7 +167,7 @@ class Campaign(CampaignResults):
                 ``auto``, ``dynamics``, ``posterior`` or, with an acceptable volume, ``anytime``.
             audited: before the bound from learned dynamics decides, predict and execute eight fresh random tasks, half
                 of them with parameters at their bounds. If a distance exceeds its prediction, the bound is withdrawn.
-            workers, executor, timeout: as in :meth:`run`.
+            workers, executor, timeout, progress: as in :meth:`run`.
 
         Raises:
             InputError, ModelError, DesignError, DistanceError, CampaignError: as in :meth:`run`.
@@ -172,7 +177,7 @@ class Campaign(CampaignResults):
         by = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         decision = UntilDecided(self._recorder, threshold, by, total, audited)
         pool = self._pool(workers, executor, timeout)
-        with self._recorder.predicting(decision.predicts):
+        with self._recorder.predicting(decision.predicts), progress_shown(progress):
             return self._execute(Schedule(self._recorder, decision.choose, total), pool, on_trial)
 
     def audit(
@@ -183,6 +188,7 @@ class Campaign(CampaignResults):
         workers: int | None = None,
         executor: cf.Executor | None = None,
         timeout: float | None = None,
+        progress: bool | None = None,
     ) -> Campaign:
         """Execute independent draws from the distribution of tasks until the trials contain this number of them.
 
@@ -191,7 +197,7 @@ class Campaign(CampaignResults):
         Args:
             draws: total number of independent draws, including earlier ones.
             on_trial: called with each trial that has ended.
-            workers, executor, timeout: as in :meth:`run`.
+            workers, executor, timeout, progress: as in :meth:`run`.
 
         Raises:
             InputError: if the number is not a positive integer.
@@ -200,13 +206,17 @@ class Campaign(CampaignResults):
         """
         planned = _count("an audit needs a positive number of draws", draws)
 
+        def missing() -> int:
+            return max(0, planned - sum(trial.origin == "iid" for trial in self.trials))
+
         def rule() -> Choice | None:
-            drawn = sum(trial.origin == "iid" for trial in self.trials)
-            return None if drawn >= planned else Choice(self._recorder.draw(), "iid", planned_draws=planned)
+            return Choice(self._recorder.draw(), "iid", planned_draws=planned) if missing() else None
 
         pool = self._pool(workers, executor, timeout)
         self._require_no_open_trials()
-        return self._execute(Schedule(self._recorder, rule), pool, on_trial)
+        with progress_shown(progress):
+            expected = self.executions + missing()
+            return self._execute(Schedule(self._recorder, rule, expected=expected), pool, on_trial)
 
     def _require_no_open_trials(self) -> None:
         """Refuse open trials that people are executing; an audit itself executes interrupted trials again."""
@@ -246,6 +256,7 @@ class Campaign(CampaignResults):
         draw: bool = False,
         because: str | None = None,
         wait: float = 0.0,
+        progress: bool | None = None,
     ) -> OpenTrial:
         """Open the next trial: the search's choice, the task with these parameters, or an independent draw.
 
@@ -254,6 +265,7 @@ class Campaign(CampaignResults):
             draw: draw the task from the distribution of tasks, for an audit.
             because: the change that was made to the system since the task with these parameters was executed before.
             wait: seconds to wait while another process chooses a task.
+            progress: as in :meth:`run`.
 
         Raises:
             InputError: if the parameters are not in the task space.
@@ -265,7 +277,7 @@ class Campaign(CampaignResults):
             raise InputError('because needs the parameters of an earlier task and a reason, such as "fuse replaced".')
         # An operator's time is worth a prediction: it is stored, and the execution tests it.
         predicts = self._recorder.search.uses_prediction
-        with self.store.sole_writer(wait), self._recorder.predicting(predicts):
+        with progress_shown(progress), self.store.sole_writer(wait), self._recorder.predicting(predicts):
             self._recorder.refresh()
             if parameters is not None:
                 return self._recorder.open(Choice(self._unit_point(parameters), "manual", because))

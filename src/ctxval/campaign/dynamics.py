@@ -11,6 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.describe import rounded
+from ctxval._util.progress import stage
 from ctxval._util.representation import call
 from ctxval.campaign.history import executed_trials
 from ctxval.certificates.dynamics import PREDICTIONS
@@ -79,9 +80,10 @@ class CampaignDynamics:
 
     def predict(self, trials: Sequence[Trial], point: Array) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task from completed trials; None if nothing can be predicted."""
-        learned = self.learned(trials)
         try:
-            return None if learned is None else learned.predict(point)
+            with stage("predicting the execution", unit="closed loops"):
+                learned = self.learned(trials)
+                return None if learned is None else learned.predict(point)
         except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
             return None
 
@@ -92,11 +94,16 @@ class CampaignDynamics:
             trials: all trials.
             confidence: the probability with which a bound must hold; it sets the least number of draws.
         """
-        learned = self.learned(trials)
-        if learned is None:
-            return None
+        draws = min(_MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
+        with stage("searching the learned dynamics", self._study.search.expected_loops(draws), "closed loops"):
+            learned = self.learned(trials)
+            return None if learned is None else self._evidence_or_none(learned, trials, draws)
+
+    def _evidence_or_none(
+        self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int
+    ) -> DynamicsEvidence | None:
         try:
-            return self._evidence(learned, trials, min(_MOST_DRAWS, int(np.ceil(confidence / (1 - confidence)))))
+            return self._evidence(learned, trials, draws)
         except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
             return None
 

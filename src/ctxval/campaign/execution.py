@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ctxval._util.interrupts import Interrupts, exits_as_exceptions
+from ctxval._util.progress import advance, is_heard, stage
 from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.remeasuring import remeasure
 from ctxval.campaign.trials import TrialRecorder
@@ -51,11 +52,13 @@ class Schedule:
         rule: returns the choice of a new trial, or None if there is none at present. It is called again after an
             execution has ended.
         budget: the total number of executions; None if only the rule ends the campaign.
+        expected: the total number of executions that are expected if there is no budget.
     """
 
     recorder: TrialRecorder
     rule: Callable[[], Choice | None]
     budget: int | None = None
+    expected: int | None = None
 
     def next(self) -> Choice | Trial | None:
         """Return an interrupted trial, or the choice of a new one; None if there is nothing to execute at present."""
@@ -79,13 +82,32 @@ def execute_schedule(schedule: Schedule, pool: WorkerPool | None, on_trial: OnTr
         recorder.refresh()
         if any(trial.state == "unmeasured" for trial in recorder.trials):
             remeasure(recorder)
+        total = schedule.expected if schedule.budget is None else schedule.budget
         try:
-            if pool is None:
-                _execute_in_turn(schedule, on_trial, interrupts)
-            else:
-                _ParallelExecution(schedule, pool, on_trial, retry).run(interrupts)
+            with stage("executions", total, done=recorder.executions):
+                if pool is None:
+                    _execute_in_turn(schedule, on_trial, interrupts)
+                else:
+                    _ParallelExecution(schedule, pool, on_trial, retry).run(interrupts)
         finally:
             recorder.abandon_executions()
+
+
+def _report(recorder: TrialRecorder, ended: Trial, on_trial: OnTrial | None) -> None:
+    """Tell whoever listens that a trial has ended."""
+    if is_heard():
+        advance(int(ended.executed), _result(recorder, ended))
+    if on_trial is not None:
+        on_trial(ended)
+
+
+def _result(recorder: TrialRecorder, ended: Trial) -> str:
+    """Return the result of a trial in one sentence."""
+    pace = "" if ended.seconds is None else f" in {ended.seconds:.2g} s"
+    if ended.distance is None:
+        return f"trial {ended.number} failed{pace}: {ended.failure}"
+    largest = max(trial.distance for trial in recorder.trials if trial.distance is not None)
+    return f"trial {ended.number} has distance {ended.distance:.4g}{pace}, largest {largest:.4g}"
 
 
 def _execute_in_turn(schedule: Schedule, on_trial: OnTrial | None, interrupts: Interrupts) -> None:
@@ -101,8 +123,7 @@ def _execute_in_turn(schedule: Schedule, on_trial: OnTrial | None, interrupts: I
                 ended = recorder.fail(opened.trial, error, seconds=result.seconds)
             else:
                 ended = recorder.complete(opened.trial, measurement, result.trajectory, result.seconds)
-            if on_trial is not None:
-                on_trial(ended)
+            _report(recorder, ended, on_trial)
         interrupts.raise_if_asked()
 
 
@@ -176,8 +197,8 @@ class _ParallelExecution:
         except CtxvalError as error:
             self.stopped = self.stopped or error
             return
-        if ended is not None and self.on_trial is not None:
-            self.on_trial(ended)
+        if ended is not None:
+            _report(self.recorder, ended, self.on_trial)
 
     def _lost(self, opened: OpenTrial, reason: str) -> Trial | None:
         """Repeat an execution whose worker was lost and return None; after too many losses, return the failed trial."""

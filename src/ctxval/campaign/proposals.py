@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.progress import stage
 from ctxval._util.representation import call
 from ctxval._util.texts import shortened
 from ctxval.campaign.costs import costs_of
@@ -46,12 +47,14 @@ class Proposals:
         Raises:
             InputError: if the search returns no point of the unit cube, or a note that JSON does not have.
         """
-        if self._search.uses_prediction:
+        if not self._search.uses_prediction:
+            return self._asked(), _plain_note(self._search.note())
+        with stage("choosing a task", unit="designs"):
             prediction = predict_from(self._validation, self._store, trials, self._errors)
             if prediction is not None:
                 prediction = replace(prediction, costs=partial(costs_of, prediction, self._validation, trials))
             self._search.use_prediction(prediction)
-        return self._asked(), _plain_note(self._search.note())
+            return self._asked(), _plain_note(self._search.note())
 
     def _asked(self) -> Array:
         asked, dimension = self._search.ask(1), self._validation.space.dimension

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from ctxval._util.describe import differences
+from ctxval._util.progress import advance, stage
 from ctxval._util.texts import text_of
 from ctxval.campaign.identity import with_distance
 from ctxval.campaign.trials import TrialRecorder
@@ -44,7 +45,8 @@ def _remeasured(store: Store, validation: Validation, description: dict[str, Any
     before = store.trials()
     differing = differences(store.description(), description)
     redefined = any(path.startswith("validation.distance") for path, _ in differing)
-    after = [_measured_again(store, validation, trial, redefined) for trial in before]
+    with stage("measuring again", len(before), "trials"):
+        after = [_measured_again(store, validation, trial, redefined) for trial in before]
     changed = [(old, new) for old, new in zip(before, after, strict=True) if _outcome(old) != _outcome(new)]
     trials = [new for _, new in changed]
     if not changed and not redefined:
@@ -71,6 +73,7 @@ def _measured_again(store: Store, validation: Validation, trial: Trial, redefine
     Raises:
         DistanceError: if the trial had a distance that cannot be computed any more.
     """
+    advance()
     if trial.state == "open" or not trial.executed:
         return trial
     model, system = store.trajectory(trial.number, "model"), store.trajectory(trial.number, "system")

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.progress import stage
+from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display
 from ctxval.campaign.learned import LearnedFromTrials
 from ctxval.campaign.trials import TrialRecorder
@@ -96,6 +98,7 @@ class CampaignResults:
         stochastic: bool = False,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
+        progress: bool | None = None,
     ) -> Verdict:
         """Return whether the model can be trusted up to a threshold tau.
 
@@ -109,13 +112,15 @@ class CampaignResults:
             resolution: the largest distance between a task and its nearest trial that a validation permits, in
                 diagonals of the task space.
             certificate: the kind and the options of the certificate, in place of ``auto`` with the three options above.
+            progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
 
         Raises:
             InputError: if the threshold is not a positive number, or the confidence is below 0.5.
             CertificateError: if an option of the certificate is not valid.
         """
         chosen = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
-        return judge(self.trials, threshold, chosen, self.provenance)
+        with progress_shown(progress), stage("certifying"):
+            return judge(self.trials, threshold, chosen, self.provenance)
 
     @property
     def provenance(self) -> Provenance:

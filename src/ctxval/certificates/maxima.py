@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.progress import advance, stage
 from ctxval._util.representation import call
 from ctxval.certificates.bounds import ERRORS, require_probability
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
@@ -142,9 +143,12 @@ def draw_maxima(
     usual = Prior(noise=STOCHASTIC, offset=None, spread_share=1.0) if stochastic else Prior()
     believed = usual if prior is None else prior
     best_first = X[np.argsort(-y, kind="stable")]
-    with single_threaded():
+    with single_threaded(), stage("drawing the largest distance", draws * paths, "draws"):
         conditioned = draw_hyperparameters(X, y, draws, rng, believed)
-        found = [maxima(draw_paths(one, X, paths, rng), best_first, rng) for one in conditioned]
+        found = []
+        for one in conditioned:
+            found.append(maxima(draw_paths(one, X, paths, rng), best_first, rng))
+            advance(paths)
     tops = np.concatenate(
         [
             one.warp.backward(top + _EXACTNESS * np.sqrt(one.scale2))

@@ -15,12 +15,11 @@ from dataclasses import asdict
 from typing import Any
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from ctxval._util.describe import describe
+from ctxval._util.progress_display import progress_shown
 from ctxval._util.texts import reason_of, shortened
-from ctxval.campaign.campaign import Campaign
 from ctxval.certificates.bounds import as_text
 from ctxval.certificates.verdict import Verdict
 from ctxval.cli.screen import Commands, Screen, line
@@ -54,7 +53,8 @@ def command(function: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(*args: Any, **kwargs: Any) -> Any:
         warnings.showwarning = _show_warning
         try:
-            with _stdout_to_stderr() if kwargs.get("as_json") else nullcontext() as stdout:
+            as_json = bool(kwargs.get("as_json"))
+            with _stdout_to_stderr() if as_json else nullcontext() as stdout, progress_shown(not as_json, err):
                 return _finish(function(*args, **kwargs), stdout)
         except CtxvalError as error:
             say_error(str(error))
@@ -140,30 +140,6 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
 def say_error(sentence: str) -> None:
     """Print an error message."""
     err.say(("error:", "bold red"), f" {sentence}")
-
-
-@contextmanager
-def progress(campaign: Campaign, total: int, *, show: bool) -> Iterator[Callable[[Trial], None]]:
-    """Show a progress bar of the executions; yield the function that updates it after each trial."""
-    columns = (
-        TextColumn("executions"),
-        BarColumn(bar_width=30),
-        MofNCompleteColumn(),
-        TextColumn("largest distance {task.fields[best]}  {task.fields[pace]}"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=err, disable=not show) as display:
-        task = display.add_task("", total=total, completed=campaign.executions, best="-", pace="")
-
-        def on_trial(trial: Trial) -> None:
-            best = "-" if campaign.worst is None else f"{campaign.worst.distance:.4g}"
-            display.update(task, completed=campaign.executions, best=best, pace=_pace(trial))
-
-        yield on_trial
-
-
-def _pace(trial: Trial) -> str:
-    return "" if trial.seconds is None else f"{trial.seconds:.2g} s/execution"
 
 
 def certificate_of(verdict: Verdict | None) -> dict[str, Any]:

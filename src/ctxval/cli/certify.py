@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval.campaign.campaign import Campaign
+from ctxval._util.progress import stage
 from ctxval.certificates import KINDS, Assessment, Certificate, Provenance, TheoremConstants, assess
 from ctxval.certificates.verdict import require_threshold
-from ctxval.cli.base import FALSIFIED, app, command, out, print_other_stores, print_verdict, progress
+from ctxval.cli.base import FALSIFIED, app, command, out, print_other_stores, print_verdict
 from ctxval.cli.options import (
     AsJson,
     Confidence,
@@ -125,9 +125,10 @@ def certify_store(
         options.kind.require_audit_helps([trial.origin for trial in opened.trials()])
     campaign = open_store(opened, store, experiment, trust, accept_change).campaign if loads else None
     if campaign is not None and audit is not None:
-        _audit(campaign, audit, show=not as_json)
+        campaign.audit(audit)
     known = Provenance.of(opened.description(), opened.history()) if campaign is None else campaign.provenance
-    found = assess(opened.trials(), options, limit, known)
+    with stage("certifying"):
+        found = assess(opened.trials(), options, limit, known)
     others = [str(other) for other in other_stores(store)]
     if not as_json:
         _print_assessment(found)
@@ -158,12 +159,6 @@ def _require_together(given: dict[str, Any], threshold: float | None) -> None:
         raise InputError("--volume needs --threshold: it is the share of the task space that may exceed the threshold.")
     if "constant" in given and "theorem" in given:
         raise InputError("--constant and --theorem cannot be given together.")
-
-
-def _audit(campaign: Campaign, draws: int, *, show: bool) -> None:
-    drawn = sum(trial.origin == "iid" for trial in campaign.trials)
-    with progress(campaign, campaign.executions + max(0, draws - drawn), show=show) as on_trial:
-        campaign.audit(draws, on_trial)
 
 
 def _print_assessment(found: Assessment) -> None:

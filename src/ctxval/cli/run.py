@@ -25,7 +25,6 @@ from ctxval.cli.base import (
     print_other_stores,
     print_table,
     print_verdict,
-    progress,
     say_error,
     worker_options,
     worst_of,
@@ -144,8 +143,8 @@ def run(
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
     total = experiment.budget if settings.budget is None else settings.budget
     execute = _until_decided(campaign, limit, settings, audited) if until_decided else campaign.run
-    with worker_options(workers, dask, timeout) as execution, progress(campaign, total, show=not as_json) as on_trial:
-        execute(budget=total, on_trial=on_trial, **execution)
+    with worker_options(workers, dask, timeout) as execution:
+        execute(budget=total, **execution)
     known = experiment.truth() if truth and experiment.truth is not None else None
     verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
     report = _report(campaign, experiment, settings, total, path, verdict, known)

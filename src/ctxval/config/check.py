@@ -10,6 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.texts import reason_of
+from ctxval.campaign.costs import ThinkingCosts
 from ctxval.core.experiment import Experiment, labels_of
 from ctxval.core.plan import Plan
 from ctxval.core.task import Task
@@ -20,6 +21,12 @@ from ctxval.testing import check_distance, check_model, check_synthesizer
 
 _TASKS = 8
 """Number of random tasks that are planned, besides the lowest, the middle and the highest one."""
+
+_EXECUTED = 3
+"""Number of executions after which the cost of a suggestion is estimated."""
+
+_LONG = 30.0
+"""Seconds for a suggestion that the user should know of."""
 
 _SAME_START = 1e-6
 """Largest error of the initial state of an execution, in each state."""
@@ -64,6 +71,7 @@ def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int
         ("batches", lambda: _batches(validation, plans)),
         ("distance", lambda: _distance(validation, plans)),
         ("execution", lambda: _executions(validation, plans[1], execute)),
+        ("cost", lambda: _cost(validation, plans)),
     ]
     for name, check in checks:
         findings += _guarded(name, check)
@@ -119,6 +127,21 @@ def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Fin
         "ok" if reached else "noted",
         f"ends at most {errors[worst]:.3g} from the goal (1-norm of the states), at {where}"
         + ("" if reached else "; a controller that fails on the model itself cannot be expected to work on the system"),
+    )
+
+
+def _cost(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]:
+    """State what designs, closed loops on M and a suggestion of ``auto`` cost in CPU time."""
+    thinking = ThinkingCosts.measured(validation, [plan.parameters.points for plan in plans[:_EXECUTED]])
+    text = f"a design takes {thinking.design:.2g} s of CPU, a closed loop on the model {thinking.closed_loop:.2g} s"
+    if thinking.suggestion is None:
+        yield Finding("cost", "ok", text)
+        return
+    yield Finding(
+        "cost",
+        "ok" if thinking.suggestion < _LONG else "noted",
+        f"{text}; a suggestion of the search auto takes about {thinking.suggestion:.2g} s if it thinks thoroughly "
+        f"({thinking.designs} designs) and {thinking.fast:.2g} s if it thinks fast",
     )
 
 

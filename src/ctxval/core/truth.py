@@ -20,6 +20,7 @@ from scipy.optimize import Bounds, differential_evolution
 from ctxval._util.arrays import Array
 from ctxval._util.boxes import climb
 from ctxval._util.describe import describe, rounded
+from ctxval._util.progress import stage
 from ctxval._util.representation import call, line, lines
 from ctxval.core.space import Parameters
 from ctxval.core.validation import Validation
@@ -27,6 +28,9 @@ from ctxval.errors import InputError
 
 _STEP = 1e-6
 """Step of the central differences, in widths of the unit cube."""
+
+_FINER = 9
+"""Number of points on each axis of a refined grid around one point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +64,12 @@ def grid_truth(validation: Validation, per_axis: int = 2001, refinements: int = 
     Raises:
         InputError: if every execution failed.
     """
+    count = per_axis**validation.space.dimension + 8 * refinements * _FINER**validation.space.dimension
+    with stage("searching the largest distance", count, "executions"):
+        return _grid_truth(validation, per_axis, refinements)
+
+
+def _grid_truth(validation: Validation, per_axis: int, refinements: int) -> Truth:
     space = validation.space
     points = space.grid(per_axis)
     values = validation.distances(points)
@@ -81,7 +91,7 @@ def grid_truth(validation: Validation, per_axis: int = 2001, refinements: int = 
 
 def _around(centres: Array, cell: Array, low: Array, high: Array) -> Array:
     """Return a grid of a quarter of the cell around each centre, inside the box."""
-    offsets = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * len(cell), indexing="ij"), axis=-1)
+    offsets = np.stack(np.meshgrid(*[np.linspace(-1, 1, _FINER)] * len(cell), indexing="ij"), axis=-1)
     points = centres[:, None, :] + offsets.reshape(-1, len(cell)) * cell
     return np.clip(points.reshape(-1, len(cell)), low, high)
 
@@ -116,8 +126,9 @@ def search_truth(
     """
     search = _TruthSearch(validation, population, generations, climbs)
     found: list[tuple[float, Array]] = []
-    while len(found) < repeats and not _gap(found) <= agreement:
-        found.append(search.repeat(np.random.default_rng(np.random.SeedSequence([seed, len(found)]))))
+    with stage("searching the largest distance", unit="executions"):
+        while len(found) < repeats and not _gap(found) <= agreement:
+            found.append(search.repeat(np.random.default_rng(np.random.SeedSequence([seed, len(found)]))))
     distance, unit_point = max(found, key=lambda repeat: repeat[0])
     if not math.isfinite(distance):
         raise InputError("the truth is unknown: every execution of the search failed.")

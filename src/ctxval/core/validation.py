@@ -10,6 +10,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats, require_shape
 from ctxval._util.describe import describe
 from ctxval._util.interrupts import raised_by_signal
+from ctxval._util.progress import advance
 from ctxval._util.representation import call, lines, shown
 from ctxval._util.texts import reason_of, text_of
 from ctxval.core.controller import Synthesizer
@@ -299,6 +300,8 @@ class Validation:
             trajectory = self.execute(plan)
         except ExecutionError:
             return np.nan
+        finally:
+            advance()
         return self.measure(plan, trajectory)
 
     def _batch_distances(self, points: Array) -> Array:
@@ -323,6 +326,7 @@ class Validation:
         wrong = executed & ~(np.isfinite(values) & (values >= 0))
         if wrong.any():
             self._refuse_distance(values[np.argmax(wrong)], points[np.argmax(wrong)])
+        advance(len(points))
         return np.where(executed, values, np.nan)
 
     # Used for one task and for many

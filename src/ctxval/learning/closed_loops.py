@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.progress import advance
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.model import Step
@@ -117,6 +118,7 @@ class LoopPlanner:
         promised = rollout(parts.model.step, controller, task)
         if promised.batch_shape != chosen.shape[:-1]:
             raise ValueError("the task function did not return one task for each point")
+        advance(len(rows))
         return PlannedTasks(rows, task, controller, promised)
 
     def run(self, draws: DynamicsDraws, planned: Sequence[PlannedTasks]) -> list[Loops]:
@@ -138,6 +140,7 @@ class LoopPlanner:
             own = int(one.rows[0]) // q
             step: Step = _OwnStep(draws, q, one.rows) if one.task.batch_shape else draws[own].step
             found[one.rows] = self._distances(one, rollout(step, one.controller, one.task))
+            advance(len(one.rows))
         return found.reshape(S, q)
 
     def _run(self, draws: DynamicsDraws, planned: PlannedTasks) -> Loops:
@@ -149,6 +152,7 @@ class LoopPlanner:
             loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
         else:
             loops = [rollout(draws[s].step, planned.controller, task) for s in range(S)]
+        advance(S * len(planned.rows))
         states, inputs = np.stack([one.states for one in loops]), np.stack([one.inputs for one in loops])
         shape = (S, len(planned.rows))
         return Loops(

@@ -14,6 +14,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.cores import on_all_cores
+from ctxval._util.progress import advance
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.rollout import rollout
 from ctxval.core.validation import Validation
@@ -126,7 +127,9 @@ class _PredictedDistance:
         """Return distances and doubts ``(m,)``; NaN for a task that fails. A batch that fails is halved and retried."""
         if self.batched or len(points) == 1:
             try:
-                return self._closed_loops(points, corrected)
+                found = self._closed_loops(points, corrected)
+                advance(len(points))
+                return found
             except Exception:  # the user's task, synthesizer or distance, on points that may never be executed
                 if len(points) == 1:
                     return np.array([np.nan]), np.array([np.nan])

@@ -120,6 +120,12 @@ class WorstCaseSearch:
         """The dimension d of the task space."""
         return self.planner.validation.space.dimension
 
+    def expected_loops(self, draws: int) -> int:
+        """Return about how many closed loops a search with so many draws runs, on M and on the draws."""
+        own, all_draws = self.settings, self.settings.elites + self.settings.shared + _SHOWN
+        moves = own.rounds * (2 * self.dimension + own.moves + 1)
+        return 2 * own.evaluations + all_draws + draws * (all_draws + 2 * moves)
+
     @functools.cached_property
     def pool(self) -> Array:
         """Tasks that are spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``."""

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.progress import expect
 from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.searches.base import Costs, Prediction
@@ -15,7 +16,9 @@ from ctxval.searches.trust_region import TrustRegion
 
 Thinking = Literal["balanced", "fast", "thorough"]
 
-_SHARES = (1.0, 0.4, 0.15)
+FAST = 0.15
+"""Share of the largest number of points that fast thinking predicts."""
+_SHARES = (1.0, 0.4, FAST)
 """Shares of the largest number of points that are predicted for one choice, from thorough to fast."""
 _SHORT = 1.0
 """Seconds for which a search may think in any case."""
@@ -51,7 +54,10 @@ class Auto(TrustRegion):
     def use_prediction(self, prediction: Prediction | None) -> None:
         """Take the prediction for the point that is asked for next; None if there is none."""
         self._fixed_now = None
-        super().use_prediction(prediction if prediction is None else self._afforded(prediction))
+        if prediction is not None:
+            prediction = replace(prediction, budget=self.designs(prediction))
+            expect(prediction.budget + self.predicted_besides)
+        super().use_prediction(prediction)
 
     def propose(self, rng: np.random.Generator) -> Array:
         """Return the next point; if the number of designs is fixed at this choice, its note contains the number."""
@@ -60,15 +66,18 @@ class Auto(TrustRegion):
             self._last_note = {**(self._last_note or {}), DESIGNS: self._fixed_now}
         return point
 
-    def _afforded(self, prediction: Prediction) -> Prediction:
-        """Return the prediction with a budget for this thinking."""
+    def designs(self, prediction: Prediction) -> int:
+        """Return the number of points that are predicted for the next choice."""
         most = min(prediction.budget, self._settings.points * self.dimension)
-        if isinstance(self.thinking, int):
-            return replace(prediction, budget=min(self.thinking, prediction.budget))
-        if self.thinking != "balanced":
-            return replace(prediction, budget=_designs(_SHARES[0 if self.thinking == "thorough" else -1], most))
-        designs = self._noted_designs() or self._measured_designs(prediction, most)
-        return replace(prediction, budget=min(designs, prediction.budget))
+        match self.thinking:
+            case "balanced":
+                return min(most, self._noted_designs() or self._measured_designs(prediction, most))
+            case "thorough":
+                return most
+            case "fast":
+                return _designs(FAST, most)
+            case number:
+                return min(int(number), most)
 
     def _measured_designs(self, prediction: Prediction, most: int) -> int:
         """Return the number of designs for the measured costs; it is fixed once an execution was timed."""

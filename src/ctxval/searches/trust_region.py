@@ -172,6 +172,13 @@ class TrustRegion(SequentialSearch):
         self._last_note = {**note, "why": why}
         return point
 
+    @property
+    def predicted_besides(self) -> int:
+        """The number of known points that are predicted for a choice, besides those of the budget."""
+        known, settings = int(np.isfinite(self.values).sum()), self._settings
+        compared = min(known, settings.compared_on) if known >= settings.compared_from else 0
+        return compared + min(known, _REPRESENTING)
+
     # How good the prediction is
 
     def _why_not(self, prediction: Prediction) -> str | None:

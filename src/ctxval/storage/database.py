@@ -5,12 +5,13 @@ from __future__ import annotations
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from ctxval._util.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
+from ctxval._util.progress import advance, stage
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
 from ctxval.storage import rows, schema
 from ctxval.storage.disks import make_folder, on_network, warn_of_network
@@ -96,14 +97,19 @@ class Database:
         until = time.monotonic() + wait
         try:
             lock = self._lock = self._lock or FileLock(_lockable(path))
-            while True:
-                try:
-                    lock.acquire()
-                    return lock
-                except LockedError:
-                    if time.monotonic() >= until:
-                        raise
-                time.sleep(_WAIT)
+            with suppress(LockedError):
+                lock.acquire()
+                return lock
+            with stage("waiting for another process", wait, "s"):
+                while True:
+                    try:
+                        lock.acquire()
+                        return lock
+                    except LockedError:
+                        if time.monotonic() >= until:
+                            raise
+                    time.sleep(_WAIT)
+                    advance(_WAIT)
         except LockedError as error:
             raise StoreAccessError(f"{self.name} is being run by another process.") from error
         except OSError as error:

@@ -1,0 +1,164 @@
+"""Progress on a screen or in a notebook; in a log, a line for each note and for what takes very long."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from ctxval._util.progress import Progress, ignore, is_heard, listening
+from ctxval._util.texts import shortened, visible
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+    from rich.progress import Progress as Bars
+
+_DELAY = 0.4
+"""Seconds before a stage is shown; most end sooner."""
+
+_SILENCE = 30.0
+"""Seconds without a line in a log, after which a stage writes one."""
+
+
+@contextmanager
+def progress_shown(wanted: bool | None = None, console: Console | None = None) -> Iterator[None]:
+    """Show the progress of everything within this context on standard error.
+
+    Args:
+        wanted: None to show it at a terminal and in a notebook, unless somebody listens already.
+        console: the console of rich to print to; standard error by default.
+    """
+    if is_heard() and wanted is not False:
+        yield
+        return
+    if wanted is None:
+        wanted = is_screen()
+    with listening(_display(console) if wanted else ignore):
+        yield
+
+
+def is_screen() -> bool:
+    """Return whether people see what is printed at once: at a terminal or in a notebook."""
+    return bool(sys.stderr is not None and sys.stderr.isatty()) or "ipykernel" in sys.modules
+
+
+def _display(console: Console | None) -> OnScreen | InLog:
+    from rich.console import Console  # slow to load, and needed by few programs
+
+    found = Console(stderr=True, markup=False, emoji=False, highlight=False) if console is None else console
+    return OnScreen(found) if found.is_terminal or found.is_jupyter else InLog(found)
+
+
+class InLog:
+    """Prints each note, and what takes very long.
+
+    Args:
+        console: the console of rich.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._last = time.monotonic()
+        self._started: dict[int, float] = {}
+
+    def __call__(self, progress: Progress) -> None:
+        """Print a line if there is a note, or if there was none for long."""
+        now = time.monotonic()
+        self._started.setdefault(progress.depth, now)
+        if progress.note or (now - self._last > _SILENCE and not progress.ended):
+            self._last = now
+            text = ", ".join(filter(None, [amount(progress, now - self._started[progress.depth]), progress.note]))
+            self._console.print(f"{progress.stage}: {visible(shortened(text))}", soft_wrap=True)
+        if progress.ended:
+            del self._started[progress.depth]
+
+
+class OnScreen:
+    """Shows one bar for each stage. The bar of a stage with notes stays on the screen when all is done.
+
+    Args:
+        console: the console of rich.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._bars: Bars | None = None
+        self._rows: dict[int, Any] = {}
+
+    def __call__(self, progress: Progress) -> None:
+        """Show a report."""
+        bars = self._bars = self._bars or self._started()
+        if progress.depth not in self._rows:
+            self._rows[progress.depth] = bars.add_task(progress.stage, text="", note="", lasts=False)
+        row = self._rows[progress.depth]
+        task = bars.tasks[bars.task_ids.index(row)]
+        note = visible(shortened(progress.note)) or task.fields["note"]
+        bars.update(
+            row,
+            completed=progress.done,
+            total=progress.expected,
+            text=amount(progress, task.elapsed or 0.0),
+            note=note,
+            lasts=bool(note),
+        )
+        if progress.ended:
+            self._end(progress.depth, lasts=bool(note))
+
+    def _started(self) -> Bars:
+        bars = _bars(self._console)
+        bars.start()
+        return bars
+
+    def _end(self, depth: int, lasts: bool) -> None:
+        assert self._bars is not None
+        row = self._rows.pop(depth)
+        self._bars.stop_task(row)
+        if not lasts:
+            self._bars.remove_task(row)
+        if not self._rows:
+            self._bars.live.transient = not self._bars.tasks
+            self._bars.stop()
+            self._bars = None
+
+
+def _bars(console: Console) -> Bars:
+    """Return a display of stages that leaves out those which have just begun."""
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    class Delayed(Bars):
+        def get_renderables(self) -> Iterable[RenderableType]:
+            shown = [task for task in self.tasks if task.fields["lasts"] or (task.elapsed or 0.0) > _DELAY]
+            yield self.make_tasks_table(shown)
+
+    return Delayed(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=20),
+        TextColumn("{task.fields[text]}  {task.fields[note]}", markup=False),
+        TimeElapsedColumn(),
+        console=console,
+    )
+
+
+def amount(progress: Progress, elapsed: float) -> str:
+    """Return how much of a stage is done, and how many seconds are left if that can be told.
+
+    Args:
+        progress: the report.
+        elapsed: seconds since the stage began.
+    """
+    if progress.expected is None:
+        return f"{progress.done:,.0f} {progress.unit}".strip() if progress.done else ""
+    text = f"{progress.done:,.0f}/{progress.expected:,.0f} {progress.unit}".strip()
+    if not progress.done or progress.ended or progress.note:
+        return text
+    return f"{text}, {duration(elapsed * (progress.expected - progress.done) / progress.done)} left"
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in the largest unit that suits it."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
