@@ -1,0 +1,117 @@
+"""Progress as people see it. The screens are those of a pseudo-terminal."""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from ctxval._util import progress_display
+from ctxval._util.progress import Progress, advance, is_heard, listening, stage
+from ctxval._util.progress_display import amount, duration, is_screen, progress_shown
+
+
+def console(*, terminal: bool) -> Console:
+    return Console(file=io.StringIO(), force_terminal=terminal, width=100, force_jupyter=False)
+
+
+def text(of: Console) -> str:
+    """Return what was printed, without codes for colours and the cursor."""
+    assert isinstance(of.file, io.StringIO)
+    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", of.file.getvalue())
+
+
+def executions(notes: list[str], of: Console) -> None:
+    with progress_shown(True, of), stage("executions", 3):
+        for note in notes:
+            advance(1, note)
+
+
+def test_a_log_has_a_line_for_each_note() -> None:
+    log = console(terminal=False)
+    executions(["trial 0 has distance 1", "trial 1 failed: \x1b[2Jbad"], log)
+    assert text(log).splitlines() == [
+        "executions: 1/3, trial 0 has distance 1",
+        r"executions: 2/3, trial 1 failed: \x1b[2Jbad",
+    ]
+
+
+def test_a_log_says_that_long_work_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(0, 1000, 20))
+    monkeypatch.setattr(progress_display.time, "monotonic", lambda: float(next(clock)))
+    log = console(terminal=False)
+    with progress_shown(True, log), stage("choosing a task", 100, "designs"):
+        for _ in range(4):
+            advance(10)
+    lines = text(log).splitlines()
+    assert lines[0].startswith("choosing a task: 10/100 designs, ")
+    assert len(lines) == 2
+
+
+def test_a_screen_keeps_the_last_result_and_forgets_other_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress_display, "_DELAY", 0.0)
+    screen = console(terminal=True)
+    with progress_shown(True, screen), stage("executions", 3):
+        with stage("choosing a task", 10, "designs"):
+            advance(4)
+        advance(1, "trial 0 has distance 1")
+    last = text(screen).rstrip().splitlines()[-1]
+    assert "executions" in last
+    assert "1/3  trial 0 has distance 1" in last
+
+
+def test_a_short_stage_is_not_shown() -> None:
+    screen = console(terminal=True)
+    with progress_shown(True, screen):
+        for _ in range(3):
+            with stage("blinking"):
+                advance()
+    assert "blinking" not in text(screen)
+
+
+def test_text_of_users_cannot_control_the_screen() -> None:
+    screen = console(terminal=True)
+    executions(["[red]x[/red] \x1b]0;owned\x07"], screen)
+    assert "[red]x[/red]" in text(screen)
+    assert isinstance(screen.file, io.StringIO)
+    assert "\x1b]0" not in screen.file.getvalue()
+
+
+@pytest.mark.parametrize("wanted", [None, False])
+def test_nothing_is_shown_in_a_program_unless_it_is_asked_for(wanted: bool | None, capfd: Any) -> None:
+    assert not is_screen()
+    with progress_shown(wanted), stage("executions", 1):
+        advance(1, "done")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_whoever_listens_already_goes_on_listening() -> None:
+    heard: list[Progress] = []
+    with listening(heard.append):
+        with progress_shown(None), stage("a"):
+            pass
+        with progress_shown(True), stage("b"):
+            pass
+        with progress_shown(False), stage("c"):
+            assert is_heard()
+    assert {p.stage for p in heard} == {"a", "b"}
+
+
+@given(st.floats(0, 1e6), st.one_of(st.none(), st.floats(0, 1e6)), st.floats(0, 1e6))
+def test_every_amount_has_a_text(done: float, expected: float | None, elapsed: float) -> None:
+    if expected is not None and done > expected:
+        expected = None
+    found = amount(Progress("s", done, expected, "designs"), elapsed)
+    assert ("left" in found) == (expected is not None and done > 0)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "shown"), [(0.2, "0 s"), (99, "99 s"), (150, "2 min"), (5999, "100 min"), (7200, "2.0 h")]
+)
+def test_a_duration_has_one_unit(seconds: float, shown: str) -> None:
+    assert duration(seconds) == shown

@@ -1,0 +1,167 @@
+"""What people see while a command works: at a terminal (a pseudo-terminal here), and in a log."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+pty = pytest.importorskip("pty", reason="there are no pseudo-terminals here")
+
+RIG = '''
+import time
+from conftest import make_validation
+from ctxval import Experiment, Validation, controllers
+
+
+class Slow:
+    """A synthesizer that takes its time."""
+
+    def design(self, task, model):
+        time.sleep(0.008)
+        return controllers.LQR([1.0, 0.1], [1e-2], [10.0, 1.0]).design(task, model)
+
+
+class Manual:
+    manual = True
+
+    def execute(self, controller, task):
+        raise AssertionError
+
+
+def validation(system):
+    whole = make_validation()
+    return Validation(
+        space=whole.space, task=whole.task, system=system or whole.system, model=whole.model, synthesizer=Slow(),
+        distance=whole.distance,
+    )
+
+
+experiment = Experiment("slow", validation(None))
+by_hand = Experiment("slow-by-hand", validation(Manual()))
+'''
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "rig.py").write_text(RIG)
+    return tmp_path
+
+
+def environment(folder: Path) -> dict[str, str]:
+    source = Path(__file__).parents[2] / "src"
+    path = os.pathsep.join([str(folder), str(source), str(Path(__file__).parents[1])])
+    return {**os.environ, "PYTHONPATH": path, "TERM": "xterm-256color", "COLUMNS": "120"}
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "ctxval.cli", *arguments]
+
+
+def at_terminal(folder: Path, *arguments: str, release_after: bytes | None = None) -> tuple[str, str, int]:
+    """Return what a command writes to its terminal and to its redirected standard output, and its exit status.
+
+    The file ``release`` is made as soon as the terminal shows a text, if there is one.
+    """
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        command(*arguments), cwd=folder, env=environment(folder), stdout=subprocess.PIPE, stderr=slave, text=True
+    )
+    os.close(slave)
+    seen: list[bytes] = []
+
+    def read() -> None:
+        while True:
+            try:
+                seen.append(os.read(master, 65536))
+            except OSError:  # the terminal has no writer any more
+                return
+            if release_after is not None and release_after in b"".join(seen):
+                (folder / "release").touch()
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    out, _ = process.communicate()
+    reader.join()
+    os.close(master)
+    screen = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", b"".join(seen).decode())
+    return screen, out, process.returncode
+
+
+@pytest.mark.slow
+def test_a_run_shows_its_executions_and_what_it_is_doing(folder: Path) -> None:
+    screen, out, status = at_terminal(folder, "run", "rig:experiment", "--budget", "2", "--store", "a.sqlite")
+    assert status == 0
+    assert re.search(r"executions +\S+ +2/2  trial 1 has distance", screen)
+    assert re.search(r"choosing a task +\S+ +[1-9]\d*/\d+ designs, \d+ s left", screen)
+    assert "designs" not in out
+    assert "executions" in out
+
+
+@pytest.mark.slow
+def test_a_log_has_a_line_for_each_trial(folder: Path) -> None:
+    arguments = ("run", "rig:experiment", "--budget", "2", "--search", "random", "--store", "a.sqlite")
+    done = subprocess.run(command(*arguments), cwd=folder, env=environment(folder), capture_output=True, text=True)
+    assert done.returncode == 0
+    lines = [line for line in done.stderr.splitlines() if line.startswith("executions: ")]
+    assert [line[:36] for line in lines] == [
+        "executions: 1/2, trial 0 has distanc",
+        "executions: 2/2, trial 1 has distanc",
+    ]
+    quiet = subprocess.run(
+        command(*arguments[:3], "3", *arguments[4:], "--json"), cwd=folder, env=environment(folder), capture_output=True
+    )
+    assert quiet.stderr == b""
+
+
+@pytest.mark.slow
+def test_asking_and_waiting_for_the_lock_are_shown(folder: Path) -> None:
+    first, _, status = at_terminal(folder, "ask", "rig:by_hand", "--store", "a.sqlite")
+    assert status == 0
+    assert "choosing a task" in first
+    with Holding(folder):
+        screen, _, status = at_terminal(folder, "ask", "a.sqlite", release_after=b"waiting for another process")
+    assert status == 0
+    assert re.search(r"waiting for another process +\S+ +\d+/60 s", screen)
+
+
+class Holding:
+    """Another process that holds the lock of the store until the file ``release`` exists."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __enter__(self) -> None:
+        script = (
+            "import pathlib, time\nfrom ctxval import Store\n"
+            "with Store('a.sqlite').sole_writer():\n"
+            "    pathlib.Path('held').touch()\n"
+            "    while not pathlib.Path('release').exists(): time.sleep(0.05)\n"
+        )
+        self.process = subprocess.Popen([sys.executable, "-c", script], cwd=self.folder, env=environment(self.folder))
+        while not (self.folder / "held").exists():
+            time.sleep(0.05)
+
+    def __exit__(self, *_: object) -> None:
+        (self.folder / "release").touch()
+        self.process.wait()
+
+
+@pytest.mark.slow
+def test_certifying_is_shown(folder: Path) -> None:
+    subprocess.run(
+        command("run", "rig:experiment", "--budget", "6", "--search", "random", "--store", "a.sqlite"),
+        cwd=folder,
+        env=environment(folder),
+        check=True,
+        capture_output=True,
+    )
+    screen, out, _ = at_terminal(folder, "certify", "a.sqlite", "--threshold", "9", "--kind", "posterior")
+    assert re.search(r"drawing the largest distance +\S+ +[\d,]+/[\d,]+ draws", screen)
+    assert "draws," not in out
