@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.costs import ThinkingCosts
 from ctxval.core.experiment import Experiment, labels_of
@@ -132,7 +133,8 @@ def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Fin
 
 def _cost(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]:
     """State what designs, closed loops on M and a suggestion of ``auto`` cost in CPU time."""
-    thinking = ThinkingCosts.measured(validation, [plan.parameters.points for plan in plans[:_EXECUTED]])
+    with stage("measuring what a suggestion costs"):
+        thinking = ThinkingCosts.measured(validation, [plan.parameters.points for plan in plans[:_EXECUTED]])
     text = f"a design takes {thinking.design:.2g} s of CPU, a closed loop on the model {thinking.closed_loop:.2g} s"
     if thinking.suggestion is None:
         yield Finding("cost", "ok", text)

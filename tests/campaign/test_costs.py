@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import re
+import time
+
+import numpy as np
+import pytest
+
+from conftest import make_validation
+from ctxval import Campaign, Experiment, Task, Validation, controllers, distances, searches
+from ctxval.campaign.costs import ThinkingCosts
+from ctxval.config.check import check_experiment
+from ctxval.core.controller import Controller
+from ctxval.core.model import Model
+from ctxval.testing import FaultyRig
+
+BURNT = 0.02
+
+
+class Busy:
+    """A synthesizer that needs the processor."""
+
+    def design(self, task: Task, model: Model) -> Controller:
+        until = time.process_time() + BURNT
+        while time.process_time() < until:
+            pass
+        return controllers.LQR([1.0, 0.1], [1e-2], [10.0, 1.0]).design(task, model)
+
+
+def with_synthesizer(synthesizer: object) -> Validation:
+    whole = make_validation(system=FaultyRig(make_validation().system, dict.fromkeys(range(100), "raise")))
+    return Validation(
+        space=whole.space,
+        task=whole.task,
+        system=whole.system,
+        model=whole.model,
+        synthesizer=synthesizer,
+        distance=whole.distance,
+    )
+
+
+def costs(validation: Validation) -> ThinkingCosts:
+    return ThinkingCosts.measured(validation, [np.array([goal]) for goal in (-3.0, 0.5, 3.0)])
+
+
+@pytest.mark.slow
+def test_a_suggestion_costs_at_least_its_designs() -> None:
+    found = costs(with_synthesizer(Busy()))
+    assert found.designs == 150
+    assert found.suggestion is not None
+    assert found.fast is not None
+    assert found.design >= BURNT > found.closed_loop
+    assert found.suggestion >= 150 * BURNT
+    assert 22 * BURNT <= found.fast < found.suggestion
+
+
+@pytest.mark.slow
+def test_the_estimate_is_that_of_a_real_suggestion_within_a_factor() -> None:
+    validation = make_validation()
+    campaign = Campaign(validation, search=searches.Auto("thorough"), seed=1).run(3)
+    started = time.process_time()
+    campaign._recorder._proposals.next(campaign.trials)
+    real = time.process_time() - started
+    estimated = costs(validation).suggestion
+    assert estimated is not None
+    assert real / 10 < estimated < 10 * real
+
+
+@pytest.mark.slow
+def test_a_check_states_the_costs_without_an_execution() -> None:
+    found = {one.check: one for one in check_experiment(Experiment("x", with_synthesizer(Busy())))}
+    assert found["cost"].state == "ok"
+    seconds = r"[\d.e-]+ s"
+    assert re.search(
+        rf"a design takes {seconds} of CPU, a closed loop on the model {seconds}; a suggestion of the search auto "
+        rf"takes about {seconds} if it thinks thoroughly \(150 designs\) and {seconds} if it thinks fast",
+        found["cost"].text,
+    )
+
+
+def test_a_suggestion_that_cannot_be_predicted_has_no_estimate() -> None:
+    class Refusing(Busy):
+        def design(self, task: Task, model: Model) -> Controller:
+            if abs(float(task.goal[0])) != 3.0:
+                raise ValueError
+            return controllers.LQR([1.0, 0.1], [1e-2], [10.0, 1.0]).design(task, model)
+
+    validation = with_synthesizer(Refusing()).with_distance(distances.WholeTrajectory())
+    found = ThinkingCosts.measured(validation, [np.array([3.0]), np.array([-3.0])])
+    assert found.suggestion is None
+    assert found.design < 1.0
