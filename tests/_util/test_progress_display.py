@@ -34,10 +34,10 @@ def executions(notes: list[str], of: Console) -> None:
 
 def test_a_log_has_a_line_for_each_note() -> None:
     log = console(terminal=False)
-    executions(["trial 0 has distance 1", "trial 1 failed: \x1b[2Jbad"], log)
+    executions(["trial 0 has distance 1", "trial 1 failed: \x1b[2Jbad\nexecutions: 3/3"], log)
     assert text(log).splitlines() == [
         "executions: 1/3, trial 0 has distance 1",
-        r"executions: 2/3, trial 1 failed: \x1b[2Jbad",
+        r"executions: 2/3, trial 1 failed: \x1b[2Jbad executions: 3/3",
     ]
 
 

@@ -112,6 +112,7 @@ def test_memory_is_bounded(tmp_path: Path) -> None:
         np.testing.assert_array_equal(again[number].states, trajectory(number, steps=100).states)
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 1), st.booleans(), st.booleans()), max_size=12))
 def test_a_store_with_memory_reads_what_a_new_one_reads(steps: list[tuple[int, bool, bool]]) -> None:

@@ -70,7 +70,7 @@ class InLog:
         if progress.note or (now - self._last > _SILENCE and not progress.ended):
             self._last = now
             text = ", ".join(filter(None, [amount(progress, now - self._started[progress.depth]), progress.note]))
-            self._console.print(f"{progress.stage}: {visible(shortened(text))}", soft_wrap=True)
+            self._console.print(f"{progress.stage}: {_in_one_line(text)}", soft_wrap=True)
         if progress.ended:
             del self._started[progress.depth]
 
@@ -94,7 +94,7 @@ class OnScreen:
             self._rows[progress.depth] = bars.add_task(progress.stage, text="", note="", lasts=False)
         row = self._rows[progress.depth]
         task = bars.tasks[bars.task_ids.index(row)]
-        note = visible(shortened(progress.note)) or task.fields["note"]
+        note = _in_one_line(progress.note) or task.fields["note"]
         bars.update(
             row,
             completed=progress.done,
@@ -140,6 +140,10 @@ def _bars(console: Console) -> Bars:
         TimeElapsedColumn(),
         console=console,
     )
+
+
+def _in_one_line(text: str) -> str:
+    return visible(" ".join(shortened(text).split()))
 
 
 def amount(progress: Progress, elapsed: float) -> str:
