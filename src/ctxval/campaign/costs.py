@@ -67,7 +67,7 @@ class ThinkingCosts:
         if prediction is None:
             return cls(design, loop)
         learning = _cpu_now() - begun
-        each = _seconds_of_prediction(prediction, validation.space.dimension, _cpu_now)
+        each = _seconds_of_prediction(prediction, validation.space.dimension)
         search = Auto("thorough")
         search.reset(validation.space.dimension, 0)
         designs = search.designs(prediction)
@@ -110,16 +110,15 @@ def costs_of(prediction: Prediction, validation: Validation, trials: Sequence[Tr
     return Costs(predicting, _seconds_of_execution(validation, trials))
 
 
-def _seconds_of_prediction(
-    prediction: Prediction, dimension: int, clock: Callable[[], float] = time.perf_counter
-) -> float:
-    """Return the seconds in which one task is predicted, in a batch if there can be one."""
+def _seconds_of_prediction(prediction: Prediction, dimension: int) -> float:
+    """Return the seconds of CPU time in which one task is predicted, in a batch if there can be one."""
+    # Elapsed time would make the choices depend on what else the machine does.
     rng, seconds = np.random.default_rng(0), math.inf
     for count in _BATCHES:
         points = rng.random((count, dimension))
-        started = clock()
+        started = _cpu_now()
         prediction.expected(points)
-        taken = clock() - started
+        taken = _cpu_now() - started
         seconds = min(seconds, taken / count)
         if taken > _ENOUGH:
             break

@@ -24,7 +24,7 @@ class Costs:
     """What one prediction and one evaluation cost.
 
     Attributes:
-        prediction: seconds of the prediction of one point.
+        prediction: seconds of CPU time of the prediction of one point.
         evaluation: seconds of one evaluation; infinity if people make it, and None if none was timed.
     """
 
