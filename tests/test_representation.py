@@ -182,8 +182,15 @@ def predicted() -> learning.ExecutionPrediction:
 
 
 @functools.cache
+def covariance() -> learning.LearnedCovariance:
+    found = learning.learn_covariance(LINEAR, RECORDED, np.zeros(len(RECORDED), dtype=np.intp))
+    assert found is not None
+    return found
+
+
+@functools.cache
 def residual() -> learning.Residual:
-    found = learning.learn_residual(LINEAR, RECORDED, np.zeros(len(RECORDED), dtype=np.intp))
+    found = learning.learn_residual(covariance(), RECORDED, np.zeros(len(RECORDED), dtype=np.intp), 100)
     assert found is not None
     return found
 
@@ -263,6 +270,9 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "distances.GoalError": distances.GoalError,
     "distances.MeanDeviation": distances.MeanDeviation,
     "distances.WholeTrajectory": distances.WholeTrajectory,
+    "learning.DistancePredictor": lambda: learning.DistancePredictor(learned().study.validation),
+    "learning.LearnedCovariance": covariance,
+    "learning.ResidualsWithout": lambda: residual().without([{0}]),
     "learning.CorrectedModel": lambda: learning.CorrectedModel(LINEAR, residual()),
     "learning.Coverage": lambda: learning.Coverage(LEARNED_GAP, LEARNED_GAP, None, np.zeros(11), np.ones(8), 1024),
     "learning.DynamicsDraws": lambda: learned().posterior.mean,

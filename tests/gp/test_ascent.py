@@ -56,6 +56,39 @@ def test_what_is_not_finite_is_no_maximum(dimension: int) -> None:
     assert nothing == -np.inf
 
 
+@pytest.mark.parametrize("dimension", [4, 6])
+def test_an_approximation_is_searched_and_the_function_itself_decides(dimension: int) -> None:
+    asked: list[int] = []
+
+    def exact(X: Array) -> Array:
+        asked.append(len(X))
+        return -((X - 0.3) ** 2).sum(axis=1)
+
+    low, high = np.zeros(dimension), np.ones(dimension)
+    ascent = Ascent(exact, low, high, 1000, rough=lambda X: -((X - 0.33) ** 2).sum(axis=1))
+    points, values = ascent.run(np.empty((0, dimension)), np.random.default_rng(0))
+    assert sum(asked) == len(points) < 300
+    np.testing.assert_allclose(points[0], 0.3, atol=0.05)
+    np.testing.assert_allclose(values, -((points - 0.3) ** 2).sum(axis=1))
+
+
+def test_in_few_dimensions_the_function_is_asked_for_the_same_points_each_time() -> None:
+    asked: list[Array] = []
+
+    def function(X: Array) -> Array:
+        asked.append(X)
+        return np.sin(9 * X).prod(axis=1)
+
+    for seed, low in enumerate([0.0, 0.4]):
+        ascent = Ascent(function, np.full(2, low), np.ones(2), 600)
+        ascent.run(np.empty((0, 2)), np.random.default_rng(seed))
+    pools = [points for points in asked if len(points) == 200]
+    assert len(pools) == 2
+    np.testing.assert_array_equal(*pools)
+    assert pools[0].min() == 0.0
+    assert pools[0].max() == 1.0
+
+
 def test_the_same_randomness_finds_the_same_points() -> None:
     first, again = (maximum(lambda X: np.sin(9 * X).prod(axis=1), 5, seed=3) for _ in range(2))
     np.testing.assert_array_equal(first[0], again[0])

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ctxval import Transitions, models
-from ctxval._util.arrays import Array
-from ctxval.learning.dynamics import CorrectedModel, Identity, Residual, learn_corrected, learn_residual
+from ctxval._util.arrays import Array, Rows
+from ctxval.learning.dynamics import CorrectedModel, Identity, Residual, learn_covariance, learn_residual
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 
@@ -20,8 +22,11 @@ def record(count: int, seed: int = 0, reach: float = 1.0) -> Transitions:
     return Transitions(x, u, truth(x, u))
 
 
-def learn(data: Transitions, model: models.Model = MODEL) -> Residual:
-    residual = learn_residual(model, data, np.full(len(data), -1))
+def learn(data: Transitions, sources: Rows | None = None, centres: int = 450) -> Residual:
+    of = np.full(len(data), -1) if sources is None else sources
+    learned = learn_covariance(MODEL, data, of)
+    assert learned is not None
+    residual = learn_residual(replace(learned, model=MODEL), data, of, centres)
     assert residual is not None
     return residual
 
@@ -75,7 +80,7 @@ def test_noise_in_the_recordings_is_not_learned() -> None:
 def test_a_model_without_error_leaves_nothing_to_be_learned() -> None:
     data = record(50)
     exact = Transitions(data.x, data.u, MODEL.step(data.x, data.u))
-    assert learn_residual(MODEL, exact, np.full(50, -1)) is None
+    assert learn_covariance(MODEL, exact, np.full(50, -1)) is None
 
 
 def test_recordings_that_repeat_themselves_and_ones_that_diverged_do_no_harm() -> None:
@@ -90,11 +95,53 @@ def test_recordings_that_are_not_finite_are_left_out() -> None:
     data = record(100)
     broken = Transitions(data.x, data.u, np.where(np.arange(100)[:, None] % 7 == 0, np.nan, data.x_next))
     assert np.isfinite(learn(broken)(data.x, data.u)).all()
-    assert learn_residual(MODEL, Transitions(data.x, data.u, data.x_next * np.nan), np.full(100, -1)) is None
+    assert learn_covariance(MODEL, Transitions(data.x, data.u, data.x_next * np.nan), np.full(100, -1)) is None
 
 
 def test_around_a_model_that_is_rougher_than_the_system_the_steps_are_learned_instead() -> None:
     rough = models.Function(lambda x, u: MODEL.step(x, u) + 0.3 * np.sign(np.sin(9 * x)), vectorized=True)
     data = record(400)
-    corrected = [learn_corrected(model, data, np.full(400, -1), 200) for model in (MODEL, rough)]
-    assert [type(hat.model) for hat in corrected if hat is not None] == [models.Linear, Identity]
+    learned = [learn_covariance(model, data, np.full(400, -1)) for model in (MODEL, rough)]
+    assert [type(one.model) for one in learned if one is not None] == [models.Linear, Identity]
+
+
+def test_residuals_without_executions_are_those_conditioned_on_the_other_ones() -> None:
+    data, of = record(90), np.repeat(np.arange(6), 15)
+    residual = learn(data, of, centres=60)
+    together = residual.without([{2}, {0, 5}, set()])
+    everything = residual.without([set()] * 3)
+    x, u = data.x[:3], data.u[:3]
+    np.testing.assert_allclose(together(x, u)[2], everything(x, u)[2])
+    np.testing.assert_allclose(together[np.array([1])](x[1:2], u[1:2])[0], together(x, u)[1])
+    for row, gone in enumerate([[2], [0, 5]]):
+        # All transitions are centres or replacements, so the others are conditioned on directly.
+        centres, outputs, sources = (
+            np.concatenate([used, unused])
+            for used, unused in zip(
+                (residual.centres, residual.outputs, residual.sources), residual.unused, strict=True
+            )
+        )
+        kept = ~np.isin(sources, gone)
+        alone = replace(residual, centres=centres[kept], outputs=outputs[kept], sources=sources[kept])
+        np.testing.assert_allclose(together(x, u)[row], alone(x, u)[row], rtol=0.05, atol=1e-3)
+
+
+def test_a_rough_residual_has_fewer_centres_and_almost_the_same_values() -> None:
+    data = record(400)
+    residual = learn(data)
+    rough = residual.rough(100)
+    assert len(rough.centres) == 100 < len(residual.centres)
+    size = np.abs(residual(data.x, data.u)).max()
+    np.testing.assert_allclose(rough(data.x, data.u), residual(data.x, data.u), atol=0.02 * size)
+
+
+def test_a_covariance_that_was_learned_earlier_keeps_its_physical_length_scales() -> None:
+    data = record(200)
+    learned = learn_covariance(MODEL, data, np.full(200, -1))
+    assert learned is not None
+    wider = Transitions.joined([data, record(100, seed=4, reach=3.0)])
+    residual = learn_residual(learned, wider, np.full(300, -1), 200)
+    assert residual is not None
+    np.testing.assert_allclose(
+        np.exp(residual.theta[1:-2]) * residual.scale_in, np.exp(learned.theta[1:-2]) * learned.scale
+    )

@@ -10,9 +10,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
-from ctxval.core.validation import Validation
-from ctxval.learning.error_vectors import ErrorVectors
-from ctxval.learning.prediction import predict_distance
+from ctxval.learning.prediction import DistancePredictor
 from ctxval.searches import Prediction
 from ctxval.storage.store import Store
 
@@ -41,20 +39,17 @@ def executed_trials(store: Store, trials: Sequence[Trial]) -> list[tuple[Trial, 
     return [(trial, found[trial.number]) for trial in completed if trial.number in found]
 
 
-def predict_from(
-    validation: Validation, store: Store, trials: Sequence[Trial], errors: ErrorVectors | None = None
-) -> Prediction | None:
+def predict_from(predictor: DistancePredictor, store: Store, trials: Sequence[Trial]) -> Prediction | None:
     """Return the distance predicted from the executed trajectories; None if no prediction is possible.
 
     Args:
-        validation: the map p -> d(p).
+        predictor: predicts d(p) from executions.
         store: the store of the trajectories.
         trials: all trials.
         errors: keeps the vectors of earlier executions.
     """
     executed = executed_trials(store, trials)
-    pairs = [(trial.unit_point, trajectory) for trial, trajectory in executed]
-    prediction = predict_distance(validation, pairs, errors)
+    prediction = predictor.predict([(trial.unit_point, trajectory) for trial, trajectory in executed])
     known = [trial for trial in history_of(trials) if trial.distance is not None]
     if prediction is None or [trial.number for trial in known] == [trial.number for trial, _ in executed]:
         return prediction

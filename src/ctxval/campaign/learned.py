@@ -14,6 +14,7 @@ from ctxval.campaign.history import predict_from
 from ctxval.certificates import DynamicsEvidence
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
+from ctxval.learning import DistancePredictor
 from ctxval.searches import Prediction
 from ctxval.storage.store import Store
 
@@ -36,7 +37,11 @@ class LearnedFromTrials:
     store: Store
     trials: Sequence[Trial]
     study: CampaignDynamics
+    _predictor: DistancePredictor = field(init=False)
     _predictions: dict[int, Prediction | None] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_predictor", DistancePredictor(self.validation))
 
     def expected(self, points: Array, before: int) -> Array:
         """Return predicted distances ``(m,)`` at points ``(m, d)``, learned from the trials with smaller numbers.
@@ -58,7 +63,7 @@ class LearnedFromTrials:
         """Return the prediction from the trials with smaller numbers; it is computed once."""
         if before not in self._predictions:
             earlier = [trial for trial in self.trials if trial.number < before]
-            self._predictions[before] = predict_from(self.validation, self.store, earlier)
+            self._predictions[before] = predict_from(self._predictor, self.store, earlier)
         return self._predictions[before]
 
     def __repr__(self) -> str:

@@ -20,7 +20,7 @@ from ctxval.campaign.history import predict_from
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
-from ctxval.learning.error_vectors import ErrorVectors
+from ctxval.learning.prediction import DistancePredictor
 from ctxval.searches import BaseSearch
 from ctxval.storage.store import Store
 
@@ -36,7 +36,7 @@ class Proposals:
 
     def __init__(self, validation: Validation, search: BaseSearch, store: Store) -> None:
         self._validation, self._search, self._store = validation, search, store
-        self._errors = ErrorVectors(validation)
+        self._predictor = DistancePredictor(validation)
 
     def next(self, trials: Sequence[Trial]) -> tuple[Array, dict[str, Any] | None]:
         """Return the search's next point ``(d,)`` and its note.
@@ -50,7 +50,7 @@ class Proposals:
         if not self._search.uses_prediction:
             return self._asked(), _plain_note(self._search.note())
         with stage("choosing a task", unit="designs"):
-            prediction = predict_from(self._validation, self._store, trials, self._errors)
+            prediction = predict_from(self._predictor, self._store, trials)
             if prediction is not None:
                 prediction = replace(prediction, costs=partial(costs_of, prediction, self._validation, trials))
             self._search.use_prediction(prediction)

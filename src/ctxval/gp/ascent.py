@@ -9,33 +9,60 @@ from __future__ import annotations
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.boxes import separated_rows
+from ctxval._util.boxes import moves_to_bounds, separated_rows
 from ctxval.gp.evaluations import Evaluations, Values
 
-_STARTS = 6
-"""Number of points from which the function is climbed."""
+_STARTS = 10
+"""Number of points from which the function, or its approximation, is climbed."""
+_ROUNDS = 3
+"""Number of line searches of each climb."""
+_FINALISTS = (3, 2)
+"""Number of points from which the function itself is climbed after its approximation, and of line searches."""
 _SEPARATION = 0.1
 """Least distance between the starts, as a share of the box's diagonal."""
 _FEW = 3
 """Largest dimension in which samples ever closer to the best points replace the climbs."""
-_ZOOMS = (0.03, 0.01, 0.003, 0.001)
-"""Standard deviations of these samples, as shares of the box."""
+_POOL = 128
+"""Number of points in few dimensions that are the same in each search, for each dimension."""
+_SCALES = (1.0, 0.3, 0.1)
+"""Standard deviations of these samples, in distances between the points of the pool; smaller in later rounds."""
+_WIDEST = 0.3
+"""Largest standard deviation, as a share of the box."""
+_ZOOMED = 6
+"""Number of points that are sampled around."""
+_SAMPLES = 18
+"""Number of samples in each round, for each dimension; there are 1, 3 and 5 rounds in 1, 2 and 3 dimensions."""
+_SHRINKS = 0.5
+"""Factor of the standard deviations from round to round."""
+_MOVED = 3
+"""Number of best points of which single coordinates are moved to bounds in each round."""
+_REFINED = 16
+"""Number of points at which the function itself is evaluated after its approximation."""
+_DISTINCT = 0.02
+"""Least distance between them, as a share of the box's diagonal."""
+_MOVES = 4
+"""Largest number of rounds in which coordinates are moved to bounds."""
 
 
 class Ascent:
     """One search for the maximum of a function over a box within the unit cube.
 
-    The function is sampled. Quasi-Newton climbs start from the best samples, all at once. Then coordinates are moved to
-    the box's bounds.
+    In few dimensions, the points of a fixed pool are evaluated, and then samples ever closer to the best ones. In more
+    dimensions the function is sampled, and line searches start from the best samples, all at once, along slopes and
+    towards the corner to which they point. Then coordinates are moved to the box's bounds. If there is a cheap
+    approximation of the function, it is searched first, and the function itself is evaluated near the best points only;
+    few dimensions need no approximation.
 
     Args:
         function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
         low, high: the bounds of the box, shapes ``(d,)``.
         budget: number of points at which the function may be evaluated; the last climb may exceed it.
+        rough: a cheap approximation of the function; the function itself if None.
     """
 
-    def __init__(self, function: Values, low: Array, high: Array, budget: int) -> None:
-        self._evaluations = Evaluations(function, low, high, budget, strict=False)
+    def __init__(self, function: Values, low: Array, high: Array, budget: int, rough: Values | None = None) -> None:
+        self._exact = Evaluations(function, low, high, budget, strict=False)
+        self._rough = self._exact if rough is None else Evaluations(rough, low, high, budget, strict=False)
 
     def run(self, starts: Array, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return points ``(m, d)`` and values ``(m,)`` that were evaluated, the largest first.
@@ -44,31 +71,75 @@ class Ascent:
             starts: points ``(s, d)`` to evaluate first.
             rng: the source of the samples.
         """
-        done = self._evaluations
-        sampled = max(8, done.budget // 3)
-        done.evaluate(np.concatenate([np.clip(starts, done.low, done.high), done.samples(sampled, rng)]))
-        if done.dimension <= _FEW:
-            self._zoom(rng)
-        elif done.left > 2 * (done.dimension + 1):
-            done.climb(self._separated_best(), int(0.8 * done.left))
-        while done.left > 0 and done.move_to_bounds(rng):
-            pass
-        return done.found()
+        inside = np.clip(starts, self._exact.low, self._exact.high)
+        if self._exact.dimension <= _FEW:
+            self._search_few(inside, rng)
+        else:
+            self._search_many(inside, rng)
+        return self._exact.found()
 
-    def _separated_best(self) -> Array:
-        """Return some of the best points, each at a distance from all better ones."""
-        points, values = self._evaluations.found()
-        finite = points[:200][np.isfinite(values[:200])]
-        reach = _SEPARATION * float(np.linalg.norm(self._evaluations.high - self._evaluations.low))
-        return finite[separated_rows(finite, reach, _STARTS)]
+    @property
+    def _left(self) -> int:
+        """How many evaluations the budget still allows."""
+        used = 0 if self._rough is self._exact else self._rough.budget - self._rough.left
+        return self._exact.left - used
 
-    def _zoom(self, rng: np.random.Generator) -> None:
+    def _search_few(self, starts: Array, rng: np.random.Generator) -> None:
         """Sample ever closer to the best points: cheaper than slopes in few dimensions, and insensitive to kinks."""
-        done = self._evaluations
-        count = int(0.8 * done.left) // len(_ZOOMS)
-        for share in _ZOOMS:
-            best = self._separated_best()
-            if not len(best) or not count:
+        exact = self._exact
+        pool = _pool(exact.dimension, min(_POOL * exact.dimension, exact.budget // 3))
+        exact.evaluate(starts)
+        exact.evaluate_inside(pool)
+        best = _best(exact, _ZOOMED)
+        gap = len(pool) ** (-1 / exact.dimension)
+        for _ in range(2 * exact.dimension - 1):
+            corners = moves_to_bounds(best[:_MOVED], exact.low, exact.high).reshape(-1, exact.dimension)
+            count = min(_SAMPLES * exact.dimension, self._left - len(best) - len(corners))
+            if not len(best) or count < 1:
                 return
-            moves = share * (done.high - done.low) * rng.normal(size=(count, done.dimension))
-            done.evaluate(np.clip(np.resize(best, (count, done.dimension)) + moves, done.low, done.high))
+            widths = np.minimum(gap, _WIDEST * (exact.high - exact.low))
+            steps = np.resize(_SCALES, count)[:, None] * widths
+            near = np.resize(best, (count, exact.dimension)) + steps * rng.normal(size=(count, exact.dimension))
+            exact.evaluate(np.concatenate([best, np.clip(near, exact.low, exact.high), corners]))
+            best = _best(exact, _ZOOMED)
+            gap *= _SHRINKS
+
+    def _search_many(self, starts: Array, rng: np.random.Generator) -> None:
+        rough, exact = self._rough, self._exact
+        rough.evaluate(np.concatenate([starts, rough.samples(max(8, rough.budget // 6), rng)]))
+        self._climb(rough, _STARTS, _ROUNDS)
+        if rough is not exact:
+            exact.evaluate(np.concatenate([starts, _best(rough, _REFINED, _DISTINCT)]))
+        self._climb(exact, *_FINALISTS)
+        for _ in range(_MOVES):
+            if self._left < 1 or not exact.move_to_bounds(rng):
+                return
+
+    def _climb(self, done: Evaluations, starts: int, rounds: int) -> None:
+        """Climb from the best points, from as many of them as the budget allows."""
+        allowed = self._left // (rounds * done.line_search_cost)
+        if allowed:
+            done.search_lines(_best(done, min(starts, allowed)), rounds)
+
+
+def _best(done: Evaluations, count: int, share: float = _SEPARATION) -> Array:
+    """Return some of the best points, each at a distance from all better ones."""
+    points, values = done.found()
+    finite = points[np.isfinite(values)]
+    reach = share * float(np.linalg.norm(done.high - done.low))
+    return finite[separated_rows(finite, reach, count)]
+
+
+def _pool(dimension: int, count: int) -> Array:
+    """Return points that fill the unit cube evenly and reach its faces, shape ``(count, d)``.
+
+    Source:
+        Roberts 2018, "The unreasonable effectiveness of quasirandom sequences": a Kronecker sequence of generalised
+        golden ratios.
+    """
+    ratio = 2.0
+    for _ in range(30):
+        ratio = (1 + ratio) ** (1 / (dimension + 1))
+    points = (0.5 + np.arange(1, count + 1)[:, None] * ratio ** -np.arange(1.0, dimension + 1)) % 1
+    margin = 0.5 / count ** (1 / dimension)
+    return np.asarray(np.clip((1 + 2 * margin) * points - margin, 0, 1))

@@ -16,6 +16,12 @@ _POLISHED = 3
 """Number of best points whose coordinates are moved to bounds, several at a time."""
 _STEP = 1e-4
 """Step of the one-sided differences."""
+_SHARES = np.array([0.03, 0.1, 0.3, 0.6, 1.0])
+"""Steps of a line search, as shares of the way to a corner."""
+_LENGTHS = np.array([0.1, 0.4])
+"""Steps along the slopes, as shares of the box in the steepest coordinate."""
+_COORDINATES = (0.0, 0.25, 0.5)
+"""Shares of the coordinates that are moved to the corner alone, at least one coordinate each."""
 
 
 class Evaluations:
@@ -57,6 +63,13 @@ class Evaluations:
             self._values.append(values[: len(asked)])
         return values
 
+    def evaluate_inside(self, points: Array) -> None:
+        """Evaluate points ``(m, d)`` of which some may be outside of the box; their values do not count."""
+        inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
+        values = np.asarray(self._function(points), dtype=np.float64)[inside]
+        self._points.append(points[inside])
+        self._values.append(np.where(np.isfinite(values), values, -np.inf))
+
     def in_order(self) -> tuple[Array, Array]:
         """Return all points ``(m, d)`` and their values ``(m,)`` as they were evaluated."""
         return np.concatenate(self._points), np.concatenate(self._values)
@@ -90,6 +103,43 @@ class Evaluations:
             return self._slopes(np.clip(points, self.low, self.high))
 
         climb(sloped, starts, self.low, self.high, scale=scale, iterations=calls, evaluations=calls)
+
+    @property
+    def line_search_cost(self) -> int:
+        """The number of evaluations of one line search from one point."""
+        return self.dimension + 1 + len(_SHARES) + len(_LENGTHS) + len(_COORDINATES)
+
+    def search_lines(self, starts: Array, rounds: int) -> None:
+        """Search along lines from all starts at once, several times; the points reached are among those evaluated.
+
+        Each line leads along the slopes, or to the corner to which they point (Frank and Wolfe 1956), where convex
+        functions have their maxima. Some steps move only the coordinates that promise most.
+
+        Args:
+            starts: points ``(s, d)``.
+            rounds: number of line searches from each start.
+        """
+        points, row = starts, np.arange(len(starts))
+        for _ in range(rounds):
+            here, slopes = self._slopes(points)
+            moved = self._along(points, slopes)
+            values = self.evaluate(moved.reshape(-1, self.dimension)).reshape(moved.shape[:2])
+            best = values.argmax(axis=1)
+            better = values[row, best] > here
+            points = np.where(better[:, None], moved[row, best], points)
+            if not better.any():
+                return
+
+    def _along(self, points: Array, slopes: Array) -> Array:
+        """Return points on the lines from each point, shape ``(s, q, d)``."""
+        ways = np.where(slopes > 0, self.high, self.low) - points
+        order = np.argsort(-np.abs(slopes * ways), axis=1, kind="stable")
+        rank = np.argsort(order, axis=1)
+        counts = np.maximum(1, (np.array(_COORDINATES) * self.dimension).astype(int))
+        few = np.where(rank[:, None] < counts[:, None], ways[:, None], 0.0)
+        steepest = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300) * (self.high - self.low)
+        moves = [_SHARES[:, None] * ways[:, None], _LENGTHS[:, None] * steepest[:, None], few]
+        return np.asarray(np.clip(points[:, None] + np.concatenate(moves, axis=1), self.low, self.high))
 
     def _slopes(self, points: Array) -> tuple[Array, Array]:
         """Return values and slopes by one-sided differences, which point inward if a bound is near."""

@@ -175,10 +175,10 @@ class LoopPlanner:
         """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does."""
         promised, known = planned.promised.finite, planned.promised.finite & loops.finite
         model, system = (_without_divergence(one, known) for one in (planned.promised, loops))
-        found = np.where(known, self._measured(planned.task, model, system), np.inf)
+        found = np.where(known, self.measured(planned.task, model, system), np.inf)
         return np.where(promised, found, np.nan).reshape(len(planned.rows))
 
-    def _measured(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
+    def measured(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
         """Return the distance of each task, ``(...)``, one by one if the distance does not take a batch.
 
         It is infinity if the distance raises an exception or returns no finite number: nothing is known then.
@@ -193,7 +193,7 @@ class LoopPlanner:
                 return np.array(np.inf)
         if not model.batch_shape:
             return np.array(np.inf)
-        each = (self._measured(task[k], model[k], system[k]) for k in range(model.batch_shape[0]))
+        each = (self.measured(task[k], model[k], system[k]) for k in range(model.batch_shape[0]))
         return np.array([float(one) for one in each])
 
     def __repr__(self) -> str:

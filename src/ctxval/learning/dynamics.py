@@ -7,25 +7,23 @@ them, and ``M_hat = M + r`` is a corrected model.
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.representation import call
-from ctxval.core.model import Model
+from ctxval.core.model import Model, Step
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.gp import kernels
 from ctxval.gp.cholesky import tenfold
 from ctxval.gp.regression import MultiOutputProcess, log_likelihood_of_outputs, most_likely
 from ctxval.gp.subset import pivoted_rows
-from ctxval.learning.residual_data import residual_data
+from ctxval.learning.residual_data import ResidualData, residual_data
+from ctxval.learning.residual_expansion import ResidualExpansion, weights_without
 from ctxval.models.scaling import standardised_pairs
 
-_CENTRES = 450
-"""Largest number of transitions that the residual is conditioned on."""
 _LEARNED_FROM = 120
 """Largest number of transitions from which its hyperparameters are learned."""
 _START = 3.0
@@ -41,6 +39,12 @@ _NOISE = (1e-9, 0.1)
 positive definite."""
 _PIVOT = 0.1
 """Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
+_TOLERANCE = 1e-6
+"""Relative change of the log likelihood at which the search for the hyperparameters ends."""
+_REPLACING = (600, 100)
+"""Number of unused transitions from which replacements of those that are left out are chosen, and of replacements."""
+_ROUGHLY = 0.03
+"""Largest error of a rough residual, as a share of the residuals that it predicts."""
 _KERNEL = kernels.Sum(
     kernels.Matern(2.5, ard=True, length_scale=(0.2, 200.0), variance=(1e-6, 1e4)),
     kernels.Linear(centre=0.0, variance=(1e-6, 1e4)),
@@ -55,15 +59,15 @@ class Residual:
         theta: logarithms of the hyperparameters of a Matern 5/2 kernel with a length-scale for each column, and of a
             linear kernel.
         noise: variance of the outputs' noise.
-        centres: standardised state-input pairs that it is conditioned on, shape ``(M, n + m)``.
+        centres: standardised state-input pairs that it is conditioned on, shape ``(M, n + m)``; each is the one with
+            the largest variance given those before it.
         outputs: standardised residuals at the centres, shape ``(M, n)``.
         sources: the execution of each pair; -1 for data that the model was made from, shape ``(M,)``.
         shift_in, scale_in: constants that standardise a state-input pair, shapes ``(n + m,)``.
         scale_out: unit of the standardised residual, shape ``(n,)``; 0 if the residual of a state is negligible.
         limit: the largest standardised residual that is returned, in magnitude, shape ``(n,)``.
         unit: a standardised residual of 1, as a share of a typical step of the system.
-        spare: further pairs, outputs and sources, which replace those of executions that are left out; None if they
-            are in use already.
+        unused: further pairs, outputs and sources, some of which replace those of executions that are left out.
     """
 
     theta: Array
@@ -76,7 +80,7 @@ class Residual:
     scale_out: Array
     limit: Array
     unit: float
-    spare: tuple[Array, Array, Rows] | None = None
+    unused: tuple[Array, Array, Rows]
 
     @functools.cached_property
     def process(self) -> MultiOutputProcess:
@@ -85,12 +89,8 @@ class Residual:
         return MultiOutputProcess(_KERNEL, self.theta, self.centres, self.outputs, tuple(tenfold(self.noise)))
 
     @functools.cached_property
-    def _scaled(self) -> tuple[Array, Array, Array]:
-        """Constants of every evaluation: centres over length-scales, weights of the Matern and of the linear part."""
-        variance, scales, constant, slope = _parts(self.theta)
-        weights = self.process.weights
-        linear = np.vstack([constant * weights.sum(axis=0), slope * (self.centres.T @ weights)])
-        return self.centres / scales, variance * weights, linear
+    def _expansion(self) -> ResidualExpansion:
+        return ResidualExpansion.of(self.theta, self.centres, self.process.weights)
 
     def inputs(self, x: Array, u: Array) -> Array:
         """Return standardised pairs ``(..., n + m)``."""
@@ -98,12 +98,12 @@ class Residual:
 
     def __call__(self, x: Array, u: Array) -> Array:
         """Return r, shapes ``(..., n), (..., m) -> (..., n)``."""
+        return self.in_units(self._expansion, x, u)
+
+    def in_units(self, function: Callable[[Array], Array], x: Array, u: Array) -> Array:
+        """Return a function of standardised pairs as a function of states and inputs, in the units of the states."""
         z = self.inputs(x, u)
-        rows = z.reshape(-1, z.shape[-1])
-        centres, weights, linear = self._scaled
-        scales = np.exp(self.theta[1:-2])
-        output = _matern(cdist(rows / scales, centres)) @ weights + linear[0] + rows @ linear[1:]
-        bounded = np.clip(output, -self.limit, self.limit)
+        bounded = np.clip(function(z.reshape(-1, z.shape[-1])), -self.limit, self.limit)
         return np.asarray((self.scale_out * bounded).reshape(x.shape))
 
     def variance(self, x: Array, u: Array) -> Array:
@@ -126,34 +126,92 @@ class Residual:
         errors = self.process.factor.left_out_errors(self.process.weights)
         return self.unit * float(np.median(np.sqrt((errors**2).mean(axis=1))))
 
-    def without(self, sources: Collection[int]) -> Residual:
-        """Return the residual conditioned without some executions; its hyperparameters do not change."""
-        spare = () if self.spare is None else (self.spare,)
-        parts = zip((self.centres, self.outputs, self.sources), *spare, strict=True)
-        centres, outputs, of = (np.concatenate(part) for part in parts)
-        kept = ~np.isin(of, list(sources))
-        return replace(self, centres=centres[kept], outputs=outputs[kept], sources=of[kept], spare=None)
+    def rough(self, centres: int) -> Residual:
+        """Return the residual conditioned on the first centres only, which is cheaper to evaluate.
+
+        If so many centres do not predict the residuals at the others well, twice as many are tried, and so on.
+        """
+        first = slice(0, centres)
+        fewer = replace(self, centres=self.centres[first], outputs=self.outputs[first], sources=self.sources[first])
+        others = self.outputs[centres:]
+        if not len(others):
+            return self
+        errors = fewer.process.predict(self.centres[centres:])[0] - others
+        return fewer if (errors**2).mean() <= _ROUGHLY**2 * (others**2).mean() else self.rough(2 * centres)
+
+    def without(self, left_out: Sequence[Collection[int]]) -> ResidualsWithout:
+        """Return residuals without some executions, all together; the hyperparameters do not change.
+
+        Args:
+            left_out: for each of the residuals, the executions that it does not know.
+        """
+        some = np.linspace(0, max(0, len(self.unused[0]) - 1), min(_REPLACING[0], len(self.unused[0]))).astype(int)
+        least = _PIVOT * self.noise
+        spare = some[pivoted_rows(_KERNEL, self.theta, self.unused[0][some], _REPLACING[1], least=least)]
+        centres, outputs, sources = (
+            np.concatenate([used, unused[spare]])
+            for used, unused in zip((self.centres, self.outputs, self.sources), self.unused, strict=True)
+        )
+        gone = np.array([np.isin(sources, list(without)) for without in left_out])
+        covariance = _KERNEL(self.theta, centres, centres)
+        weights = weights_without(covariance, self.noise, outputs, gone)
+        return ResidualsWithout(self, ResidualExpansion.of(self.theta, centres, weights))
 
     def __repr__(self) -> str:
         return call(self, centres=self.centres, outputs=self.outputs, noise=self.noise)
 
 
-def _parts(theta: Array) -> tuple[float, Array, float, float]:
-    """Return Matern variance, length-scales, and the linear kernel's constant and slope variances."""
-    values = np.exp(theta)
-    return float(values[0]), values[1:-2], float(values[-2]), float(values[-1])
+@dataclass(frozen=True, eq=False)
+class ResidualsWithout:
+    """Residuals of which each is conditioned without some executions; the k-th one is for the k-th state of a batch.
+
+    Attributes:
+        residual: the residual that knows all executions.
+        expansion: the residuals as functions of standardised pairs.
+    """
+
+    residual: Residual
+    expansion: ResidualExpansion
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        """Return the value of each residual at a state of its own, shapes ``(k, n), (k, m) -> (k, n)``."""
+        return self.residual.in_units(self.expansion, x, u)
+
+    def __getitem__(self, rows: Rows) -> ResidualsWithout:
+        """Return some of the residuals."""
+        parts = {name: getattr(self.expansion, name)[rows] for name in ("weights", "constant", "slopes")}
+        return ResidualsWithout(self.residual, replace(self.expansion, **parts))
+
+    def __repr__(self) -> str:
+        return call(self, self.residual, len(self.expansion.weights))
 
 
-def _matern(r: Array) -> Array:
-    """Return the Matern 5/2 covariance of distances; the argument is overwritten."""
-    r *= np.sqrt(5.0)
-    decay = np.exp(-r)
-    decay *= 1 + r * (1 + r / 3)
-    return decay
+@dataclass(frozen=True, eq=False)
+class LearnedCovariance:
+    """The most likely covariance of the residual of a model, which may be M or none.
+
+    Attributes:
+        model: the model to which the residual is added.
+        theta, noise: see :class:`Residual`.
+        scale: the units of the standardised pairs to which theta belongs, shape ``(n + m,)``.
+        error: the median leave-one-out error of a step, as a share of a typical step.
+    """
+
+    model: Model
+    theta: Array
+    noise: float
+    scale: Array
+    error: float
+
+    def __repr__(self) -> str:
+        return call(self, self.model, error=self.error)
 
 
-def learn_residual(model: Model, transitions: Transitions, sources: Rows, centres: int = _CENTRES) -> Residual | None:
-    """Learn ``r(x, u) = x' - M(x, u)`` from recorded transitions.
+def learn_covariance(model: Model, transitions: Transitions, sources: Rows) -> LearnedCovariance | None:
+    """Return the most likely covariance of the residual of M or, if this predicts much better, of the system's steps.
+
+    If M is rougher than the system, such as a small network, then its residual has all of its kinks and is harder to
+    learn than the steps.
 
     Returns None if fewer than two transitions are usable, or if M explains all of them.
 
@@ -161,34 +219,73 @@ def learn_residual(model: Model, transitions: Transitions, sources: Rows, centre
         model: the model M.
         transitions: N transitions of the system.
         sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
-        centres: largest number of transitions that the residual is conditioned on.
     """
+    of_model = _learned(model, transitions, sources)
+    if of_model is None:
+        return None
+    of_steps = _learned(Identity(), transitions, sources)
+    return of_steps if of_steps is not None and of_steps.error < _MUCH_BETTER * of_model.error else of_model
+
+
+def _learned(model: Model, transitions: Transitions, sources: Rows) -> LearnedCovariance | None:
     data = residual_data(model, transitions, sources)
     if data is None:
         return None
-    Z, Y, learned = data.pairs, data.outputs, data.learned
     with single_threaded():
-        theta, noise = _most_likely(Z, Y[:, learned])
-        chosen = pivoted_rows(_KERNEL, theta, Z, centres, least=_PIVOT * noise)
-        others = np.setdiff1d(np.arange(len(Z)), chosen)
-        spare = others[pivoted_rows(_KERNEL, theta, Z[others], centres // 3, least=_PIVOT * noise)]
+        theta, noise, error = _most_likely(data.pairs, data.outputs[:, data.learned])
+    return LearnedCovariance(model, theta, noise, data.scale, _unit(data) * error)
+
+
+def learn_residual(
+    learned: LearnedCovariance, transitions: Transitions, sources: Rows, centres: int
+) -> Residual | None:
+    """Return the residual of the learned covariance's model, given recorded transitions.
+
+    Returns None if fewer than two transitions are usable, or if the model explains all of them.
+
+    Args:
+        learned: the model and the covariance of its residual.
+        transitions: N transitions of the system.
+        sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
+        centres: largest number of transitions that the residual is conditioned on.
+    """
+    data = residual_data(learned.model, transitions, sources)
+    if data is None:
+        return None
+    Z, Y = data.pairs, data.outputs
+    theta = learned.theta.copy()
+    theta[1:-2] += np.log(learned.scale / data.scale)
+    with single_threaded():
+        chosen = pivoted_rows(_KERNEL, theta, Z, centres, least=_PIVOT * learned.noise)
+    others = np.setdiff1d(np.arange(len(Z)), chosen)
     return Residual(
-        *(theta, noise, Z[chosen], Y[chosen], data.sources[chosen], data.shift, data.scale),
+        *(theta, learned.noise, Z[chosen], Y[chosen], data.sources[chosen], data.shift, data.scale),
         scale_out=data.units,
         limit=_REACH * np.abs(Y).max(axis=0),
-        unit=float(np.sqrt(((data.sizes / data.steps)[learned] ** 2).mean())),
-        spare=(Z[spare], Y[spare], data.sources[spare]),
+        unit=_unit(data),
+        unused=(Z[others], Y[others], data.sources[others]),
     )
 
 
-def _most_likely(Z: Array, Y: Array) -> tuple[Array, float]:
-    """Return the hyperparameters and the noise that make outputs ``(N, n)`` of well-spread inputs most likely."""
+def _unit(data: ResidualData) -> float:
+    """Return a standardised residual of 1 as a share of a typical step."""
+    return float(np.sqrt(((data.sizes / data.steps)[data.learned] ** 2).mean()))
+
+
+def _most_likely(Z: Array, Y: Array) -> tuple[Array, float, float]:
+    """Return the hyperparameters and the noise that make outputs ``(N, n)`` of well-spread inputs most likely.
+
+    The third value is the median leave-one-out error of these outputs.
+    """
     start = np.log([1.0, *[_START] * Z.shape[1], 0.1, 0.1, 1e-6])
     rows = pivoted_rows(_KERNEL, start[:-1], Z, _LEARNED_FROM, least=_PIVOT * _NOISE[0])
     bounds = [*_KERNEL.bounds(Z.shape[1]), (float(np.log(_NOISE[0])), float(np.log(_NOISE[1])))]
     Z, Y = Z[rows], Y[rows]
-    found = most_likely(lambda theta: log_likelihood(theta, Z, Y), start[None], bounds)
-    return found[:-1], float(np.exp(found[-1]))
+    found = most_likely(lambda theta: log_likelihood(theta, Z, Y), start[None], bounds, tolerance=_TOLERANCE)
+    theta, noise = found[:-1], float(np.exp(found[-1]))
+    process = MultiOutputProcess(_KERNEL, theta, Z, Y, tuple(tenfold(noise)))
+    errors = process.factor.left_out_errors(process.weights)
+    return theta, noise, float(np.median(np.sqrt((errors**2).mean(axis=1))))
 
 
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
@@ -220,7 +317,7 @@ class CorrectedModel:
         residual: the residual r.
     """
 
-    def __init__(self, model: Model, residual: Residual) -> None:
+    def __init__(self, model: Model, residual: Step) -> None:
         self.model = model
         self.residual = residual
 
@@ -230,27 +327,3 @@ class CorrectedModel:
 
     def __repr__(self) -> str:
         return call(self, self.model, self.residual)
-
-
-def learn_corrected(model: Model, transitions: Transitions, sources: Rows, centres: int) -> CorrectedModel | None:
-    """Return M plus its residual or, if this predicts much better, a model of the system's steps without M.
-
-    If M is rougher than the system, such as a small network, then its residual has all of its kinks and is harder to
-    learn than the steps.
-
-    Returns None if no residual can be learned (see :func:`learn_residual`).
-
-    Args:
-        model: the model M.
-        transitions: N transitions of the system.
-        sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
-        centres: largest number of transitions that a residual is conditioned on.
-    """
-    of_model = learn_residual(model, transitions, sources, centres)
-    if of_model is None:
-        return None
-    of_steps = learn_residual(Identity(), transitions, sources, centres)
-    with single_threaded():
-        if of_steps is not None and of_steps.typical_error() < _MUCH_BETTER * of_model.typical_error():
-            return CorrectedModel(Identity(), of_steps)
-    return CorrectedModel(model, of_model)

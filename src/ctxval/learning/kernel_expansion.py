@@ -11,7 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.learning.hyperparameters import Hyperparameters
 
-_ROWS = 512
+_ROWS = 128
 """Number of arguments that are evaluated together, so that intermediate results stay in the processor's cache."""
 
 

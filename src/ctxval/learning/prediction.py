@@ -8,24 +8,41 @@ from __future__ import annotations
 
 import functools
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.cores import on_all_cores
 from ctxval._util.progress import advance
+from ctxval._util.representation import call
 from ctxval.core.distance import ComposedDistance
+from ctxval.core.model import Model, Step
 from ctxval.core.rollout import rollout
+from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.dynamics import CorrectedModel, learn_corrected
+from ctxval.learning.closed_loops import PlannedTasks
+from ctxval.learning.dynamics import (
+    CorrectedModel,
+    LearnedCovariance,
+    Residual,
+    learn_covariance,
+    learn_residual,
+)
 from ctxval.learning.error_vectors import ErrorVectors, Executed
+from ctxval.learning.plan_memory import PlanMemory
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.vector import predict_composed
 from ctxval.searches import Prediction
 
+_ResidualOf = Callable[[Rows], Step]
+"""Rows of a batch of tasks -> the residual with which they are run."""
+
 _CENTRES = (100, 450)
 """Least and largest number of transitions that the residual is conditioned on."""
+_ROUGH_CENTRES = 64
+"""The same for the rough prediction, with which a search screens many points."""
 _WORK = 30_000
 """Number of these transitions times the horizon; it bounds the time of a closed loop."""
 _DESIGNS = 2000
@@ -36,55 +53,106 @@ _SLOW = 0.02
 """Seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores."""
 
 
-def predict_distance(
-    validation: Validation, executed: Executed, errors: ErrorVectors | None = None
-) -> Prediction | None:
-    """Return a prediction of d at other points, from the executions so far and the data that the model was made from.
+class DistancePredictor:
+    """Predicts d at points that were not executed, from growing sets of executions of one campaign.
 
-    Returns None if there are no recorded transitions, if M already explains them, or if no task can be planned.
+    What does not depend on the executions is kept between predictions: the controllers of tasks that are looked at
+    again, and the trajectories of M there. Everything is a function of the executions, so a resumed campaign predicts
+    the same.
 
-    If the distance is composed of a short vector, such as the error of the final state, a second prediction models the
-    vector as a function of p, because an error that is no function of state and input may still be a function of p.
-    The first prediction offers the second one as ``otherwise``. If there is no first prediction, the second one is
-    returned instead.
+    Args:
+        validation: the map p -> d(p); S is never executed.
+    """
+
+    def __init__(self, validation: Validation) -> None:
+        self.validation = validation
+        self._plans = PlanMemory(validation)
+        self._errors = ErrorVectors(validation)
+        self._learned: tuple[bytes, LearnedCovariance | None] | None = None
+
+    def predict(self, executed: Executed) -> Prediction | None:
+        """Return a prediction of d from executions and from the data that the model was made from.
+
+        Returns None if there are no recorded transitions, if M already explains them, or if no task can be planned.
+
+        If the distance is composed of a short vector, such as the error of the final state, a second prediction models
+        the vector as a function of p, because an error that is no function of state and input may still be a function
+        of p. The first prediction offers the second one as ``otherwise``. If there is no first prediction, the second
+        one is returned instead.
+
+        Args:
+            executed: points of the unit cube ``(d,)`` with the system's trajectories there.
+        """
+        otherwise = functools.partial(_predict_vectors, self._errors, executed)
+        with single_threaded():
+            found = self._predict(executed)
+            return otherwise() if found is None else replace(found, otherwise=otherwise)
+
+    @functools.cached_property
+    def _loops(self) -> tuple[Trajectory | None, float]:
+        """Closed loops on M, and the seconds that they took."""
+        started = time.perf_counter()
+        return closed_loops_on_model(self.validation), time.perf_counter() - started
+
+    def _predict(self, executed: Executed) -> Prediction | None:
+        loops, seconds = self._loops
+        corrected = None if loops is None else self._corrected(executed, loops)
+        if loops is None or corrected is None:
+            return None
+        batched = bool(loops.batch_shape)
+        in_parallel = not batched and seconds > _SLOW
+        exact = _PredictedDistance(self._plans, *corrected, executed, in_parallel)
+        rough = replace(exact, residual=exact.residual.rough(_ROUGH_CENTRES))
+        return Prediction(exact, exact.left_out, _DESIGNS if batched else _SLOW_DESIGNS, rough=rough)
+
+    def _corrected(self, executed: Executed, loops: Trajectory) -> tuple[Model, Residual] | None:
+        recorded = recorded_transitions(self.validation.model, [one for _, one in executed], loops)
+        if recorded is None:
+            return None
+        # If nothing could be learned when it was scheduled, it is learned now.
+        learned = self._covariance(executed[: _scheduled(len(executed))], loops) or self._covariance(executed, loops)
+        centres = int(np.clip(_WORK // loops.horizon, *_CENTRES))
+        residual = None if learned is None else learn_residual(learned, *recorded, centres)
+        return None if learned is None or residual is None else (learned.model, residual)
+
+    def _covariance(self, executed: Executed, loops: Trajectory) -> LearnedCovariance | None:
+        key = b"".join(part.tobytes() for _, one in executed for part in (one.states, one.inputs))
+        if self._learned is None or self._learned[0] != key:
+            recorded = recorded_transitions(self.validation.model, [one for _, one in executed], loops)
+            self._learned = key, None if recorded is None else learn_covariance(self.validation.model, *recorded)
+        return self._learned[1]
+
+    def __repr__(self) -> str:
+        return call(self, self.validation)
+
+
+def predict_distance(validation: Validation, executed: Executed) -> Prediction | None:
+    """Return a single prediction of d; see :meth:`DistancePredictor.predict`.
 
     Args:
         validation: the map p -> d(p).
         executed: points of the unit cube ``(d,)`` with the system's trajectories there.
-        errors: keeps the vectors of earlier executions, so that a further suggestion computes only new ones.
     """
-    otherwise = functools.partial(_predict_vectors, validation, executed, errors or ErrorVectors(validation))
-    with single_threaded():
-        found = _predict_distance(validation, executed)
-        return otherwise() if found is None else replace(found, otherwise=otherwise)
+    return DistancePredictor(validation).predict(executed)
 
 
-def _predict_vectors(validation: Validation, executed: Executed, errors: ErrorVectors) -> Prediction | None:
+def _scheduled(count: int) -> int:
+    """Return the largest number of executions, up to ``count``, at which hyperparameters are learned.
+
+    These are 0 to 4, 6, 8, 12, 16, 24 and so on, two in each doubling.
+    """
+    step = 1
+    while count >= 4 * step:
+        step *= 2
+    return count - count % step
+
+
+def _predict_vectors(errors: ErrorVectors, executed: Executed) -> Prediction | None:
     """Return the prediction from the vectors of which distances are composed; None if they are not known."""
-    distance, vectors = validation.distance, errors.of(executed)
+    distance, vectors = errors.validation.distance, errors.of(executed)
     if vectors is None or not isinstance(distance, ComposedDistance):
         return None
     return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)
-
-
-def _predict_distance(validation: Validation, executed: Executed) -> Prediction | None:
-    started = time.perf_counter()
-    loops = closed_loops_on_model(validation)
-    seconds = time.perf_counter() - started
-    if loops is None:
-        return None
-    recorded = recorded_transitions(validation.model, [trajectory for _, trajectory in executed], loops)
-    if recorded is None:
-        return None
-    centres = int(np.clip(_WORK // loops.horizon, *_CENTRES))
-    corrected = learn_corrected(validation.model, *recorded, centres)
-    if corrected is None:
-        return None
-    batched = bool(loops.batch_shape)
-    predicted = _PredictedDistance(
-        validation, corrected, batched, executed, in_parallel=not batched and seconds > _SLOW
-    )
-    return Prediction(predicted, predicted.left_out, _DESIGNS if batched else _SLOW_DESIGNS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,60 +160,71 @@ class _PredictedDistance:
     """The validation of M against M_hat, as a function of points of the unit cube.
 
     Attributes:
-        validation: the validation of M against S.
-        corrected: the corrected model M_hat.
-        batched: whether controllers are designed in batches.
+        plans: designs controllers, and keeps the latest ones.
+        model, residual: the corrected model M_hat is their sum.
         executed: executed points, with the trajectories from which M_hat was learned.
         in_parallel: whether closed loops are distributed over the cores; their results are the same.
     """
 
-    validation: Validation
-    corrected: CorrectedModel
-    batched: bool
+    plans: PlanMemory
+    model: Model
+    residual: Residual
     executed: Executed
     in_parallel: bool
 
+    _known: dict[bytes, tuple[float, float]] = field(default_factory=dict, init=False)
+
     def __call__(self, points: Array) -> tuple[Array, Array]:
         """Return the predicted distances ``(m,)``, and the doubt in the predicted trajectories ``(m,)``."""
-        with single_threaded():
-            if not self.in_parallel:
-                return self._looped(points, self.corrected)
-            parts = on_all_cores(functools.partial(self._looped, corrected=self.corrected), list(points[:, None, :]))
-            return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+        keys = [point.tobytes() for point in points]
+        new = [row for row, key in enumerate(keys) if key not in self._known]
+        if new:
+            with single_threaded():
+                found = self._predicted(points[new])
+            self._known.update(
+                zip((keys[row] for row in new), zip(*map(np.ndarray.tolist, found), strict=True), strict=True)
+            )
+        distance, doubt = np.array([self._known[key] for key in keys]).reshape(-1, 2).T
+        return distance, doubt
+
+    def _predicted(self, points: Array) -> tuple[Array, Array]:
+        if not self.in_parallel or all(map(self.plans.has, points)):
+            return self._looped(points, lambda rows: self.residual)
+        parts = on_all_cores(lambda point: self._looped(point, lambda rows: self.residual), list(points[:, None, :]))
+        return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
     def left_out(self, rows: Rows) -> Array:
         """Return the distances predicted at executed points, each from the executions of other points, ``(k,)``."""
-        points = [self.executed[k][0] for k in rows.tolist()]
+        points = np.array([self.executed[k][0] for k in rows.tolist()])
+        without = self.residual.without([self._there(point) for point in points])
         with single_threaded():
-            return np.array([self._looped(point[None], self._without(point))[0][0] for point in points])
+            return self._looped(points, lambda rows: without[rows])[0]
 
-    def _without(self, point: Array) -> CorrectedModel:
-        there = [source for source, (other, _) in enumerate(self.executed) if np.array_equal(other, point)]
-        return CorrectedModel(self.corrected.model, self.corrected.residual.without(there))
+    def _there(self, point: Array) -> list[int]:
+        """Return the executions of a point."""
+        return [source for source, (other, _) in enumerate(self.executed) if np.array_equal(other, point)]
 
-    def _looped(self, points: Array, corrected: CorrectedModel) -> tuple[Array, Array]:
+    def _looped(self, points: Array, residual: _ResidualOf) -> tuple[Array, Array]:
         """Return distances and doubts ``(m,)``; NaN for a task that fails. A batch that fails is halved and retried."""
-        if self.batched or len(points) == 1:
+        distance, doubt = np.full(len(points), np.nan), np.full(len(points), np.nan)
+        for planned in self.plans.plan(points):
+            rows = planned.rows
             try:
-                found = self._closed_loops(points, corrected)
-                advance(len(points))
-                return found
-            except Exception:  # the user's task, synthesizer or distance, on points that may never be executed
-                if len(points) == 1:
-                    return np.array([np.nan]), np.array([np.nan])
-        half = len(points) // 2
-        parts = [self._looped(part, corrected) for part in (points[:half], points[half:])]
-        return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+                distance[rows], doubt[rows] = self._closed_loops(planned, residual(rows))
+                advance(len(rows))
+            except Exception:  # the user's controller, on states that may never be reached
+                for half in np.array_split(rows, 2) if len(rows) > 1 else []:
+                    distance[half], doubt[half] = self._looped(points[half], functools.partial(_of, residual, half))
+        return distance, doubt
 
-    def _closed_loops(self, points: Array, corrected: CorrectedModel) -> tuple[Array, Array]:
-        parts, space = self.validation, self.validation.space
-        rows = points if self.batched else points[0]
-        task = parts.task(space.parameters(space.from_unit(rows)))
-        controller = parts.synthesizer.design(task, parts.model)
-        promised = rollout(parts.model.step, controller, task)
-        predicted = rollout(corrected.step, controller, task)
-        with np.errstate(all="ignore"):
-            distance = np.reshape(parts.distance(promised, predicted, task), len(points))
-            doubt = np.reshape(corrected.residual.unfamiliarity(predicted), len(points))
-        finite = np.isfinite(distance) & np.isfinite(doubt)
+    def _closed_loops(self, planned: PlannedTasks, residual: Step) -> tuple[Array, Array]:
+        predicted = rollout(CorrectedModel(self.model, residual).step, planned.controller, planned.task)
+        distance = self.plans.planner.measured(planned.task, planned.promised, predicted)
+        doubt = self.residual.unfamiliarity(predicted)
+        finite = np.isfinite(distance) & np.isfinite(doubt) & planned.promised.finite & predicted.finite
         return np.where(finite, distance, np.nan), np.where(finite, doubt, np.nan)
+
+
+def _of(residual: _ResidualOf, chosen: Rows, rows: Rows) -> Step:
+    """Return the residual for some of the chosen rows."""
+    return residual(chosen[rows])

@@ -47,6 +47,7 @@ class Prediction:
         otherwise: returns another prediction to use if leave-one-out errors show that this one is not good; None if
             there is no other.
         costs: measures the costs, which takes some predictions; None if they cannot be measured.
+        rough: an approximation of ``expected`` that is cheaper to evaluate; None if there is none.
     """
 
     expected: Callable[[Array], tuple[Array, Array]]
@@ -54,6 +55,7 @@ class Prediction:
     budget: int
     otherwise: Callable[[], Prediction | None] | None = None
     costs: Callable[[], Costs] | None = None
+    rough: Callable[[Array], tuple[Array, Array]] | None = None
 
     def with_rows(self, left_out_of: Callable[[Prediction], Callable[[Rows], Array]]) -> Prediction:
         """Return the prediction with other rows, also in those that it may turn to.

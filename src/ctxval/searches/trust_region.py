@@ -261,7 +261,7 @@ class TrustRegion(SequentialSearch):
     def _best(self, value: _OptimisticValue, region: _Region, rng: np.random.Generator) -> Array | None:
         """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
         budget = min(value.prediction.budget, self._settings.points * self.dimension)
-        ascent = Ascent(value, *region.box(self.dimension), budget)
+        ascent = Ascent(value, *region.box(self.dimension), budget, rough=value.rough)
         points, promised = ascent.run(best_first(self.points, self.values)[:8], rng)
         usable = points[np.isfinite(promised)]
         # The first few suffice almost always, and a long history makes each comparison costly.
@@ -334,6 +334,12 @@ class _OptimisticValue:
     prediction: Prediction
     discrepancy: GaussianProcess | None
     optimism: float
+
+    @property
+    def rough(self) -> _OptimisticValue | None:
+        """The same with the rough prediction; None if there is none."""
+        rough = self.prediction.rough
+        return None if rough is None else replace(self, prediction=replace(self.prediction, expected=rough))
 
     def __call__(self, points: Array) -> Array:
         expected, doubt = self.prediction.expected(points)
