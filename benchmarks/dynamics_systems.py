@@ -123,11 +123,23 @@ def record(
     seed: int,
     rollouts: int = 30,
     steps: int = 20,
+    around: Any = 0.0,
 ) -> Transitions:
-    """Return short runs from seeded random states in a box, under seeded random inputs within their limits."""
+    """Return short runs from seeded random states in a box, under seeded random inputs within their limits.
+
+    Args:
+        system: what is recorded.
+        low, high: the box of the first states, shape ``(n,)``.
+        inputs: the largest deviation of each input, shape ``(m,)``.
+        dt: s.
+        seed: of states and inputs.
+        rollouts: number of runs.
+        steps: of each run.
+        around: the inputs that the deviations are added to, shape ``(m,)``.
+    """
     rng = np.random.default_rng(seed)
     start = rng.uniform(low, high, (rollouts, len(low)))
-    forces = rng.uniform(-1, 1, (steps, rollouts, len(inputs))) * np.asarray(inputs)
+    forces = around + rng.uniform(-1, 1, (steps, rollouts, len(inputs))) * np.asarray(inputs)
     return system.execute(lambda t, x: forces[t], Task(start, horizon=steps, dt=dt)).transitions()
 
 

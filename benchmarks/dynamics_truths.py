@@ -132,8 +132,13 @@ class DeepSearch:
         return np.nan_to_num(found[:, 0], neginf=-1.0), np.where(np.isfinite(slopes), slopes, 0.0)
 
 
-def search(found: Experiment) -> dict[str, Any]:
-    """Return the record of a truth."""
+def search(found: Experiment, samples: int = SAMPLES) -> dict[str, Any]:
+    """Return the record of a truth.
+
+    Args:
+        found: the experiment.
+        samples: how many random tasks each repeat begins with, for all realisations of the noise together.
+    """
     validation, started = found.validation, time.process_time()
     noisy = realisations(validation, REALISATIONS)
 
@@ -142,7 +147,7 @@ def search(found: Experiment) -> dict[str, Any]:
         mean = np.mean([one.distances(points) for one in noisy], axis=0)
         return np.where(np.isfinite(mean), mean, -np.inf)
 
-    deep = DeepSearch(values, validation.space.dimension, SAMPLES // len(noisy))
+    deep = DeepSearch(values, validation.space.dimension, samples // len(noisy))
     tops: list[tuple[float, Array]] = []
     while len(tops) < LEAST or (_difference(tops) > AGREEMENT and len(tops) < MOST):
         tops.append(deep.repeat(len(tops)))
