@@ -20,25 +20,27 @@ written down before any search had run on any of the plants.
 
 from __future__ import annotations
 
-from plants.automatic_transmission import automatic_transmission
+from plants import (
+    automatic_transmission,
+    cart_pole,
+    f16,
+    fuel_control,
+    magnetic_levitation,
+    quadrotor,
+    six_joint_arm,
+    wind_turbine,
+)
 from plants.base import DEVELOPMENT, REPORTING, Plant, listed
-from plants.cart_pole import cart_pole
-from plants.f16 import f16_pull_up
-from plants.fuel_control import fuel_control
-from plants.magnetic_levitation import magnetic_levitation
-from plants.quadrotor import quadrotor
-from plants.six_joint_arm import six_joint_arm
-from plants.wind_turbine import wind_turbine
 
 __all__ = ["DEVELOPMENT", "PLANTS", "REPORTING", "Plant"]
 
 PLANTS: dict[str, Plant] = listed(
-    Plant("automatic-transmission", DEVELOPMENT, automatic_transmission, samples=10000),
-    Plant("fuel-control", DEVELOPMENT, fuel_control, samples=20000),
-    Plant("wind-turbine", DEVELOPMENT, wind_turbine, samples=20000),
-    Plant("cart-pole", DEVELOPMENT, cart_pole, samples=5000),
-    Plant("f16-pull-up", REPORTING, f16_pull_up, samples=10000),
-    Plant("magnetic-levitation", REPORTING, magnetic_levitation, samples=10000),
-    Plant("quadrotor-3d", REPORTING, quadrotor, samples=20000, budget=30),
-    Plant("six-joint-arm", REPORTING, six_joint_arm, samples=4000, budget=30),
+    Plant("automatic-transmission", DEVELOPMENT, automatic_transmission.make, samples=10000),
+    Plant("fuel-control", DEVELOPMENT, fuel_control.make, samples=20000),
+    Plant("wind-turbine", DEVELOPMENT, wind_turbine.make, samples=20000),
+    Plant("cart-pole", DEVELOPMENT, cart_pole.make, samples=5000),
+    Plant("f16-pull-up", REPORTING, f16.make, samples=10000),
+    Plant("magnetic-levitation", REPORTING, magnetic_levitation.make, samples=10000),
+    Plant("quadrotor-3d", REPORTING, quadrotor.make, samples=20000, budget=30),
+    Plant("six-joint-arm", REPORTING, six_joint_arm.make, samples=4000, budget=30),
 )

@@ -140,7 +140,7 @@ def recorded(system: systems.System, seed: int) -> Transitions:
     return driven.transitions()
 
 
-def automatic_transmission(seed: int) -> Experiment:
+def make(seed: int) -> Experiment:
     """Return a cruise control on the transmission; M is a network learned from careful drives. 5-D."""
     system = systems.Simulated(step, vectorized=True)
     return experiment(

@@ -35,7 +35,7 @@ def derivative(x: Array, u: Array, friction: float = CART_FRICTION) -> Array:
     return np.stack([speed, rate, fixed - moment * turned * (cosine - grip * sine) / total, turned], axis=-1)
 
 
-def cart_pole(seed: int) -> Experiment:
+def make(seed: int) -> Experiment:
     """Return the cart-pole that is led to rest by iLQR; M is linear, from small angles. 2-D."""
     system = simulated(derivative, DT, substeps=4)
     return experiment(

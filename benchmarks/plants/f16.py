@@ -167,7 +167,7 @@ def polynomial(data: Transitions) -> models.ScikitLearn:
     )
 
 
-def f16_pull_up(seed: int) -> Experiment:
+def make(seed: int) -> Experiment:
     """Return the aircraft that pulls up under LQR; M is a quadratic polynomial, from flight near level. 5-D."""
     system = simulated(derivative, DT, substeps=2)
     low, high = [420, 0.0, -0.3, -0.15, 2000, 5], [580, 0.14, 0.3, 0.15, 8000, 45]

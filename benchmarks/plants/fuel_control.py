@@ -89,7 +89,7 @@ def drive(p: Parameters) -> Task:
     return Task(first, reference=np.stack(reference, axis=-1), horizon=HORIZON, dt=DT)
 
 
-def fuel_control(seed: int) -> Experiment:
+def make(seed: int) -> Experiment:
     """Return the fuel control under a pulse of the pedal; M is linear, from gentle pedal movements. 5-D."""
     system = simulated(derivative, DT, substeps=5)  # the manifold is stiff behind an open throttle
     low, high = [14, 0.85, 14.2, 0.7, -0.02, 950 * RPM], [26, 1.02, 15.2, 0.85, 0.04, 1050 * RPM]

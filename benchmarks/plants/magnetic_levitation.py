@@ -93,7 +93,7 @@ def network(data: Transitions, seed: int) -> models.ScikitLearn:
         )
 
 
-def magnetic_levitation(seed: int) -> Experiment:
+def make(seed: int) -> Experiment:
     """Return the magnet, led between heights by a controller that inverts a network. 4-D."""
     system = simulated(derivative, DT)
     data = record(system, [0.8, -1.0], [2.5, 1.0], [1.0], DT, seed, rollouts=40, steps=12, around=[1.8])

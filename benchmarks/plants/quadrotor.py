@@ -74,7 +74,7 @@ def fly(p: Parameters) -> Task:
     return Task(start, goal=np.concatenate([p.goal, still], axis=-1), horizon=HORIZON, dt=DT)
 
 
-def quadrotor(seed: int) -> Experiment:
+def make(seed: int) -> Experiment:
     """Return the quadrotor under LQR; M is linear, from gentle flight around hovering. 12-D."""
     system = simulated(derivative, DT)
     box = np.array([1, 1, 1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.2, 0.2, 0.2])

@@ -84,7 +84,7 @@ def reach(p: Parameters) -> Task:
     return Task(start, reference=reference, horizon=HORIZON, dt=DT)
 
 
-def six_joint_arm(seed: int) -> Experiment:
+def make(seed: int) -> Experiment:
     """Return the arm that reaches under LQR; M is linear, from small motions around its home. 12-D."""
     system = systems.MuJoCo(MJCF, substeps=SUBSTEPS)
     box = np.array([*[0.2] * 6, *[0.4] * 6])

@@ -124,7 +124,7 @@ def blow(p: Parameters) -> Task:
     return Task(first, reference=reference, horizon=HORIZON, dt=DT)
 
 
-def wind_turbine(seed: int) -> Experiment:
+def make(seed: int) -> Experiment:
     """Return the turbine under a changing wind with a gust; M is a Gaussian process, from moderate wind. 5-D."""
     system = simulated(derivative, DT, substeps=2)
     low, high = [1.15, 0.2, -0.1, 0.05, -0.02, 0.1, 12.5], [1.4, 0.45, 0.1, 0.25, 0.02, 0.5, 17.0]
