@@ -67,6 +67,7 @@ search: .venv/.test  ## how many executions the searches need; writes docs/searc
 	$(BIN)/python benchmarks/study_scalar.py dubins-basin
 	$(BIN)/python benchmarks/study_scalar.py dubins-basin --search scalar --seeds 30
 	$(BIN)/python benchmarks/misleading.py
+	$(BIN)/python benchmarks/study_plants.py
 	$(BIN)/python benchmarks/study_ablations.py
 	$(BIN)/python benchmarks/study_global_search.py
 	$(BIN)/python benchmarks/search_page.py

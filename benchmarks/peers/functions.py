@@ -70,7 +70,13 @@ class Function:
         return self.validation.distances(self.validation.space.from_unit(points))
 
 
-def function(case: str, seed: int, truths: Path = TRUTHS) -> Function:
-    """Return the function of a case and a seed; its maximum may take minutes to find, and is stored in a folder."""
+def function(case: str, seed: int, truths: Path = TRUTHS, maximum: float | None = None) -> Function:
+    """Return the function of a case and a seed.
+
+    Args:
+        case, seed: which.
+        truths: folder of maxima; one that is missing may take minutes to find, and is stored there.
+        maximum: d* if it is known already.
+    """
     found = experiment(case, seed)
-    return Function(found.validation, truth(case, found, truths))
+    return Function(found.validation, truth(case, found, truths) if maximum is None else maximum)

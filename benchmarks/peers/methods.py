@@ -53,6 +53,8 @@ METHODS: dict[str, Method] = {
     "botorch-ucb": Method("BoTorch UCB", VALUE, "with_botorch", "ucb", "botorch"),
     "turbo": Method("TuRBO-1", VALUE, "with_botorch", "turbo", "botorch"),
     "optuna-gp": Method("Optuna GP", VALUE, "with_optuna", "optuna_gp", "optuna"),
+    "egobox": Method("EGObox", VALUE, "with_egobox", "egor", "egobox"),
+    "bayesian-optimization": Method("bayesian-optimization", VALUE, "with_bayes_opt", "bayesian", "bayes_opt"),
     "cma-es": Method("CMA-ES", VALUE, "ours", "cma_es", "cmaes"),
     "dual-annealing": Method("dual annealing", VALUE, "with_scipy", "annealing", resumes=False),
     "direct": Method("DIRECT", VALUE, "with_scipy", "rectangles", resumes=False),

@@ -247,6 +247,11 @@ We know of no other tool that takes a system, a model and a controller designed 
 have one task in common with `ctxval`: they search for the largest value of a function in few evaluations. Each of them
 is therefore given d(p), as a function of the unit cube, to maximise.
 
+None of these tools learns from trajectories, but others do: FReaK, ARIsTEO and their successors learn a model of the
+system from simulations, and search on it for a violation of a requirement. [search.md](search.md) states what their
+authors report. They need a requirement in temporal logic and a system whose controller does not depend on the task, so
+they are not run here.
+
 ## Method
 
 The functions are the cases of `ctxval.cases`. The model and its data are drawn anew for each seed, and all methods have
@@ -332,6 +337,14 @@ SETTINGS = [
         "min(100 d, 5,000) candidates, batches of one",
     ],
     ["Optuna 5.0.0", "`GPSampler`, 10 random first points, exact evaluations"],
+    [
+        "EGObox 1.0.0",
+        "default settings: log expected improvement; a Latin hypercube of d + 1 first points, and at least 5",
+    ],
+    [
+        "bayesian-optimization 3.4.0",
+        "default settings: upper confidence bound with kappa 2.576, Matern 5/2; 5 random first points",
+    ],
     ["scipy 1.17.1", "`dual_annealing` and `direct` with their defaults"],
     [
         "VerifAI 2.2.0",

@@ -35,7 +35,8 @@ LINES: list[Any] = ["-", "--", ":", "-.", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1
 PANELS: dict[str, tuple[str, ...]] = {
     "ours": ("scalar", "auto", "auto-no-data", "vector", "gp-ucb"),
     "others, with a model of the distance": (
-        *("scalar", "gpyopt", "botorch-log-ei", "botorch-ucb", "turbo", "optuna-gp", "verifai-bo"),
+        *("scalar", "gpyopt", "botorch-log-ei", "botorch-ucb", "turbo", "optuna-gp"),
+        *("verifai-bo", "egobox", "bayesian-optimization"),
     ),
     "others, without": (
         *("scalar", "cma-es", "dual-annealing", "direct", "verifai-ce", "verifai-mab", "verifai-halton"),
@@ -51,7 +52,8 @@ def style(name: str) -> Style:
         return Style("#000000", "D", "-")
     panel = next(names for names in PANELS.values() if name in names)
     at = [other for other in panel if other != "scalar"].index(name)
-    return Style(COLOURS[1 + at % 6], MARKERS[at], LINES[1 + at % 6])
+    # Colours repeat after six; the line then is another one.
+    return Style(COLOURS[1 + at % 6], MARKERS[at], LINES[1 + (at + at // 6) % 6])
 
 
 def save(figure: Figure, name: str) -> None:

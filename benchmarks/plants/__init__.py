@@ -35,12 +35,12 @@ from plants.base import DEVELOPMENT, REPORTING, Plant, listed
 __all__ = ["DEVELOPMENT", "PLANTS", "REPORTING", "Plant"]
 
 PLANTS: dict[str, Plant] = listed(
-    Plant("automatic-transmission", DEVELOPMENT, automatic_transmission.make, samples=10000),
-    Plant("fuel-control", DEVELOPMENT, fuel_control.make, samples=20000),
-    Plant("wind-turbine", DEVELOPMENT, wind_turbine.make, samples=20000),
-    Plant("cart-pole", DEVELOPMENT, cart_pole.make, samples=5000),
-    Plant("f16-pull-up", REPORTING, f16.make, samples=10000),
-    Plant("magnetic-levitation", REPORTING, magnetic_levitation.make, samples=10000),
-    Plant("quadrotor-3d", REPORTING, quadrotor.make, samples=20000, budget=30),
-    Plant("six-joint-arm", REPORTING, six_joint_arm.make, samples=4000, budget=30),
+    Plant("automatic-transmission", DEVELOPMENT, automatic_transmission.make, dimension=5, samples=10000),
+    Plant("fuel-control", DEVELOPMENT, fuel_control.make, dimension=5, samples=20000),
+    Plant("wind-turbine", DEVELOPMENT, wind_turbine.make, dimension=5, samples=20000),
+    Plant("cart-pole", DEVELOPMENT, cart_pole.make, dimension=2, samples=5000),
+    Plant("f16-pull-up", REPORTING, f16.make, dimension=5, samples=10000),
+    Plant("magnetic-levitation", REPORTING, magnetic_levitation.make, dimension=4, samples=10000),
+    Plant("quadrotor-3d", REPORTING, quadrotor.make, dimension=12, samples=20000, budget=30),
+    Plant("six-joint-arm", REPORTING, six_joint_arm.make, dimension=12, samples=4000, budget=30),
 )

@@ -18,6 +18,7 @@ class Plant:
         name: of the plant, in files and tables.
         kind: whether searches may be developed on it, or only reported.
         make: the experiment of a seed, which draws the data of M.
+        dimension: of its task space.
         samples: how many random tasks each repeat of the search for its maximum begins with.
         budget: executions of a campaign.
     """
@@ -25,6 +26,7 @@ class Plant:
     name: str
     kind: str
     make: Callable[[int], Experiment]
+    dimension: int
     samples: int
     budget: int = 25
 

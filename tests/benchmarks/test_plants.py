@@ -17,6 +17,8 @@ BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 import plants  # noqa: E402
+import search_plants_part  # noqa: E402
+from ctxval._util.json_lines import JsonLines  # noqa: E402
 from dynamics_systems import repeated  # noqa: E402
 from dynamics_truths import digest  # noqa: E402
 from plants import (  # noqa: E402
@@ -36,6 +38,8 @@ from plants import (  # noqa: E402
 from plants.base import listed  # noqa: E402
 from plants.tables import bilinear, linear  # noqa: E402
 from plants.truths import TRUTHS, truth  # noqa: E402
+from study_auto import first_within  # noqa: E402
+from study_plants import STORED, run, version_of  # noqa: E402
 
 experiment = functools.cache(lambda name, seed: PLANTS[name](seed))
 
@@ -43,16 +47,13 @@ experiment = functools.cache(lambda name, seed: PLANTS[name](seed))
 def test_at_least_half_of_the_plants_are_only_for_reporting() -> None:
     kinds = [plant.kind for plant in PLANTS.values()]
     assert kinds.count(REPORTING) >= kinds.count(DEVELOPMENT) >= 3
-    dimensions = [experiment(plant.name, 0).validation.space.dimension for plant in PLANTS.values()]
-    assert min(dimensions) == 2
-    assert max(dimensions) == 12
 
 
 def test_the_declared_table_is_that_of_the_plants() -> None:
     assert plants.__doc__ is not None
     rows = [[cell.strip() for cell in row.split("|")[1:-1]] for row in plants.__doc__.splitlines() if "-D |" in row]
     assert {row[0]: (row[2], row[-1]) for row in rows} == {
-        name: (f"{experiment(name, 0).validation.space.dimension}-D", plant.kind) for name, plant in PLANTS.items()
+        name: (f"{plant.dimension}-D", plant.kind) for name, plant in PLANTS.items()
     }
 
 
@@ -61,7 +62,7 @@ def test_names_are_unique_and_kinds_known() -> None:
     with pytest.raises(ValueError, match="a name of its own"):
         listed(plant, plant)
     with pytest.raises(ValueError, match="got both"):
-        listed(Plant("mist", "both", plant.make, 10))
+        listed(Plant("mist", "both", plant.make, 2, 10))
 
 
 @pytest.mark.parametrize("name", PLANTS)
@@ -78,6 +79,7 @@ def test_batches_agree_with_single_executions(name: str) -> None:
 def test_the_systems_conform_and_the_model_carries_its_data(name: str) -> None:
     found = experiment(name, 0)
     assert found.name == name
+    assert found.validation.space.dimension == PLANTS[name].dimension
     plan = found.validation.plan(0.5 * (found.validation.space.low + found.validation.space.high))
     check_system(found.validation.system, plan.controller, plan.task)
     assert len(found.validation.model.data) > 100  # type: ignore[attr-defined]
@@ -239,3 +241,40 @@ def test_the_stored_maximum_belongs_to_the_plant_as_it_is(name: str) -> None:
     sample = found.validation.space.iid(100, np.random.default_rng(5))
     assert found.validation.distances(sample).max() <= record["distance"]
     assert truth(PLANTS[name], 0, found) == record
+
+
+# The study
+
+
+def test_stored_campaigns_end_within_one_per_cent_or_with_their_budget() -> None:
+    assert STORED
+    for (case, seed, _, _), result in STORED.items():
+        ended = len(result["distances"])
+        assert ended <= result["budget"] == PLANTS[case].budget
+        assert ended == result["budget"] or first_within(result, 1.0) == ended
+        assert result["truth"] in [record["distance"] for record in TRUTHS.select(plant=case, seed=seed)]
+
+
+def test_a_campaign_is_run_once_and_only_auto_has_versions(tmp_path: Path) -> None:
+    results, truths = JsonLines(tmp_path / "plants.jsonl", STORED.key), JsonLines(tmp_path / "truths.jsonl", TRUTHS.key)
+    found = experiment("cart-pole", 0)
+    truths.append({"plant": "cart-pole", "seed": 0, "digest": digest(found.validation), "distance": 0.01})
+    first = run("before", "cart-pole", 0, "random", results, truths)
+    assert first["distances"][0] > 0.01
+    assert run("after", "cart-pole", 0, "random", results, truths) == first
+    assert list(results) == [("cart-pole", 0, "random", "unchanged")]
+    assert version_of("auto", "after") == "after"
+
+
+def test_the_page_lists_every_plant_and_every_seed() -> None:
+    text = search_plants_part.text()
+    head, rows = search_plants_part.auto_table()
+    assert [row[0] for row in rows] == list(PLANTS)
+    assert head[2] == "5 %, before"
+    assert all(name in text for name in PLANTS)
+    assert search_plants_part.executions({}, 5.0, 25) == "-"
+    one = {
+        0: {"truth": 1.0, "distances": [0.5, 0.96], "budget": 25},
+        2: {"truth": 1.0, "distances": [0.5], "budget": 25},
+    }
+    assert search_plants_part.executions(one, 5.0, 25) == "> 25 (2, -, > 25, -, -)"
