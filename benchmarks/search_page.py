@@ -226,9 +226,9 @@ def scalar_alone() -> str:
         float(np.median([within_of(result, 1.0) for result in theirs])),
     ]
     return (
-        "The search `scalar` alone, which sees no trajectory, is a Bayesian optimisation like others: "
-        f"on the linear system in 20-D it needs {medians[0]:g} executions to 1 % of d* (median of {len(ours)} seeds), "
-        f"which is level with GPyOpt's {medians[1]:g} ({len(theirs)} seeds, [benchmarks.md](benchmarks.md))."
+        "The search `scalar` alone, which sees no trajectory, is a Bayesian optimisation like others.\n"
+        f"On the linear system in 20-D it needs {medians[0]:g} executions to 1 % of d* (median of {len(ours)} seeds).\n"
+        f"This is level with GPyOpt's {medians[1]:g} ({len(theirs)} seeds): [benchmarks.md](benchmarks.md)."
     )
 
 

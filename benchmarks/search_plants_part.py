@@ -138,10 +138,14 @@ def versions_sentence() -> str:
 
 def missing_sentence() -> str:
     """Return which campaigns have not been run; empty if all have."""
-    few = []
-    for plant in PLANTS.values():
-        wanted = [("auto", version) for version in versions_run()] + [("scalar", UNCHANGED)]
-        counts = {f"{search} {version}": len(campaigns(plant, search, version)) for search, version in wanted}
-        few += [f"{plant.name}, {name.removesuffix(' ' + UNCHANGED)} ({count} of {SEEDS})"
-                for name, count in counts.items() if count < SEEDS]  # fmt: skip
-    return f"Not all seeds have been run: {'; '.join(few)}. `make search` resumes them." if few else ""
+    wanted = [("auto", version) for version in versions_run()]
+    wanted += [(search, UNCHANGED) for search in SEARCHES if search != "auto"]
+    parts = []
+    for search, version in wanted:
+        counts = {plant.name: len(campaigns(plant, search, version)) for plant in PLANTS.values()}
+        few = [f"{name} {count}" for name, count in counts.items() if count < SEEDS]
+        name = search if version == UNCHANGED else f"{search}, {version}"
+        parts += [f"- {name}: {', '.join(few)}"] if few else []
+    if not parts:
+        return ""
+    return "\n".join([f"Plants with fewer than {SEEDS} seeds; `make search` runs the others:", "", *parts])

@@ -13,7 +13,7 @@ from pathlib import Path
 from ctxval import searches
 from ctxval._util.json_lines import JsonLines
 from plants import PLANTS
-from plants.truths import TRUTHS, truth
+from plants.truths import TRUTHS, require_known, truth
 from study_auto import RESULTS, Result, campaign, print_table
 
 VERSIONS = ("before", "after")
@@ -50,6 +50,7 @@ def main() -> None:
     parser.add_argument("--results", type=lambda path: JsonLines(Path(path), STORED.key), default=STORED)
     parser.set_defaults(truths=TRUTHS)
     options = parser.parse_args()
+    require_known(parser, options.cases)
     print_table(options, partial(run, options.version))
 
 

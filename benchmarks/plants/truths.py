@@ -32,12 +32,20 @@ def truth(plant: Plant, seed: int, found: Experiment, file: JsonLines = TRUTHS) 
     return file[key]
 
 
+def require_known(parser: argparse.ArgumentParser, names: list[str]) -> None:
+    """End with a message if a plant is unknown."""
+    unknown = [name for name in names if name not in PLANTS]
+    if unknown:
+        parser.error(f"no plant is called {', '.join(unknown)}; the plants are {', '.join(PLANTS)}.")
+
+
 def main() -> None:
     """Compute what is missing."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=list(PLANTS), help=f"of {', '.join(PLANTS)}")
     parser.add_argument("--seeds", type=int, default=5)
     options = parser.parse_args()
+    require_known(parser, options.names)
     for seed in range(options.seeds):
         for name in options.names:
             record = truth(PLANTS[name], seed, PLANTS[name](seed))
