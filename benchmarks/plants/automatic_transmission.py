@@ -7,7 +7,8 @@ Controller* (The MathWorks): the engine ``I_ei dN_e/dt = T_e - T_i``, the torque
 ``I_v dN_w/dt = R_fd T_out - T_load``.
 
 Differences from the source: the shift logic acts at once, every 0.04 s; its wait of 0.08 s is left out, because it
-would be a state that is not recorded. A cruise control follows a speed, where the competition searches over pedals.
+would be a state that is not recorded. The sign of the road load is a steep tanh. K is rounded to two decimals. A cruise
+control follows a speed, where the competition searches over pedals.
 """
 
 from __future__ import annotations

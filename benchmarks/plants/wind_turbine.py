@@ -6,7 +6,9 @@ Scott, *Definition of a 5-MW Reference Wind Turbine for Offshore System Developm
 ``J dw/dt = M_a - M_g / n``; tower top: ``m x'' + c x' + k x = F_a``; pitch actuator of second order.
 
 Differences from the source: the wind over the rotor follows the task's wind with a lag of 1 s, which makes it a state;
-rate limits and the filters of the measurements are left out; the anti-windup of the integral is a limit of it.
+rate limits and the filters of the measurements are left out; the anti-windup of the integral is a limit of it; the
+generator's inertia counts with the square of the gear ratio. Below the rated speed there is one region of the torque,
+quadratic in the speed, instead of three.
 """
 
 from __future__ import annotations
