@@ -148,5 +148,5 @@ def missing_sentence() -> str:
         parts += [f"- {name}: {', '.join(few)}"] if few else []
     if not parts:
         return ""
-    head = f"Plants with fewer than {SEEDS} seeds so far. `make search` runs those of the code of today. Those of `before`"
-    return "\n".join([head, "need the code of its commit and the option `--version before`.", "", *parts])
+    head = f"Plants with fewer than {SEEDS} seeds so far. `make search` runs those of the code of today. Those of"
+    return "\n".join([head, "`before` need the code of its commit and the option `--version before`.", "", *parts])
