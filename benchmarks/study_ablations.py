@@ -10,18 +10,28 @@ import argparse
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import dynamics_misleading
+import dynamics_truths
 import misleading
 import study_auto
 from ctxval import Experiment, searches
 from ctxval._util.json_lines import JsonLines
 from ctxval.searches import BayesianOptimisation, TrustRegion, TrustRegionSettings
+from dynamics_development_misleading import MISLEADING
 from study_auto import Result, add_options, campaign, print_table, results_of, stored
 
 CASES = ("pendulum-no-data", "linear-5", "dubins-basin", "arm-fnn", *misleading.CASES)
+CHOSEN_BY = {entry.name: entry for entry in MISLEADING}
+"""Systems that mislead, by which the parts of the search were chosen."""
+OTHERS = {entry.name: entry for entry in dynamics_misleading.MISLEADING}
+"""Systems that mislead, by which nothing was chosen."""
+BUDGET = 15
+"""Executions in a campaign on one of these systems."""
 
 
-def trust_region(**settings: bool) -> TrustRegion:
+def trust_region(**settings: Any) -> TrustRegion:
     """Return the search with other settings than the usual ones."""
     return TrustRegion(settings=TrustRegionSettings(**settings))
 
@@ -32,6 +42,9 @@ ABLATIONS: dict[str, Callable[[], searches.Search]] = {
     "no discrepancy": partial(trust_region, correct_discrepancy=False),
     "no trust score": partial(trust_region, compare_with_surrogate=False),
     "no climbs": partial(trust_region, restrict=False),
+    "fixed noise": partial(trust_region, learn_noise=False),
+    "starts anywhere": partial(trust_region, distinct_start=0.0),
+    "no boldness": partial(trust_region, boldness=1.0),
 }
 """What is left out -> the search without it."""
 
@@ -41,6 +54,9 @@ def prepared(case: str, seed: int, truths: Path) -> tuple[Experiment, int, float
     if case in misleading.CASES:
         found = misleading.CASES[case](seed)
         return found, misleading.BUDGET, misleading.truth(found, truths)
+    if case in dynamics_truths.ENTRIES:
+        entry = dynamics_truths.ENTRIES[case]
+        return entry(seed), BUDGET, float(dynamics_truths.truth(entry, seed)["distance"])
     found = study_auto.experiment(case, seed)
     return found, study_auto.CASES[case][3], study_auto.truth(case, found, truths)
 
@@ -54,19 +70,22 @@ def whole(case: str, seed: int, truths: Path) -> Result:
 
 def run(case: str, seed: int, without: str, results: JsonLines, truths: Path) -> Result:
     """Return one campaign without a part, running what is not stored."""
-    if without == "auto":
+    if without == "auto" and case in CASES:
         return whole(case, seed, truths)
 
     def compute() -> Result:
         found, budget, best_known = prepared(case, seed, truths)
-        return campaign(found.validation, ABLATIONS[without](), seed, budget, best_known)
+        search = searches.by_name("auto") if without == "auto" else ABLATIONS[without]()
+        return campaign(found.validation, search, seed, budget, best_known)
 
     return stored(results, case, seed, without, compute)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cases", nargs="*", default=list(CASES), help=f"of {', '.join(CASES)}")
+    parser.add_argument(
+        "cases", nargs="*", default=[*CASES, *CHOSEN_BY, *OTHERS], help=f"of {', '.join([*CASES, *CHOSEN_BY, *OTHERS])}"
+    )
     parser.add_argument("--search", nargs="+", default=["auto", *ABLATIONS], help="auto, or what is left out")
     add_options(parser, "ablations")
     parser.set_defaults(seeds=5)

@@ -25,6 +25,8 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 KEY = ("case", "seed", "search")
 WITHIN = (5.0, 2.0, 1.0)
+NEAR, GAIN = 0.02, 1e-3
+"""Two tasks are next to each other if all coordinates differ by less than this; a smaller relative gain is none."""
 
 Result = dict[str, Any]
 
@@ -84,6 +86,7 @@ def campaign(validation: Validation, search: searches.Search, seed: int, budget:
         "budget": budget,
         "distances": [trial.distance for trial in running.trials],
         "notes": [trial.note for trial in running.trials],
+        "points": [[round(x, 4) for x in trial.unit_point.tolist()] for trial in running.trials],
         "seconds": (time.process_time() - started) / len(running.trials),
     }
 
@@ -123,6 +126,16 @@ def first_within(result: Result, percent: float) -> float:
     """Return how many executions it took; infinity where the budget did not suffice."""
     enough = (1 - percent / 100) * result["truth"]
     return next((k + 1 for k, d in enumerate(result["distances"]) if d is not None and d >= enough), float("inf"))
+
+
+def repeated(result: Result) -> int | None:
+    """Return how many executions were next to an earlier one and gained nothing; None if no points are stored."""
+    if "points" not in result:
+        return None
+    points, values = np.array(result["points"]), np.array([distance or 0.0 for distance in result["distances"]])
+    gaps = [np.abs(points[:k] - points[k]).max(axis=1).min() for k in range(1, len(points))]
+    gained = values[1:] > np.maximum.accumulate(values)[:-1] * (1 + GAIN)
+    return int(((np.array(gaps) < NEAR) & ~gained).sum())
 
 
 def shown(count: float, budget: int) -> str:

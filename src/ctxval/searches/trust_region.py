@@ -5,7 +5,8 @@ process g of its logarithmic discrepancy at known points, and raised in proporti
 trusted inside a box around the best point. The box grows if an execution improves on the best value. It shrinks if an
 execution does not and the prediction was wrong. If no improvement is predicted in a region, or if several executions
 have not improved, a new region starts at the point of the whole cube with the largest optimistic value for a larger
-kappa. A larger kappa favours points where neither values nor dynamics are known.
+kappa. A larger kappa favours points where neither values nor dynamics are known. A region does not start next to a
+known point, unless a value larger than all known ones is predicted there.
 """
 
 from __future__ import annotations
@@ -16,32 +17,26 @@ from typing import Any
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from ctxval._util.arrays import Array, Mask, Rows, single_threaded
+from ctxval._util.arrays import Array, Mask, single_threaded
 from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.gp.acquisition import Box
 from ctxval.gp.ascent import Ascent
-from ctxval.gp.kernels import Matern
-from ctxval.gp.regression import GaussianProcess, condition
-from ctxval.gp.subset import kept_rows
-from ctxval.gp.surrogate import fit_surrogate
+from ctxval.gp.regression import GaussianProcess
 from ctxval.searches.base import Note, Prediction, SequentialSearch, best_first
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
+from ctxval.searches.optimistic_value import (
+    REPRESENTING,
+    Candidate,
+    OptimisticValue,
+    discrepancy,
+    left_out_by_surrogate,
+    log_error,
+    represented,
+)
 
-_LOG_OFFSET = 1e-3
-"""The c of ``log(d + c)`` in the discrepancy, in medians of the known values."""
-_ERROR_OFFSET = 0.1
-"""The c of ``log(d + c)`` in errors of predictions, in medians of the known values: small values count little."""
-_LENGTH_SCALE = 0.15
-"""Length-scale of the discrepancy's kernel, divided by the square root of the dimension."""
-_NOISE = 1e-4
-"""Noise variance of the discrepancy, as a share of its variance."""
-_CALIBRATED = 3
-"""Number of executions from which on the optimism is estimated from their errors."""
-_REPRESENTING = 150
-"""Largest number of known values from which the discrepancy and the surrogate's errors are computed."""
-_FIRST = 16
-"""Number of the best points of an ascent that are compared with the history first."""
+_STARTS = 8
+"""Number of best points at which a maximisation starts."""
 _ENGINE = "climb"
 """The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
 
@@ -52,6 +47,8 @@ class TrustRegionSettings:
 
     Attributes:
         correct_discrepancy: whether predictions are corrected by their errors at known points.
+        learn_noise: whether the noise of these errors is learned; they are noisy if distances are rough or the dynamics
+            depend on a hidden state.
         compare_with_surrogate: whether a prediction is used only if leave-one-out errors show that it is good.
         restrict: whether there are trust regions; if not, the whole cube is searched each time.
         accurate: largest relative error of a prediction that counts as right.
@@ -61,15 +58,17 @@ class TrustRegionSettings:
         improvement: least predicted improvement worth an execution, as a share of the largest value.
         patience: factor of the optimism in the test whether a region may still lead to a value larger than all others.
         boldness: factor by which the optimism grows with each new region that has found nothing larger.
-        most_optimism: upper limit of the optimism that is estimated from errors of predictions.
         compared_from: number of known values from which on the prediction must be better than the surrogate.
         compared_on: largest number of known values, the latest ones, on which the two are compared.
         good_enough: mean error of the logarithm up to which a prediction needs no comparison.
         distinct: least distance of a suggestion from each known point, in at least one coordinate.
+        distinct_start: the same for the first suggestion of a region, unless a value larger than all known ones is
+            predicted there.
         apart: least distance of a suggestion from pending and failed points, as a share of the cube's diagonal.
     """
 
     correct_discrepancy: bool = True
+    learn_noise: bool = True
     compare_with_surrogate: bool = True
     restrict: bool = True
     accurate: float = 0.1
@@ -79,11 +78,11 @@ class TrustRegionSettings:
     improvement: float = 1e-3
     patience: float = 10.0
     boldness: float = 4.0
-    most_optimism: float = 100.0
     compared_from: int = 6
     compared_on: int = 24
     good_enough: float = 0.1
     distinct: float = 1e-6
+    distinct_start: float = 0.02
     apart: float = 0.05
 
 
@@ -117,8 +116,7 @@ class TrustRegion(SequentialSearch):
     """Trust-region search with restarts on a prediction of the values; Bayesian optimisation if no prediction is good.
 
     Args:
-        optimism: kappa, the relative excess of a value over its prediction that is assumed if the doubt is 1. After
-            three executions it is estimated from their errors, with this value as the lower limit.
+        optimism: kappa, the relative excess of a value over its prediction that is assumed if the doubt is 1.
         misses: number of executions without improvement after which a region is left.
         settings: further settings, for studies; the defaults if None.
 
@@ -177,7 +175,7 @@ class TrustRegion(SequentialSearch):
         """The number of known points that are predicted for a choice, besides those of the budget."""
         known, settings = int(np.isfinite(self.values).sum()), self._settings
         compared = min(known, settings.compared_on) if known >= settings.compared_from else 0
-        return compared + min(known, _REPRESENTING)
+        return compared + min(known, REPRESENTING)
 
     # How good the prediction is
 
@@ -188,12 +186,12 @@ class TrustRegion(SequentialSearch):
         if not self._settings.compare_with_surrogate or len(values) < self._settings.compared_from:
             return None
         rows = np.arange(len(values))[-self._settings.compared_on :]
-        error = _log_error(prediction.left_out(rows), values[rows])
+        error = log_error(prediction.left_out(rows), values[rows])
         if error <= self._settings.good_enough:
             return None
-        kept = _represented(self.points[known], values)  # it ends with the latest values, which are compared
-        by_surrogate = _left_out(self.points[known][kept], values[kept])[-len(rows) :]
-        surrogate = _log_error(by_surrogate, values[rows])
+        kept = represented(self.points[known], values)  # it ends with the latest values, which are compared
+        by_surrogate = left_out_by_surrogate(self.points[known][kept], values[kept])[-len(rows) :]
+        surrogate = log_error(by_surrogate, values[rows])
         if error <= surrogate:
             return None
         return f"leaving one out, the prediction errs by {error:.2g} where the surrogate errs by {surrogate:.2g}"
@@ -202,95 +200,84 @@ class TrustRegion(SequentialSearch):
 
     def _promising(self, prediction: Prediction, rng: np.random.Generator) -> Array | None:
         """Return the next point of the last region or of a new one; None if no point can be predicted."""
-        settings, optimism = self._settings, self._calibrated()
-        value = _OptimisticValue(prediction, self._discrepancy(prediction), optimism)
+        settings, value = self._settings, OptimisticValue(prediction, self._discrepancy(prediction), self.optimism)
         if not settings.restrict:
-            return self._noted(prediction, self._best(value, _Region(), rng), _Region())
+            return self._noted(self._best(value, _Region(), rng), _Region())
         region = self._state()
         if region.misses < self.misses and region.radius >= settings.least_radius:
-            point = self._best(value, region, rng)
-            if point is not None and self._is_worth(value, point, region.best):
-                return self._noted(prediction, point, region)
+            found = self._best(value, region, rng)
+            if found is not None and self._is_worth(found, region.best):
+                return self._noted(found, region)
         # The optimism grows with every region that finds nothing larger, so the search explores more.
-        bold = replace(value, optimism=optimism * settings.boldness ** (1 + region.stale))
+        bold = replace(value, optimism=self.optimism * settings.boldness ** (1 + region.stale))
         new = _Region(region.number + 1, settings.first_radius)
-        return self._noted(prediction, self._best(bold, _Region(), rng), new)
+        return self._noted(self._start(bold, rng), new)
 
-    def _is_worth(self, value: _OptimisticValue, point: Array, best: float) -> bool:
-        """Return whether the value at ``(d,)`` may exceed a region's best value and, with more optimism, all values.
+    def _is_worth(self, found: Candidate, best: float) -> bool:
+        """Return whether a value may exceed a region's best value and, with more optimism, all values."""
+        return self._exceeds(found, 1.0, best) and self._promises(found, self._settings.patience)
 
-        A region may be climbed through values below the largest one, unless even this optimism predicts nothing larger.
-        """
-        patient = replace(value, optimism=self._settings.patience * value.optimism)
-        largest = float(np.nanmax(self.values, initial=0.0))
-        return self._exceeds(value, point, best) and self._exceeds(patient, point, largest)
+    def _promises(self, found: Candidate, patience: float = 1.0) -> bool:
+        """Return whether the value with so many times the usual optimism is larger than all known values."""
+        return self._exceeds(found, patience, float(np.nanmax(self.values, initial=0.0)))
 
-    def _exceeds(self, value: _OptimisticValue, point: Array, other: float) -> bool:
-        """Return whether the optimistic value at ``(d,)`` is larger than another value by the least improvement."""
-        return bool(value(point[None])[0] > other * (1 + self._settings.improvement))
+    def _exceeds(self, found: Candidate, patience: float, other: float) -> bool:
+        """Return whether the value with so many times the usual optimism exceeds another by the least improvement."""
+        return found.optimistic(patience * self.optimism) > other * (1 + self._settings.improvement)
 
     def _discrepancy(self, prediction: Prediction) -> GaussianProcess | None:
-        """Return the GP of ``log(d + c) - log(d_hat + c)`` over the points; None if no point has both values."""
         known = np.isfinite(self.values)
         if not self._settings.correct_discrepancy or not known.any():
             return None
-        points, values = self.points[known], self.values[known]
-        kept = _represented(points, values)
-        points, values = points[kept], values[kept]
-        expected = prediction.expected(points)[0]
-        floor = max(_LOG_OFFSET * float(np.median(values)), 1e-12)
-        ratio = np.log(values + floor) - np.log(np.maximum(expected, 0.0) + floor)
-        usable = np.isfinite(ratio)
-        if not usable.any():
-            return None
-        size = max(float((ratio[usable] ** 2).mean()), 1e-8)
-        theta = np.log([size, _LENGTH_SCALE * np.sqrt(self.dimension)])
-        return condition(Matern(2.5), theta, points[usable], ratio[usable], noise=_NOISE * size)
+        return discrepancy(prediction, self.points[known], self.values[known], self._settings.learn_noise)
 
-    def _calibrated(self) -> float:
-        """Return kappa, estimated as the median difference of log values from log predictions per unit of doubt."""
-        errors = [
-            abs(np.log(value / note["expected"])) / note["doubt"]
-            for value, note in zip(self.values.tolist(), self.notes, strict=True)
-            if note is not None and note.get("doubt", 0) > 0 and value > 0 and note["expected"] > 0
-        ]
-        if len(errors) < _CALIBRATED:
-            return self.optimism
-        return float(np.clip(np.median(errors), self.optimism, self._settings.most_optimism))
-
-    def _best(self, value: _OptimisticValue, region: _Region, rng: np.random.Generator) -> Array | None:
+    def _best(self, value: OptimisticValue, region: _Region, rng: np.random.Generator) -> Candidate | None:
         """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
-        budget = min(value.prediction.budget, self._settings.points * self.dimension)
-        ascent = Ascent(value, *region.box(self.dimension), budget, rough=value.rough)
-        points, promised = ascent.run(best_first(self.points, self.values)[:8], rng)
-        usable = points[np.isfinite(promised)]
-        # The first few suffice almost always, and a long history makes each comparison costly.
-        for some in np.split(usable, [_FIRST]):
-            new = self._is_new(some)
-            if new.any():
-                return np.asarray(some[np.argmax(new)])
-        return None
+        return next((value.at(point) for point in self._best_points(value, region, rng)), None)
 
-    def _noted(self, prediction: Prediction, point: Array | None, region: _Region) -> Array | None:
-        """Return the next point of a region unchanged, and record the prediction for it in the note."""
-        if point is None:
+    def _start(self, value: OptimisticValue, rng: np.random.Generator) -> Candidate | None:
+        """Return the first point of a new region; None if no point can be predicted.
+
+        It is the best point, unless that one is next to a known point and, with the usual optimism, promises nothing.
+        """
+        points = self._best_points(value, _Region(), rng)
+        if not len(points):
             return None
-        expected, doubt = prediction.expected(point[None])
+        best, apart = value.at(points[0]), self._gaps(points) > self._settings.distinct_start
+        if apart[0] or not apart.any() or self._promises(best):
+            return best
+        return value.at(points[apart.argmax()])
+
+    def _best_points(self, value: OptimisticValue, region: _Region, rng: np.random.Generator) -> Array:
+        """Return new points ``(m, d)`` of a region whose value can be predicted, that of largest value first."""
+        budget = min(value.prediction.budget, self._settings.points * self.dimension)
+        ascent = Ascent(value, *region.box(self.dimension), budget, value.rough)
+        points, promised = ascent.run(best_first(self.points, self.values)[:_STARTS], rng)
+        return np.asarray(points[self._is_new(points) & np.isfinite(promised)])
+
+    def _noted(self, found: Candidate | None, region: _Region) -> Array | None:
+        """Return the next point of a region, and record the prediction for it in the note; None if there is none."""
+        if found is None:
+            return None
         self._last_note = {
             "engine": _ENGINE,
             "climb": region.number,
             "radius": region.radius,
-            "expected": float(expected[0]),
-            "doubt": float(doubt[0]),
+            "expected": found.expected,
+            "doubt": found.doubt,
         }
-        return point
+        return found.point
 
     def _is_new(self, points: Array) -> Mask:
         """Return which of some points ``(m, d)`` are far enough from all known, pending and failed ones."""
-        known, reach = np.isfinite(self.values), self._settings.apart * np.sqrt(self.dimension)
-        gaps = cdist(points, self.points[known], "chebyshev").min(axis=1, initial=np.inf)
-        others = cdist(points, self.points[~known]).min(axis=1, initial=np.inf)
-        return np.asarray((gaps > self._settings.distinct) & (others > reach))
+        unknown, reach = self.points[~np.isfinite(self.values)], self._settings.apart * np.sqrt(self.dimension)
+        others = cdist(points, unknown).min(axis=1, initial=np.inf)
+        return np.asarray((self._gaps(points) > self._settings.distinct) & (others > reach))
+
+    def _gaps(self, points: Array) -> Array:
+        """Return the distance of each point to the nearest known one, in the coordinate in which it is largest."""
+        known = self.points[np.isfinite(self.values)]
+        return np.asarray(cdist(points, known, "chebyshev").min(axis=1, initial=np.inf))
 
     def _state(self) -> _Region:
         """Return the state of the last region."""
@@ -319,52 +306,3 @@ class TrustRegion(SequentialSearch):
         if value > region.best:
             region = replace(region, best=value, point=point)
         return replace(region, misses=region.misses + 1, radius=region.radius if right else region.radius / 2)
-
-
-@dataclass(frozen=True, eq=False)
-class _OptimisticValue:
-    """The optimistic value of points: the prediction, corrected and raised in proportion to its doubt.
-
-    Attributes:
-        prediction: the prediction d_hat and its doubt w.
-        discrepancy: the correction g; None if it is not used.
-        optimism: the factor kappa of the doubt.
-    """
-
-    prediction: Prediction
-    discrepancy: GaussianProcess | None
-    optimism: float
-
-    @property
-    def rough(self) -> _OptimisticValue | None:
-        """The same with the rough prediction; None if there is none."""
-        rough = self.prediction.rough
-        return None if rough is None else replace(self, prediction=replace(self.prediction, expected=rough))
-
-    def __call__(self, points: Array) -> Array:
-        expected, doubt = self.prediction.expected(points)
-        if self.discrepancy is not None:
-            mean, variance = self.discrepancy.predict(points)
-            # At a point with a known value there is no doubt, even if the dynamics on its trajectory are uncertain.
-            expected = expected * np.exp(mean)
-            doubt = doubt * np.sqrt(variance / self.discrepancy.kernel.diagonal(self.discrepancy.theta, points))
-        return np.asarray(expected * (1 + self.optimism * doubt))
-
-
-def _log_error(expected: Array, values: Array) -> float:
-    """Return the mean error of the logarithm; small values count little."""
-    if not np.isfinite(expected).all():
-        return np.inf
-    floor = max(_ERROR_OFFSET * float(np.median(values)), 1e-12)
-    return float(np.abs(np.log(np.maximum(expected, 0.0) + floor) - np.log(values + floor)).mean())
-
-
-def _represented(points: Array, values: Array) -> Rows:
-    """Return the rows of a long history that represent all of it, in their order; they end with the latest ones."""
-    return kept_rows(points, values, _REPRESENTING, long=_REPRESENTING)
-
-
-def _left_out(points: Array, values: Array) -> Array:
-    """Return leave-one-out predictions ``(n,)`` by the surrogate of the values."""
-    surrogate = fit_surrogate(points, values)
-    return np.asarray(surrogate.shift + surrogate.scale * surrogate.process.left_out()[0])

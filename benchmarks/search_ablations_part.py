@@ -1,0 +1,72 @@
+"""The tables of the page on searches that say what each part of the search ``auto`` buys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+import misleading
+from calibration_page import table
+from search_cells import ENDS, cells, reached, results
+from study_ablations import ABLATIONS, BUDGET
+from study_ablations import CASES as ABLATED
+from study_auto import WITHIN, Result, first_within, repeated, shown
+
+ABLATION_SEEDS = range(5)
+SHOWN = {"no climbs": "no trust region"}
+"""What the page calls an ablation, if it is not the name of its results."""
+
+
+def of_ablation(case: str, without: str) -> dict[int, Result]:
+    """Return the campaigns without a part, or those of `auto` itself."""
+    if without != "auto":
+        return results("ablations", case, without, ABLATION_SEEDS)
+    return results("misleading" if case in misleading.CASES else "auto", case, "auto", ABLATION_SEEDS)
+
+
+def ablation_table() -> str:
+    """Return what is found without each part, on the seeds that all have."""
+    rows = []
+    for case in ABLATED:
+        found = {without: of_ablation(case, without) for without in ("auto", *ABLATIONS)}
+        found = {without: campaigns for without, campaigns in found.items() if campaigns}
+        common = sorted(set.intersection(*map(set, found.values()))) if found else []
+        if common and len(found) > 1:
+            rows += [[case, SHOWN.get(name, name), *cells(found[name][seed] for seed in common)] for name in found]
+    return table(["case", "search", *ENDS], rows)
+
+
+def new_ablation_table(entries: Iterable[str]) -> str:
+    """Return what is found on further systems without each part, all together, on the campaigns that all have."""
+    found = {
+        name: {(entry, seed): run for entry in entries for seed, run in results("ablations", entry, name).items()}
+        for name in ("auto", *ABLATIONS)
+    }
+    found = {name: campaigns for name, campaigns in found.items() if campaigns}
+    common = sorted(set.intersection(*map(set, found.values()))) if found else []
+    rows = [[SHOWN.get(name, name), *together([found[name][key] for key in common])] for name in found if common]
+    return table(["search", *TOGETHER], rows)
+
+
+TOGETHER = ["campaigns", "within 5 %", "within 1 %", "median to 5 %", "mean share of d*", "next to an earlier one"]
+
+
+def together(campaigns: list[Result]) -> list[str]:
+    """Return counts and means over campaigns on several systems."""
+    near = [[first_within(result, percent) for result in campaigns] for percent in (WITHIN[0], WITHIN[-1])]
+    executions = sum(len(result["distances"]) for result in campaigns)
+    wasted = sum(repeated(result) or 0 for result in campaigns)
+    return [
+        str(len(campaigns)),
+        *(reached(counts) for counts in near),
+        shown(float(np.median(near[0])), BUDGET),
+        f"{100 * np.mean([average_share(result) for result in campaigns]):.1f} %",
+        f"{wasted} of {executions}",
+    ]
+
+
+def average_share(result: Result) -> float:
+    """Return the mean over all executions of the budget of the largest distance so far, as a share of d*."""
+    shares = np.maximum.accumulate([distance or 0.0 for distance in result["distances"]]) / result["truth"]
+    return float(np.pad(np.minimum(shares, 1.0), (0, result["budget"] - len(shares)), mode="edge").mean())
