@@ -360,6 +360,14 @@ class Campaign(CampaignResults):
         """Record an execution after ``campaign.known.check_known``; return None if it is already in the store."""
         return self._recorder.add(known, wait)
 
+    def refresh(self) -> None:
+        """Read the trials again if another process has changed the store.
+
+        Raises:
+            StoreMismatchError: if the store now belongs to another experiment.
+        """
+        self._recorder.refresh()
+
     def _unit_point(self, parameters: Mapping[str, Any]) -> Array:
         return self.validation.space.to_unit(self.validation.space.point(parameters))
 

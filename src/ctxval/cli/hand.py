@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from ctxval.campaign.by_hand import KnownRun, parameters_from, read_recording, read_runs, write_files
-from ctxval.campaign.campaign import Campaign, OpenTrial
+from ctxval.campaign.by_hand import KnownRun, parameters_from, read_runs, write_files
+from ctxval.campaign.campaign import OpenTrial
 from ctxval.campaign.known import KnownExecution
+from ctxval.campaign.telling import Report, parameters_of_trial, require_tolerance, result_sentence, tell_report
 from ctxval.cli.base import app, command, out
 from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, named_values
 from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, open_store
 from ctxval.config.settings import read_settings
-from ctxval.core.experiment import Experiment
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 from ctxval.storage.store import Store
@@ -103,7 +102,9 @@ def ask(
         found = opened.campaign.reopen(trial)
     else:
         space = opened.experiment.validation.space
-        chosen = parameters_from(parameters, space) if parameters else _parameters_of(opened.campaign, again)
+        chosen = None if again is None else parameters_of_trial(opened.campaign, again)
+        if parameters:
+            chosen = parameters_from(parameters, space)
         found = opened.campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
     folder = opened.path.with_suffix(".trials") / str(found.number) if out_folder is None else out_folder
     report = {
@@ -117,16 +118,6 @@ def ask(
     if not as_json:
         _print_asked(report, found)
     return report
-
-
-def _parameters_of(campaign: Campaign, number: int | None) -> dict[str, Any] | None:
-    """Return the parameters of the task of a trial; None if no trial is named."""
-    if number is None:
-        return None
-    known = {trial.number: trial.parameters for trial in campaign.trials}
-    if number not in known:
-        raise InputError(f"there is no trial {number}; there are {len(known)}, numbered from 0.")
-    return known[number]
 
 
 @app.command()
@@ -159,17 +150,13 @@ def tell(
         raise InputError('--failed needs a reason, such as "the motor cut out".')
     if trajectory is None and npz is None and (resample or start_tolerance is not None):
         raise InputError("--resample and --start-tolerance need a recording: give --trajectory or --npz.")
-    _require_tolerance(start_tolerance)
+    require_tolerance(start_tolerance, "--start-tolerance")
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
-    recording = None
-    path = trajectory or npz
-    if path is not None:
-        plan = opened.campaign.reopen(trial).plan
-        recording = read_recording(path, opened.experiment, plan, npz=npz is not None, resample=resample)
-    ended = opened.campaign.tell(trial, recording, distance=distance, failed=failed, start_tolerance=start_tolerance)
+    told = Report(trajectory or npz, distance, failed, npz is not None, resample, start_tolerance)
+    ended = tell_report(opened.campaign, opened.experiment, trial, told)
     report = _ended(ended, opened)
     if not as_json:
-        out.say(_sentence(ended, opened.experiment))
+        out.say(result_sentence(ended, opened.experiment.units))
     return report
 
 
@@ -197,7 +184,7 @@ def import_runs(
 
     Each one counts in the budget. A run that is already in the store is not imported again.
     """
-    _require_tolerance(start_tolerance)
+    require_tolerance(start_tolerance, "--start-tolerance")
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
     space = opened.experiment.validation.space
     runs = read_runs(files, parameters_from(parameters, space) if parameters else None, space)
@@ -211,7 +198,7 @@ def import_runs(
     }
     if not as_json:
         for trial in new:
-            out.say(_sentence(trial, opened.experiment))
+            out.say(result_sentence(trial, opened.experiment.units))
         out.say(f"{len(new)} runs imported, {len(ended) - len(new)} already in the store.")
     return report
 
@@ -222,11 +209,6 @@ def _checked(run: KnownRun, opened: Opened, resample: bool, start_tolerance: flo
         return run.checked(opened.campaign.validation, opened.experiment, resample, start_tolerance)
     except InputError as error:
         raise InputError(f"{run.where}: {error}") from error
-
-
-def _require_tolerance(given: float | None) -> None:
-    if given is not None and not (0 <= given < math.inf):
-        raise InputError(f"--start-tolerance must be a finite number >= 0, got {given!r}.")
 
 
 def _opened(
@@ -259,14 +241,6 @@ def _ended(trial: Trial, opened: Opened) -> dict[str, Any]:
         "executions": opened.campaign.executions,
         "store": str(opened.path),
     }
-
-
-def _sentence(trial: Trial, experiment: Experiment) -> str:
-    if trial.state == "unmeasured":
-        return f"trial {trial.number} is stored without a distance: {trial.failure}"
-    if trial.distance is None:
-        return f"trial {trial.number} failed: {trial.failure}"
-    return f"trial {trial.number} has the distance {trial.distance:.4g} {experiment.units}".rstrip()
 
 
 def _print_asked(report: dict[str, Any], opened: OpenTrial) -> None:

@@ -12,7 +12,7 @@ import typer
 from ctxval import plot
 from ctxval._util.texts import reason_of
 from ctxval.campaign.campaign import Campaign
-from ctxval.certificates.verdict import Verdict, require_threshold
+from ctxval.certificates.verdict import Verdict
 from ctxval.cli.base import (
     CANNOT_GO_ON,
     FALSIFIED,
@@ -43,7 +43,7 @@ from ctxval.cli.options import (
     Workers,
     named_values,
 )
-from ctxval.cli.trust import AcceptChange
+from ctxval.cli.trust import AcceptChange, limit_of
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment
 from ctxval.core.truth import Truth
@@ -138,7 +138,7 @@ def run(
     certificate = settings.certificate_options  # it is checked before executions are paid for
     if truth:
         _require_truth(experiment)  # before executions are paid for
-    limit = _limit(experiment, settings)
+    limit = limit_of(experiment, settings)
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
     total = experiment.budget if settings.budget is None else settings.budget
@@ -152,12 +152,6 @@ def run(
     if not as_json:
         _print_report(report, verdict)
     return report, _status(campaign, verdict)
-
-
-def _limit(experiment: Experiment, settings: Settings) -> float | None:
-    """Return the threshold of the verdict; None if neither the settings nor the experiment have one."""
-    threshold = experiment.threshold if settings.threshold is None else settings.threshold
-    return None if threshold is None else require_threshold(threshold)
 
 
 def _status(campaign: Campaign, verdict: Verdict | None) -> int:

@@ -18,7 +18,7 @@ _INDENT = "\n  "
 
 PANELS = {
     "Run": ("init", "check", "run", "remeasure"),
-    "By hand": ("ask", "tell", "import"),
+    "By hand": ("ask", "tell", "import", "serve"),
     "Inspect": ("status", "certify", "export"),
     "Paper": ("cases", "reproduce"),
 }

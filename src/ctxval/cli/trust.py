@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from ctxval.campaign.campaign import Campaign
+from ctxval.certificates.verdict import require_threshold
 from ctxval.cli.base import err
 from ctxval.cli.options import TARGET
 from ctxval.config.settings import Settings, trusted_settings
@@ -51,6 +52,12 @@ class Opened:
     experiment: Experiment
     campaign: Campaign
     path: Path
+
+
+def limit_of(experiment: Experiment, settings: Settings) -> float | None:
+    """Return the threshold of the verdict; None if neither the settings nor the experiment have one."""
+    threshold = experiment.threshold if settings.threshold is None else settings.threshold
+    return None if threshold is None else require_threshold(threshold)
 
 
 def settings_of(store: Store, experiment: str | None, trust: bool) -> Settings:

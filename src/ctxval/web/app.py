@@ -1,0 +1,290 @@
+"""The operator's page as an ASGI application."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import json
+import tempfile
+import zipfile
+from collections.abc import AsyncIterator, Awaitable, Callable
+from importlib.resources import files as resources
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.datastructures import FormData, UploadFile
+from starlette.formparsers import MultiPartException
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, RedirectResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from ctxval._util.texts import shortened, visible
+from ctxval.campaign.telling import Report
+from ctxval.errors import CampaignError, CtxvalError, InputError, StoreError
+from ctxval.web import forms
+from ctxval.web.access import Access
+from ctxval.web.desk import recording_in
+from ctxval.web.page import Page, Problem
+from ctxval.web.security import MOST_UPLOAD, Guard, Hosts
+from ctxval.web.service import CampaignService, Work
+
+_LISTENERS = 64
+"""Largest number of browsers that are kept up to date at a time."""
+
+_KINDS = ("recording", "distance", "failure")
+
+_TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+
+_OUT_OF_DATE = "This page is from an earlier start of the server. Its fields are kept, a file must be chosen again."
+
+Handler = Callable[[Request, str], Awaitable[Response]]
+
+
+class OperatorPage:
+    """The routes of the page.
+
+    Args:
+        service: the campaign.
+        access: who may use the page.
+    """
+
+    def __init__(self, service: CampaignService, access: Access) -> None:
+        self.service, self.access = service, access
+        self.page = Page(service)
+        self._listeners = 0
+
+    def routes(self) -> list[Route]:
+        """Return all routes; every one but the static files and the entrance needs a session."""
+        inside = self._inside
+        return [
+            Route("/", self.start, methods=["GET"]),
+            Route("/enter", self.enter, methods=["POST"]),
+            Route("/static/{name}", static, methods=["GET"]),
+            Route("/choose", inside(self.choose), methods=["POST"]),
+            Route("/trials/{number:int}/{kind}", inside(self.tell), methods=["POST"]),
+            Route("/trials/{number:int}/files.zip", inside(self.archive), methods=["GET"]),
+            Route("/trials/{number:int}/files/{name}", inside(self.file), methods=["GET"]),
+            Route("/pictures/{name}.svg", inside(self.picture), methods=["GET"]),
+            Route("/events", inside(self.events), methods=["GET"]),
+        ]
+
+    # Entrance
+
+    async def start(self, request: Request) -> Response:
+        """Show the campaign, or ask for the token."""
+        session = self.access.session(request.cookies)
+        token = request.query_params.get("token")
+        if token is not None:
+            return await self._enter(token)
+        if session is None and self.access.needs_token:
+            return HTMLResponse(self.page.enter(), 401)
+        if session is not None:
+            return HTMLResponse(self._campaign(request, session))
+        cookie = self.access.new_session()
+        session = self.access.session({self.access.cookie: cookie})
+        assert session is not None
+        return self._with_cookie(HTMLResponse(self._campaign(request, session)), cookie)
+
+    async def enter(self, request: Request) -> Response:
+        """Take the token from the form of the entrance."""
+        async with request.form(max_files=0, max_fields=4) as form:
+            return await self._enter(_texts(form).get("token", "").strip())
+
+    async def _enter(self, token: str) -> Response:
+        if not self.access.needs_token:
+            return RedirectResponse("/", 303)
+        if not self.access.admits(token):
+            await asyncio.sleep(0.5)
+            return HTMLResponse(self.page.enter("This is not the token of this server."), 401)
+        # A redirect after a link from another site would not send the strict cookie; a page that goes on does.
+        page = self.page.message("Welcome", "The page of the campaign opens.", forward=True)
+        return self._with_cookie(HTMLResponse(page), self.access.new_session())
+
+    def _with_cookie(self, response: Response, cookie: str) -> Response:
+        response.set_cookie(self.access.cookie, cookie, httponly=True, samesite="strict", path="/")
+        return response
+
+    def _inside(self, handler: Handler) -> Callable[[Request], Awaitable[Response]]:
+        """Return a handler that is called with the name of the session, and only if there is one."""
+
+        async def handle(request: Request) -> Response:
+            session = self.access.session(request.cookies)
+            if session is not None:
+                return await handler(request, session)
+            if self.access.needs_token:
+                return HTMLResponse(self.page.enter("Your session has ended. Nothing was stored."), 401)
+            return HTMLResponse(self.page.message("Open the page again", _OUT_OF_DATE), 403)
+
+        return handle
+
+    # Forms
+
+    async def choose(self, request: Request, session: str) -> Response:
+        """Start to choose a task."""
+        async with request.form(max_files=0, max_fields=1_000, max_part_size=4096) as form:
+            fields = _texts(form)
+        if not self.access.allows_form(session, fields.get("token", "")):
+            return self._problem(request, session, Problem("choose", _OUT_OF_DATE, fields, 403))
+        try:
+            self.service.choose(forms.task_request(fields, self.service.description.space))
+        except InputError as error:
+            return self._problem(request, session, Problem("choose", str(error), fields, 409))
+        return RedirectResponse("/#next", 303)
+
+    async def tell(self, request: Request, session: str) -> Response:
+        """Record the result of a trial."""
+        number, kind = request.path_params["number"], request.path_params["kind"]
+        if kind not in _KINDS:
+            return HTMLResponse(self.page.message("Not found", "There is no such page."), 404)
+        fields: dict[str, str] = {}
+        try:
+            async with request.form(max_files=1, max_fields=20, max_part_size=65_536) as form:
+                fields = _texts(form)
+                if not self.access.allows_form(session, fields.get("token", "")):
+                    return self._problem(request, session, Problem(f"{kind}-{number}", _OUT_OF_DATE, fields, 403))
+                await self._tell(number, kind, form)
+        except MultiPartException as error:
+            problem = Problem(f"{kind}-{number}", f"The form cannot be read: {error.message}", fields, 400)
+            return self._problem(request, session, problem)
+        except CtxvalError as error:
+            return self._problem(request, session, self._not_told(number, kind, error, fields))
+        return RedirectResponse(f"/?told={number}#message", 303)
+
+    async def _tell(self, number: int, kind: str, form: FormData) -> None:
+        fields, upload = _texts(form), form.get("file")
+        with tempfile.TemporaryDirectory(prefix="ctxval-") as folder:
+            path = None
+            if isinstance(upload, UploadFile) and upload.filename:
+                path = recording_in(folder, upload.filename)
+                path.write_bytes(await upload.read())
+            try:
+                report: Report = forms.result(kind, fields, path)
+                await self.service.tell(number, report, fields.get("submission", ""))
+            except InputError as error:
+                # The operator knows the name of the file, not the folder in which it is read.
+                raise InputError(str(error).replace(f"{folder}/", "")) from error
+
+    def _not_told(self, number: int, kind: str, error: CtxvalError, fields: dict[str, str]) -> Problem:
+        """Return why a result was not recorded, at the form if the trial is still open."""
+        sentence = shortened(str(error))
+        ended = self.page.ended(number)
+        if ended is not None:
+            sentence = f"Your result of trial {number} is not stored, because the trial has ended already: {ended}."
+        status = 409 if ended is not None else 500 if isinstance(error, StoreError | CampaignError) else 422
+        return Problem(f"{kind}-{number}" if ended is None else "trial", sentence, fields, status)
+
+    def _campaign(self, request: Request, session: str, problem: Problem | None = None) -> str:
+        told = request.query_params.get("told", "")
+        return self.page.campaign(
+            self.access.form_token(session),
+            problem=problem,
+            told=int(told) if told.isdecimal() and len(told) < 10 else None,
+            all_="all" in request.query_params,
+        )
+
+    def _problem(self, request: Request, session: str, problem: Problem) -> Response:
+        return HTMLResponse(self._campaign(request, session, problem), problem.status)
+
+    # Files and pictures
+
+    async def file(self, request: Request, session: str) -> Response:
+        """Return one file of an open trial."""
+        number, name = request.path_params["number"], request.path_params["name"]
+        try:
+            found = await self.service.files(number)
+        except CtxvalError as error:
+            return HTMLResponse(self.page.message("No file", str(error)), 404)
+        if name not in found:
+            sentence = f"There is no file {visible(name)[:80]} of trial {number}; there are {', '.join(found)}."
+            return HTMLResponse(self.page.message("No file", sentence), 404)
+        return _download(found[name], f"trial-{number}-{name}")
+
+    async def archive(self, request: Request, session: str) -> Response:
+        """Return all files of an open trial in one archive."""
+        number = request.path_params["number"]
+        try:
+            found = await self.service.files(number)
+        except CtxvalError as error:
+            return HTMLResponse(self.page.message("No file", str(error)), 404)
+        content = io.BytesIO()
+        with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, data in found.items():
+                archive.writestr(f"trial-{number}/{name}", data)
+        return _download(content.getvalue(), f"trial-{number}.zip")
+
+    async def picture(self, request: Request, session: str) -> Response:
+        """Return a picture of the campaign."""
+        found = self.service.background.pictures.images.get(request.path_params["name"])
+        if found is None:
+            return HTMLResponse(self.page.message("No picture", "There is no such picture yet."), 404)
+        # A picture has styles of its own, and must not run anything if it is opened alone.
+        policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
+        return Response(found, media_type=_TYPES[".svg"], headers=policy)
+
+    # Live
+
+    async def events(self, request: Request, session: str) -> Response:
+        """Send an event for each change of the page."""
+        if self._listeners >= _LISTENERS:
+            return Response("too many pages are open", 503, media_type="text/plain")
+        return StreamingResponse(self._events(), media_type="text/event-stream")
+
+    async def _events(self) -> AsyncIterator[str]:
+        self._listeners += 1
+        try:
+            async for kind, content in self.service.events():
+                yield _event(kind, content)
+        finally:
+            self._listeners -= 1
+
+
+def _event(kind: str, content: Any) -> str:
+    if kind == "heartbeat":
+        return ": the server is there\n\n"
+    if isinstance(content, Work):
+        stage = content.stage
+        content = {"text": stage.text, "done": stage.done, "expected": stage.expected, "seconds": content.seconds}
+    return f"event: {kind}\ndata: {json.dumps(content)}\n\n"
+
+
+def _texts(form: FormData) -> dict[str, str]:
+    return {name: value for name, value in form.items() if isinstance(value, str)}
+
+
+def _download(content: bytes, name: str) -> Response:
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return Response(content, media_type="application/octet-stream", headers=headers)
+
+
+_STATIC = {file.name: file.read_bytes() for file in resources("ctxval.web").joinpath("static").iterdir()}
+
+
+async def static(request: Request) -> Response:
+    """Return a file of this package."""
+    name = request.path_params["name"]
+    if name not in _STATIC:
+        return Response("not found", 404, media_type="text/plain")
+    headers = {"Cache-Control": "no-cache"}
+    return Response(_STATIC[name], media_type=_TYPES[name[name.rindex(".") :]], headers=headers)
+
+
+def application(service: CampaignService, access: Access, hosts: Hosts, most: int = MOST_UPLOAD) -> Guard:
+    """Return the ASGI application of a campaign.
+
+    Args:
+        service: the campaign.
+        access: who may use the page.
+        hosts: the names of the server.
+        most: largest size of a request's body in bytes.
+    """
+
+    @contextlib.asynccontextmanager
+    async def running(app: Starlette) -> AsyncIterator[None]:
+        await service.start()
+        try:
+            yield
+        finally:
+            await service.stop()
+
+    return Guard(Starlette(routes=OperatorPage(service, access).routes(), lifespan=running), hosts, most)

@@ -1,0 +1,161 @@
+"""A child process with a campaign of its own, for work that takes long."""
+
+from __future__ import annotations
+
+import concurrent.futures as cf
+import contextlib
+import functools
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+from ctxval._util.representation import call
+from ctxval._util.texts import reason_of
+from ctxval.errors import CampaignError, CtxvalError
+from ctxval.web.served import OpenCampaign, ServedCampaign
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What a background process does at present.
+
+    Attributes:
+        text: the work, as the beginning of a sentence.
+        done, expected: how much of it is done; None if it cannot be counted.
+    """
+
+    text: str
+    done: float | None = None
+    expected: float | None = None
+
+
+TellStage = Callable[[Stage], None]
+Job = Callable[..., Any]
+"""A function of a module, called with the served campaign, a function that tells the stage, and the job's arguments."""
+
+
+class BackgroundProcess:
+    """A process that opens the campaign once and then does one job at a time.
+
+    A process keeps the server responsive while Python computes, keeps users' code of two campaigns apart, and may crash
+    without harm. The next job starts it again.
+
+    Args:
+        open_campaign: opens the campaign in the child process; it must be picklable.
+        on_stage: called in another thread when the stage of the job changes.
+    """
+
+    def __init__(self, open_campaign: OpenCampaign, on_stage: TellStage) -> None:
+        self._open, self._on_stage = open_campaign, on_stage
+        self._thread = cf.ThreadPoolExecutor(1, "background")
+        self._process: Any = None
+        self._pipe: Connection | None = None
+        self._closed = False
+
+    def submit(self, job: Job, *arguments: Any) -> cf.Future[Any]:
+        """Do a job after the earlier ones; return its future result.
+
+        The future raises a CampaignError if the job fails or the process ends.
+        """
+        return self._thread.submit(self._do, job, arguments)
+
+    def close(self) -> None:
+        """End the process with everything that it started. Work that is not stored yet is lost."""
+        self._closed = True
+        self._thread.shutdown(wait=False, cancel_futures=True)
+        if self._process is not None and self._process.is_alive():
+            _kill(self._process.pid)
+            self._process.join()
+        self._thread.shutdown()
+
+    def _do(self, job: Job, arguments: tuple[Any, ...]) -> Any:
+        if self._closed:
+            raise CampaignError("the server is being stopped.")
+        if self._process is None or not self._process.is_alive():
+            self._start()
+        assert self._pipe is not None
+        try:
+            self._pipe.send((job, arguments))
+            return self._result(self._pipe)
+        except (EOFError, OSError) as error:
+            self._process.join()
+            status = self._process.exitcode
+            raise CampaignError(f"the background process ended with the status {status}. Try again.") from error
+
+    def _start(self) -> None:
+        # A forked child would inherit the threads and the database of the server.
+        context = multiprocessing.get_context("spawn")
+        self._pipe, other = context.Pipe()
+        self._process = context.Process(target=_serve, args=(other, self._open), name="ctxval serve")
+        self._process.start()
+        other.close()
+
+    def _result(self, pipe: Connection) -> Any:
+        while True:
+            kind, content = pipe.recv()
+            if kind == "done":
+                return content
+            if kind == "failed":
+                raise CampaignError(content)
+            self._on_stage(content)
+
+    def __repr__(self) -> str:
+        return call(self, alive=self._process is not None and self._process.is_alive())
+
+
+def _kill(process: int) -> None:
+    """Kill a child and its own children, which are in its process group."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        if sys.platform == "win32":
+            os.kill(process, signal.SIGTERM)
+            return
+        if os.getpgid(process) == process:
+            os.killpg(process, signal.SIGKILL)
+        else:  # it has not made its group yet
+            os.kill(process, signal.SIGKILL)
+
+
+# In the child process
+
+
+def _serve(pipe: Connection, open_campaign: OpenCampaign) -> None:
+    """Do jobs until the server ends, however it ends."""
+    if sys.platform != "win32":
+        os.setpgid(0, 0)  # Ctrl-C at the terminal is for the server alone
+    served: ServedCampaign | None = None
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        while True:
+            job, arguments = pipe.recv()
+            try:
+                if served is None:
+                    pipe.send(("stage", Stage("loading the experiment")))
+                    served = open_campaign()
+                reply = "done", job(served, _teller(pipe), *arguments)
+            except CtxvalError as error:
+                reply = "failed", str(error)
+            except BaseException as error:  # users' code may raise anything
+                reply = "failed", reason_of(error)
+            pipe.send(reply)
+
+
+_INTERVAL = 0.2
+"""Least number of seconds between two messages that only count."""
+
+
+def _teller(pipe: Connection) -> TellStage:
+    """Return a function that sends stages, and not too many of them."""
+    last = ["", 0.0]
+
+    def tell(stage: Stage) -> None:
+        now = time.monotonic()
+        if stage.text != last[0] or now - float(last[1]) >= _INTERVAL:
+            last[:] = stage.text, now
+            pipe.send(("stage", stage))
+
+    return functools.partial(tell)

@@ -1,0 +1,92 @@
+"""The forms of the page, read into values; what cannot be read is refused in one sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from ctxval.campaign.telling import Report, require_tolerance
+from ctxval.core.space import TaskSpace
+from ctxval.errors import InputError
+from ctxval.web.jobs import TaskRequest
+
+Number = TypeVar("Number", int, float)
+
+Fields = Mapping[str, str]
+"""The fields of a form that are texts."""
+
+
+def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
+    """Return what an operator asks for.
+
+    Args:
+        fields: ``how`` is next, draw, own or again; ``seen`` is the number of trials on the operator's page.
+        space: the task space.
+
+    Raises:
+        InputError: if a field is missing or cannot be used.
+    """
+    seen = _whole(fields, "seen", "the number of trials on the page")
+    match fields.get("how"):
+        case "next":
+            return TaskRequest(trials=seen)
+        case "draw":
+            return TaskRequest(draw=True, trials=seen)
+        case "own":
+            names = zip(space.names, range(space.dimension), strict=True)
+            point = np.array([_number(fields, f"parameter-{place}", name) for name, place in names])
+            parameters = space.describe_point(point)
+            space.point(parameters)
+            return TaskRequest(parameters, trials=seen)
+        case "again":
+            number = _whole(fields, "trial", "the trial")
+            return TaskRequest(again=number, because=fields.get("because", "").strip() or None, trials=seen)
+    raise InputError("choose how the next task is to be found.")
+
+
+def result(kind: str, fields: Fields, recording: Path | None) -> Report:
+    """Return what an operator reports of a trial.
+
+    Args:
+        kind: recording, distance or failure.
+        fields: the fields of the form.
+        recording: the uploaded file; None if there is none.
+
+    Raises:
+        InputError: if a field is missing or cannot be used.
+    """
+    if kind == "failure":
+        reason = fields.get("reason", "").strip()
+        if not reason:
+            raise InputError('a failure needs a reason, such as "the motor cut out".')
+        return Report(failed=reason)
+    if kind == "distance":
+        return Report(distance=_number(fields, "distance", "the distance"))
+    if recording is None:
+        raise InputError("choose the file of the recording.")
+    tolerance = _number(fields, "tolerance", "the start tolerance") if fields.get("tolerance", "").strip() else None
+    require_tolerance(tolerance, "the start tolerance")
+    return Report(recording, resample="resample" in fields, start_tolerance=tolerance)
+
+
+def _number(fields: Fields, field: str, name: str) -> float:
+    return _read(fields, field, f"{name} must be a number", float)
+
+
+def _whole(fields: Fields, field: str, name: str) -> int:
+    return _read(fields, field, f"{name} must be a whole number", int)
+
+
+def _read(fields: Fields, field: str, sentence: str, kind: Callable[[str], Number]) -> Number:
+    given = fields.get(field, "").strip()
+    try:
+        value = kind(given)
+    except ValueError:
+        raise InputError(f"{sentence}, got {given[:60]!r}.") from None
+    if not math.isfinite(value):
+        raise InputError(f"{sentence}, got {given!r}.")
+    return value

@@ -1,0 +1,200 @@
+"""What is refused before a request reaches the page: other hosts, other sites, and bodies that are too large."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from collections.abc import Iterable
+from dataclasses import dataclass
+from html import escape
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import HTMLResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from ctxval._util.representation import call, record
+
+MOST_UPLOAD = 64 * 2**20
+"""Largest size of a request in bytes: a recording, or a form."""
+
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; form-action 'self'; "
+    "base-uri 'none'; frame-ancestors 'none'"
+)
+"""The Content-Security-Policy: nothing from elsewhere, and no script or style inside the page."""
+
+HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    # With no-referrer, a browser sends forms with the origin "null".
+    "Referrer-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+    "Cache-Control": "no-store",
+}
+
+_SAFE = ("GET", "HEAD")
+
+
+@dataclass(frozen=True)
+class Hosts:
+    """The names under which a browser may address the server.
+
+    A page of another site can direct its own name to this computer (DNS rebinding), and its requests would then be
+    requests of the same site. They still carry that name.
+
+    Attributes:
+        names: the permitted names, in lower case.
+        any_address: whether every IP address is permitted too. A site cannot direct an address elsewhere.
+    """
+
+    names: frozenset[str]
+    any_address: bool
+
+    @staticmethod
+    def of(host: str, more: Iterable[str] = ()) -> Hosts:
+        """Return the permitted names of a server.
+
+        Args:
+            host: the address that the server listens at.
+            more: further names, for example that of a proxy.
+        """
+        names = {"localhost", "127.0.0.1", "::1", host.lower(), *(name.lower() for name in more)}
+        local = is_loopback(host)
+        if not local:
+            own = socket.gethostname().lower()
+            names |= {own, f"{own.partition('.')[0]}.local"}
+        return Hosts(frozenset(names), not local)
+
+    def permit(self, header: str | None) -> bool:
+        """Return whether a Host header names this server."""
+        try:
+            name = urlsplit(f"//{header or ''}").hostname
+        except ValueError:
+            return False
+        return bool(name) and (name in self.names or (self.any_address and is_address(str(name))))
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def is_address(host: str) -> bool:
+    """Return whether a host is an IP address and not a name."""
+    try:
+        ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:
+        return False
+    return True
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only programs on this computer reach a host."""
+    return host == "localhost" or (is_address(host) and ipaddress.ip_address(host.partition("%")[0]).is_loopback)
+
+
+def refusal(method: str, headers: Headers, hosts: Hosts) -> str | None:
+    """Return why a request is refused, in one sentence; None if it is not.
+
+    Args:
+        method: the method of HTTP.
+        headers: the headers of the request.
+        hosts: the names of this server.
+    """
+    host = headers.get("host")
+    if not hosts.permit(host):
+        return (
+            f"This server is not called {(host or 'by no name')[:80]!r}. If the name is right, start the server with "
+            "--allow-host NAME."
+        )
+    site = headers.get("sec-fetch-site", "same-origin" if headers.get("origin") else "")
+    if method in _SAFE:
+        followed_link = headers.get("sec-fetch-mode") == "navigate" and headers.get("sec-fetch-dest") == "document"
+        elsewhere = site in ("cross-site", "same-site") and not followed_link
+        return "Other sites cannot use this page." if elsewhere else None
+    origin = headers.get("origin")
+    if origin is None and site not in ("same-origin", "none"):
+        return "The browser does not say which site sent this form."
+    if site not in ("same-origin", "none") or (origin is not None and urlsplit(origin).netloc != host):
+        return "This form was sent by another site."
+    return None
+
+
+class _TooLargeError(Exception):
+    """A body has more bytes than permitted."""
+
+
+class Guard:
+    """Refuses requests before the application reads them, and adds the security headers to every response.
+
+    Args:
+        app: the application.
+        hosts: the names of this server.
+        most: largest size of a request's body in bytes. It is counted as the body arrives.
+    """
+
+    def __init__(self, app: ASGIApp, hosts: Hosts, most: int = MOST_UPLOAD) -> None:
+        self.app, self.hosts, self.most = app, hosts, most
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        if scope["type"] != "http":
+            # There are no WebSockets here; only the start and the end of the server are left.
+            await (self.app(scope, receive, send) if scope["type"] == "lifespan" else send({"type": "websocket.close"}))
+            return
+        headers = Headers(scope=scope)
+        guarded = _with_headers(send)
+        reason = refusal(scope["method"], headers, self.hosts)
+        if reason is not None:
+            await _refused(403, reason)(scope, receive, guarded)
+            return
+        if (declared := headers.get("content-length", "0")).isdecimal() and int(declared) > self.most:
+            await self._too_large(scope, receive, guarded)
+            return
+        try:
+            await self.app(scope, _counting(receive, self.most), guarded)
+        except _TooLargeError:
+            await self._too_large(scope, receive, guarded)
+
+    async def _too_large(self, scope: Scope, receive: Receive, send: Send) -> None:
+        sentence = f"The file is too large: at most {self.most / 2**20:g} MiB are accepted. Nothing is stored."
+        await _refused(413, sentence)(scope, receive, send)
+
+    def __repr__(self) -> str:
+        return call(self, self.hosts, most=self.most)
+
+
+def _refused(status: int, sentence: str) -> HTMLResponse:
+    page = (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Refused</title>'
+        '<meta name="viewport" content="width=device-width"></head>'
+        f'<body><main><h1>Refused</h1><p>{escape(sentence)}</p><p><a href="/">To the page</a></p></main></body></html>'
+    )
+    return HTMLResponse(page, status, {"Connection": "close"})
+
+
+def _with_headers(send: Send) -> Send:
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            for name, value in HEADERS.items():
+                headers.setdefault(name, value)
+        await send(message)
+
+    return sending
+
+
+def _counting(receive: Receive, most: int) -> Receive:
+    read = 0
+
+    async def receiving() -> Message:
+        nonlocal read
+        message = await receive()
+        read += len(message.get("body", b""))
+        if read > most:
+            raise _TooLargeError
+        return message
+
+    return receiving

@@ -1,0 +1,312 @@
+"""The state of the page, and everything that changes it. All of it runs in the event loop of the server."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import OrderedDict
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ctxval._util.representation import call, counted
+from ctxval.campaign.telling import Report
+from ctxval.core.trial import Trial
+from ctxval.errors import CtxvalError, InputError
+from ctxval.web import jobs
+from ctxval.web.background import BackgroundProcess, Job, Stage
+from ctxval.web.desk import Desk, Snapshot
+from ctxval.web.jobs import Files, Judgement, Pictures, TaskRequest
+from ctxval.web.served import OpenCampaign
+
+_POLL = 1.0
+"""Seconds between two looks at a store that other processes may change."""
+
+_HEARTBEAT = 15.0
+"""Seconds after which a listener hears something, so that a lost connection is noticed."""
+
+_REMEMBERED = 1_000
+"""Number of submitted forms that are remembered, to recognise a form that is sent twice."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """Work of a background process that is not done yet.
+
+    Attributes:
+        stage: what it does at present.
+        started: the time of its start, on the clock of ``time.monotonic``.
+    """
+
+    stage: Stage
+    started: float
+
+    @property
+    def seconds(self) -> int:
+        """Whole seconds since the start."""
+        return int(time.monotonic() - self.started)
+
+
+@dataclass(frozen=True, eq=False)
+class Background:
+    """What the background processes have found, and what they do.
+
+    Attributes:
+        choosing, judging: present work; None if there is none.
+        choice_error: why the last choice failed; None if it did not.
+        chosen: the number of the trial that was opened last from this page; None if none was.
+        judgement: the last verdict; None if there is none.
+        judged: the trials that it is about, as :attr:`Snapshot.ended`.
+        judgement_error: why it failed; None if it did not.
+        pictures: the last pictures.
+        files: the files of open trials by number; a text says why there are none.
+        store_error: why the store cannot be read at present; None if it can.
+    """
+
+    choosing: Work | None = None
+    judging: Work | None = None
+    choice_error: str | None = None
+    chosen: int | None = None
+    judgement: Judgement | None = None
+    judged: tuple[int, int] | None = None
+    judgement_error: str | None = None
+    pictures: Pictures = Pictures()  # noqa: RUF009 (it is never changed)
+    files: dict[int, Files | str] | None = None
+    store_error: str | None = None
+
+
+class CampaignService:
+    """One campaign, with the work in progress, for any number of operators.
+
+    Args:
+        desk: the server's own campaign.
+        reopen: opens the campaign in a child process; it must be picklable.
+
+    Attributes:
+        description: what does not change.
+        snapshot: the trials as they were last read.
+        background: what the background processes have found.
+        version: a number that grows with each change.
+    """
+
+    def __init__(self, desk: Desk, reopen: OpenCampaign) -> None:
+        self._desk, self._reopen = desk, reopen
+        self.description, self.snapshot = desk.description, desk.first
+        self.background = Background(files={})
+        self.version = 0
+        self._changed = asyncio.Event()
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._preparing: dict[int, asyncio.Task[None]] = {}
+        self._submitted: OrderedDict[str, int] = OrderedDict()
+        self._closing = False
+
+    async def start(self) -> None:
+        """Start the background processes and the observation of the store."""
+        loop = asyncio.get_running_loop()
+
+        def told(stage: Stage, kind: str) -> None:
+            loop.call_soon_threadsafe(self._set_stage, kind, stage)
+
+        self._chooser = BackgroundProcess(self._reopen, lambda stage: told(stage, "choosing"))
+        self._judge = BackgroundProcess(self._reopen, lambda stage: told(stage, "judging"))
+        self._spawn(self._background(self._chooser, jobs.warm_up))
+        self._follow()
+        self._spawn(self._watch())
+
+    async def stop(self) -> None:
+        """End the background processes, and close the store."""
+        self.end_events()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        loop = asyncio.get_running_loop()
+        for close in (self._chooser.close, self._judge.close, self._desk.close):
+            await loop.run_in_executor(None, close)
+
+    # What operators do
+
+    def choose(self, request: TaskRequest) -> None:
+        """Start to choose the next task.
+
+        Raises:
+            InputError: if a task is being chosen, or if another trial was opened since the operator looked.
+        """
+        if self.background.choosing is not None:
+            raise InputError("a task is already being chosen.")
+        if request.trials is not None and request.trials != len(self.snapshot.trials):
+            raise InputError(
+                f"another task was opened since this page was loaded, as trial {len(self.snapshot.trials) - 1}. If you "
+                "need one more task, ask again."
+            )
+        work = Work(Stage("choosing a task"), time.monotonic())
+        self._update(choosing=work, choice_error=None, chosen=None)
+        self._spawn(self._choose(request))
+
+    async def tell(self, number: int, report: Report, submission: str) -> Trial:
+        """Record the result of an open trial, once for each submitted form.
+
+        Args:
+            number: the number of the trial.
+            report: the result.
+            submission: identifies the form; a form that is sent twice is recorded once.
+
+        Raises:
+            InputError, ExecutionError, StoreError, CampaignError: as in :meth:`Desk.tell`; the trial stays as it was.
+        """
+        try:
+            ended = await self._desk.tell(number, report)
+        except InputError:
+            if not submission or self._submitted.get(submission) != number:
+                raise
+            return self.snapshot.trials[number]
+        else:
+            self._submitted[submission] = number
+            if len(self._submitted) > _REMEMBERED:
+                self._submitted.popitem(last=False)
+            return ended
+        finally:
+            await self._look()
+
+    async def files(self, number: int) -> Files:
+        """Return the files of an open trial, after they are prepared.
+
+        Raises:
+            InputError: if the trial is not open, or its files cannot be made.
+        """
+        if number in self._preparing:
+            await asyncio.shield(self._preparing[number])
+        found = (self.background.files or {}).get(number)
+        if isinstance(found, dict):
+            return found
+        raise InputError(found or f"trial {number} is not open, so there are no files of it.")
+
+    # What operators see
+
+    async def events(self) -> AsyncIterator[tuple[str, Any]]:
+        """Yield the version of the page after each change, the work in progress, and now and then a heartbeat."""
+        seen = None
+        while not self._closing:
+            changed = self._changed
+            if seen != self.version:
+                seen = self.version
+                yield "version", seen
+            else:
+                work = self.background.choosing or self.background.judging
+                yield ("stage", work) if work is not None else ("heartbeat", None)
+            try:
+                async with asyncio.timeout(_HEARTBEAT):
+                    await changed.wait()
+            except TimeoutError:
+                continue
+
+    def end_events(self) -> None:
+        """Let all listeners end, because the server stops."""
+        self._closing = True
+        self._notify()
+
+    # Changes
+
+    def _update(self, **changes: Any) -> None:
+        self.background = replace(self.background, **changes)
+        self.version += 1
+        self._notify()
+
+    def _notify(self) -> None:
+        changed, self._changed = self._changed, asyncio.Event()
+        changed.set()
+
+    def _set_stage(self, kind: str, stage: Stage) -> None:
+        work: Work | None = getattr(self.background, kind)
+        if work is None:
+            return
+        counts = stage.text == work.stage.text
+        self.background = replace(self.background, **{kind: replace(work, stage=stage)})
+        self.version += not counts
+        self._notify()
+
+    def _spawn(self, work: Any) -> asyncio.Task[Any]:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    async def _background(self, process: BackgroundProcess, job: Job, *arguments: Any) -> Any:
+        return await asyncio.wrap_future(process.submit(job, *arguments))
+
+    async def _choose(self, request: TaskRequest) -> None:
+        try:
+            number, files = await self._background(self._chooser, jobs.choose, request)
+        except CtxvalError as error:
+            self._update(choosing=None, choice_error=str(error))
+        else:
+            self._update(choosing=None, chosen=number, files={**(self.background.files or {}), number: files})
+        await self._look()
+
+    async def _watch(self) -> None:
+        while True:
+            await asyncio.sleep(_POLL)
+            try:
+                if await self._desk.signature() == self.snapshot.signature and self.background.store_error is None:
+                    continue
+            except CtxvalError:
+                pass  # looking again says why
+            await self._look()
+
+    async def _look(self) -> None:
+        """Read the store; if it has changed, bring everything else up to date."""
+        try:
+            found = await self._desk.snapshot()
+        except CtxvalError as error:
+            if self.background.store_error != str(error):
+                self._update(store_error=str(error))
+            return
+        if self.background.store_error is not None:
+            self._update(store_error=None)
+        if not _same(found, self.snapshot):
+            self.snapshot = found
+            self._follow()
+            self._update()
+
+    def _follow(self) -> None:
+        """Prepare the files of open trials, forget those of others, and judge the trials that have ended."""
+        waiting = {trial.number for trial in self.snapshot.waiting if not trial.attempts}
+        files = self.background.files or {}
+        self.background = replace(self.background, files={n: kept for n, kept in files.items() if n in waiting})
+        for number in waiting - set(files) - set(self._preparing):
+            self._preparing[number] = self._spawn(self._prepare(number))
+        if self.background.judging is None and self.background.judged != self.snapshot.ended:
+            self.background = replace(self.background, judging=Work(Stage("drawing the pictures"), time.monotonic()))
+            self._spawn(self._evaluate())
+
+    async def _prepare(self, number: int) -> None:
+        found: Files | str
+        try:
+            found = await self._background(self._chooser, jobs.files_of, number)
+        except CtxvalError as error:
+            found = str(error)
+        finally:
+            self._preparing.pop(number, None)
+        if any(trial.number == number for trial in self.snapshot.waiting):
+            self._update(files={**(self.background.files or {}), number: found})
+
+    async def _evaluate(self) -> None:
+        """Draw and judge until the results are those of the present trials."""
+        while self.background.judged != self.snapshot.ended:
+            ended = self.snapshot.ended
+            try:
+                self._update(pictures=await self._background(self._judge, jobs.draw))
+                judgement = await self._background(self._judge, jobs.judge)
+            except CtxvalError as error:
+                self._update(judged=ended, judgement_error=str(error))
+            else:
+                self._update(judged=ended, judgement=judgement, judgement_error=None)
+        self._update(judging=None)
+
+    def __repr__(self) -> str:
+        return call(self, self.description.name, trials=counted(len(self.snapshot.trials), "trial"))
+
+
+def _same(one: Snapshot, other: Snapshot) -> bool:
+    """Return whether two snapshots show the same; an execution that starts changes no signature."""
+    states = [[(trial.state, trial.attempts) for trial in each.trials] for each in (one, other)]
+    return one.signature == other.signature and states[0] == states[1]
