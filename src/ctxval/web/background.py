@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import concurrent.futures as cf
 import contextlib
-import functools
 import multiprocessing
 import os
 import signal
@@ -136,7 +135,7 @@ def _serve(pipe: Connection, open_campaign: OpenCampaign) -> None:
                 if served is None:
                     pipe.send(("stage", Stage("loading the experiment")))
                     served = open_campaign()
-                reply = "done", job(served, _teller(pipe), *arguments)
+                reply = "done", job(served, _Teller(pipe), *arguments)
             except CtxvalError as error:
                 reply = "failed", str(error)
             except BaseException as error:  # users' code may raise anything
@@ -148,14 +147,14 @@ _INTERVAL = 0.2
 """Least number of seconds between two messages that only count."""
 
 
-def _teller(pipe: Connection) -> TellStage:
-    """Return a function that sends stages, and not too many of them."""
-    last = ["", 0.0]
+class _Teller:
+    """Sends stages through a pipe, and not too many of them."""
 
-    def tell(stage: Stage) -> None:
+    def __init__(self, pipe: Connection) -> None:
+        self._pipe, self._text, self._at = pipe, "", 0.0
+
+    def __call__(self, stage: Stage) -> None:
         now = time.monotonic()
-        if stage.text != last[0] or now - float(last[1]) >= _INTERVAL:
-            last[:] = stage.text, now
-            pipe.send(("stage", stage))
-
-    return functools.partial(tell)
+        if stage.text != self._text or now - self._at >= _INTERVAL:
+            self._text, self._at = stage.text, now
+            self._pipe.send(("stage", stage))

@@ -183,9 +183,8 @@ def _draw(pictures: Pictures, name: str, make: Callable[[], Figure]) -> None:
     import matplotlib
 
     # Names of parameters may contain a $, which is not mathematics; a stated id makes equal pictures equal files.
-    settings = {"text.parse_math": False, "svg.hashsalt": "ctxval"}
     try:
-        with matplotlib.rc_context(settings):
+        with matplotlib.rc_context({"text.parse_math": False, "svg.hashsalt": "ctxval"}):
             content = io.BytesIO()
             make().savefig(content, format="svg", metadata={"Date": None})
     except Exception as error:  # a picture must not hide the verdict

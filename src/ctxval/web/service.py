@@ -220,7 +220,8 @@ class CampaignService:
         if work is None:
             return
         counts = stage.text == work.stage.text
-        self.background = replace(self.background, **{kind: replace(work, stage=stage)})
+        changes: dict[str, Any] = {kind: replace(work, stage=stage)}
+        self.background = replace(self.background, **changes)
         self.version += not counts
         self._notify()
 
