@@ -33,6 +33,9 @@ from ctxval.certificates import (
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+pytest_plugins = ["browser"]
+"""Fixtures that tests of several folders use."""
+
 settings.register_profile("ctxval", deadline=None, derandomize=True)
 settings.load_profile("ctxval")
 

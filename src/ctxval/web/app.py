@@ -126,10 +126,13 @@ class OperatorPage:
             fields = _texts(form)
         if not self.access.allows_form(session, fields.get("token", "")):
             return self._problem(request, session, Problem("choose", _OUT_OF_DATE, fields, 403))
+        status = 422
         try:
-            self.service.choose(forms.task_request(fields, self.service.description.space))
+            wanted = forms.task_request(fields, self.service.description.space)
+            status = 409
+            self.service.choose(wanted)
         except InputError as error:
-            return self._problem(request, session, Problem("choose", str(error), fields, 409))
+            return self._problem(request, session, Problem("choose", str(error), fields, status))
         return RedirectResponse("/#next", 303)
 
     async def tell(self, request: Request, session: str) -> Response:
@@ -138,14 +141,15 @@ class OperatorPage:
         if kind not in _KINDS:
             return HTMLResponse(self.page.message("Not found", "There is no such page."), 404)
         fields: dict[str, str] = {}
+        where = self._where(number, kind)
         try:
             async with request.form(max_files=1, max_fields=20, max_part_size=65_536) as form:
                 fields = _texts(form)
                 if not self.access.allows_form(session, fields.get("token", "")):
-                    return self._problem(request, session, Problem(f"{kind}-{number}", _OUT_OF_DATE, fields, 403))
+                    return self._problem(request, session, Problem(where, _OUT_OF_DATE, fields, 403))
                 await self._tell(number, kind, form)
         except MultiPartException as error:
-            problem = Problem(f"{kind}-{number}", f"The form cannot be read: {error.message}", fields, 400)
+            problem = Problem(where, f"The form cannot be read: {error.message}", fields, 400)
             return self._problem(request, session, problem)
         except CtxvalError as error:
             return self._problem(request, session, self._not_told(number, kind, error, fields))
@@ -172,7 +176,12 @@ class OperatorPage:
         if ended is not None:
             sentence = f"Your result of trial {number} is not stored, because the trial has ended already: {ended}."
         status = 409 if ended is not None else 500 if isinstance(error, StoreError | CampaignError) else 422
-        return Problem(f"{kind}-{number}" if ended is None else "trial", sentence, fields, status)
+        return Problem(self._where(number, kind), sentence, fields, status)
+
+    def _where(self, number: int, kind: str) -> str:
+        """Return the form in which a problem is shown; if the trial is not open, the top of the page."""
+        is_open = any(trial.number == number for trial in self.service.snapshot.waiting)
+        return f"{kind}-{number}" if is_open else "trial"
 
     def _campaign(self, request: Request, session: str, problem: Problem | None = None) -> str:
         told = request.query_params.get("told", "")

@@ -1,0 +1,185 @@
+"""The operator's page of a rig that people operate, served by the command line in a process of its own."""
+
+from __future__ import annotations
+
+import csv
+import http.client
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctxval.core.exchange import read_controller, read_task
+from ctxval.core.rollout import rollout
+
+MODULE = """
+from ctxval import Experiment, Task, TaskSpace, Validation, controllers, distances, models, systems
+
+
+def experiment(seed, name="rig", goal="goal", unit="m"):
+    rig = systems.Manual(states={"position": "m", "speed": "m/s"}, inputs={"force": "N"}, dt=0.1)
+    validation = Validation(
+        space=TaskSpace(**{goal: (0.5, 2.0, unit)}),
+        task=lambda p: Task([0, 0], goal=[p.points[..., 0], 0], horizon=20, dt=rig.dt),
+        system=rig,
+        model=models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]]),
+        synthesizer=controllers.LQR([10, 1], [0.1], limits=3.0),
+        distance=distances.FinalState(),
+    )
+    return Experiment(name, validation, threshold=2.0, units=unit)
+
+
+HOSTILE = "<script>document.title='run'</script><img src=x onerror=alert(1)>"
+
+
+def hostile(seed):
+    return experiment(seed, HOSTILE, HOSTILE + " $x {{7*7}}", "'\\"><b>m")
+
+
+def slow(seed):
+    made = experiment(seed)
+    designed = made.validation.synthesizer.design
+
+    class Slow:
+        def design(self, task, model):
+            import time
+
+            time.sleep(1.5)
+            return designed(task, model)
+
+    made.validation.synthesizer = Slow()
+    return made
+"""
+
+COMMAND = [sys.executable, "-c", "from ctxval.cli import main; main()"]
+
+
+def ctxval(*arguments: str, folder: Path) -> dict[str, Any]:
+    """Run a command of ctxval in a folder with the rig in it; return its JSON object."""
+    (folder / "my_rig.py").write_text(MODULE)
+    command = [*COMMAND, *arguments, "--json"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode in (0, 1), done.stderr
+    report: dict[str, Any] = json.loads(done.stdout)
+    return report
+
+
+@dataclass
+class Server:
+    """A running server.
+
+    Attributes:
+        process: its process.
+        address: the address of the page, with the token if there is one.
+        port: the port.
+    """
+
+    process: subprocess.Popen[str]
+    address: str
+    port: int
+
+    def request(
+        self, method: str, path: str, body: bytes | Iterator[bytes] | None = None, **headers: str | None
+    ) -> Response:
+        """Send one request; an underscore in the name of a header is a hyphen, and None leaves a header out."""
+        given = {name.replace("_", "-"): value for name, value in headers.items()}
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        try:
+            connection.putrequest(method, path, skip_host="Host" in given, skip_accept_encoding=True)
+            chunked = body is not None and not isinstance(body, bytes)
+            if isinstance(body, bytes):
+                given.setdefault("Content-Length", str(len(body)))
+            elif chunked:
+                given["Transfer-Encoding"] = "chunked"
+            for name, value in given.items():
+                if value is not None:
+                    connection.putheader(name, value)
+            connection.endheaders(body, encode_chunked=chunked)
+            answer = connection.getresponse()
+            return Response(answer.status, dict(answer.getheaders()), answer.read())
+        finally:
+            connection.close()
+
+    def stop(self) -> tuple[int, str]:
+        """Stop the server as Ctrl-C does; return its status and what it printed on stderr."""
+        self.process.send_signal(signal.SIGINT)
+        _, said = self.process.communicate(timeout=30)
+        return self.process.returncode, said
+
+
+@dataclass(frozen=True)
+class Response:
+    """The response to one request."""
+
+    status: int
+    headers: Mapping[str, str]
+    content: bytes
+
+    @property
+    def text(self) -> str:
+        """The content as text."""
+        return self.content.decode()
+
+    @property
+    def cookie(self) -> str:
+        """The cookie of the session, as the browser sends it back."""
+        return self.headers["set-cookie"].partition(";")[0]
+
+    @property
+    def token(self) -> str:
+        """The token of the forms."""
+        found = re.search(r'name="token" value="([0-9a-f]+)"', self.text)
+        assert found is not None
+        return found[1]
+
+
+@contextmanager
+def serving(folder: Path, *arguments: str, store: str = "a.sqlite") -> Iterator[Server]:
+    """Serve a store on a free port."""
+    command = [*COMMAND, "serve", store, "--port", "0", *arguments]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    )
+    assert process.stdout is not None
+    first = process.stdout.readline()
+    found = re.search(r"http://\S+?:(\d+)/\S*", first)
+    if found is None:
+        _, said = process.communicate(timeout=30)
+        raise AssertionError(f"{first}{said}")
+    server = Server(process, found[0], int(found[1]))
+    try:
+        yield server
+    finally:
+        if process.poll() is None:
+            server.stop()
+
+
+def new_store(folder: Path, reference: str = "my_rig:experiment") -> None:
+    """Make a store with one open trial."""
+    ctxval("ask", reference, "--store", "a.sqlite", folder=folder)
+
+
+def record(files: Path, path: Path, *, rate: float = 0.98, steps: int | None = None) -> Path:
+    """Do what a rig does with the files alone: read them, run, and write a recording as CSV."""
+    found, task = read_controller(files / "controller.json"), read_task(files / "task.json")
+
+    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return np.array([x[0] + 0.1 * x[1], rate * x[1] + 0.1 * u[0]])
+
+    run = rollout(step, found.controller, task)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "position [m]", "speed [m/s]", "force [N]"])
+        for k, state in enumerate(run.states.tolist()[:steps]):
+            writer.writerow([run.times[k], *state, run.inputs[k, 0] if k < run.horizon else ""])
+    return path

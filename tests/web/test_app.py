@@ -1,0 +1,400 @@
+"""The operator's page as a server: what it answers, what it refuses, and what it stores, by plain requests."""
+
+from __future__ import annotations
+
+import io
+import re
+import time
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlencode
+
+import pytest
+
+from ctxval.core.trial import Trial
+from ctxval.storage.store import Store
+from ctxval.web.security import HEADERS, MOST_UPLOAD
+from rig_page import Response, Server, ctxval, new_store, record, serving
+
+pytestmark = pytest.mark.slow
+
+SHORT = b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n"
+"""A recording of two times."""
+
+NAMES = ["../../evil.csv", "..\\\\evil.csv", ".csv", "a" * 300 + ".csv", "<b>.csv", "x\x01.npz"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("rig")
+    new_store(made)
+    return made
+
+
+@pytest.fixture(scope="module")
+def server(folder: Path) -> Iterator[Server]:
+    with serving(folder) as running:
+        yield running
+
+
+@pytest.fixture
+def page(server: Server) -> Response:
+    return server.request("GET", "/")
+
+
+def trials(folder: Path) -> list[Trial]:
+    store = Store.existing(folder / "a.sqlite")
+    try:
+        return store.trials()
+    finally:
+        store.close()
+
+
+def post(server: Server, path: str, page: Response, fields: dict[str, str], **headers: str | None) -> Response:
+    """Send a form as the browser of the page does; headers replace those of the browser."""
+    sent = {
+        "Cookie": page.cookie,
+        "Origin": f"http://127.0.0.1:{server.port}",
+        "Sec_Fetch_Site": "same-origin",
+        "Content_Type": "application/x-www-form-urlencoded",
+        **headers,
+    }
+    return server.request("POST", path, urlencode({"token": page.token, **fields}).encode(), **sent)
+
+
+def upload(
+    server: Server, number: int, page: Response, content: bytes, name: str = "run.csv", **fields: str
+) -> Response:
+    """Send a recording as the browser does."""
+    parts = [
+        f'--edge\r\nContent-Disposition: form-data; name="{key}"\r\n\r\n{value}\r\n'.encode()
+        for key, value in {"token": page.token, **fields}.items()
+    ]
+    head = f'--edge\r\nContent-Disposition: form-data; name="file"; filename="{name}"\r\n\r\n'.encode()
+    body = b"".join([*parts, head, content, b"\r\n--edge--\r\n"])
+    sent = {"Cookie": page.cookie, "Origin": f"http://127.0.0.1:{server.port}", "Sec_Fetch_Site": "same-origin"}
+    kind = "multipart/form-data; boundary=edge"
+    return server.request("POST", f"/trials/{number}/recording", body, Content_Type=kind, **sent)
+
+
+def problem(response: Response) -> str:
+    """Return the sentence of a page that refuses a form."""
+    found = re.search(r'role="alert"[^>]*>(.*?)</p>', response.text, re.DOTALL)
+    assert found is not None, response.text
+    return found[1].replace("&#39;", "'").replace("&#34;", '"')
+
+
+def test_every_response_has_the_security_headers(server: Server, page: Response) -> None:
+    for path in ("/", "/static/page.css", "/nothing", "/events-that-are-not", "/trials/0/files/task.json"):
+        answer = server.request("GET", path, Cookie=page.cookie)
+        assert {name.lower() for name in HEADERS} <= {name.lower() for name in answer.headers}, path
+        assert "server" not in answer.headers
+    assert "'unsafe" not in page.headers["content-security-policy"]
+    assert "<script>" not in page.text
+    assert "style=" not in page.text
+
+
+def test_the_session_is_a_cookie_that_scripts_and_other_sites_do_not_get(page: Response, server: Server) -> None:
+    said = page.headers["set-cookie"].lower()
+    assert "httponly" in said
+    assert "samesite=strict" in said
+    assert said.startswith(f"ctxval-session-{server.port}=")
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "", "192.168.0.7"])
+def test_another_host_is_refused(server: Server, page: Response, host: str) -> None:
+    """A page of another site can direct its own name to this computer (DNS rebinding)."""
+    answer = server.request("GET", "/", Host=host, Cookie=page.cookie)
+    assert answer.status == 403
+    assert "is not called" in answer.text
+
+
+@pytest.mark.parametrize("host", ["localhost", "LOCALHOST:{port}", "127.0.0.1:{port}", "[::1]:{port}"])
+def test_names_of_this_computer_are_accepted(server: Server, host: str) -> None:
+    assert server.request("GET", "/", Host=host.format(port=server.port)).status == 200
+
+
+@pytest.mark.parametrize(
+    ("headers", "sentence"),
+    [
+        ({"Origin": "http://evil.example"}, "sent by another site"),
+        ({"Origin": "null"}, "sent by another site"),
+        ({"Origin": "http://127.0.0.1:1"}, "sent by another site"),
+        ({"Sec_Fetch_Site": "cross-site"}, "sent by another site"),
+        ({"Sec_Fetch_Site": "same-site"}, "sent by another site"),
+        ({"Origin": None, "Sec_Fetch_Site": "cross-site"}, "does not say which site"),
+        ({"Origin": None, "Sec_Fetch_Site": None}, "does not say which site"),
+    ],
+)
+def test_a_form_of_another_site_is_refused(
+    server: Server, page: Response, folder: Path, headers: dict[str, str | None], sentence: str
+) -> None:
+    answer = post(server, "/trials/0/failure", page, {"reason": "forged"}, **headers)
+    assert (answer.status, sentence in answer.text) == (403, True)
+    assert trials(folder)[0].state == "open"
+
+
+def test_a_form_needs_the_token_of_its_session(server: Server, page: Response, folder: Path) -> None:
+    other = server.request("GET", "/")
+    for fields in ({"token": "x"}, {"token": ""}, {"token": other.token}, {"token": page.token[:-1] + "\udcff"}):
+        sent = {name: value.encode("utf-8", "replace").decode() for name, value in fields.items()}
+        answer = post(server, "/trials/0/failure", page, {"reason": "forged", **sent})
+        assert answer.status == 403
+        assert "earlier start of the server" in problem(answer)
+    assert post(server, "/trials/0/failure", page, {"reason": "forged"}, Cookie=None).status == 403
+    forged = f"{page.cookie.partition('.')[0]}.{'0' * 64}"
+    assert post(server, "/trials/0/failure", page, {"reason": "forged"}, Cookie=forged).status == 403
+    assert trials(folder)[0].state == "open"
+
+
+def test_another_site_cannot_embed_or_read_the_page_but_may_link_to_it(server: Server, page: Response) -> None:
+    fetched = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "no-cors", "Sec_Fetch_Dest": "image"}
+    assert server.request("GET", "/pictures/distance.svg", Cookie=page.cookie, **fetched).status == 403
+    linked = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate", "Sec_Fetch_Dest": "document"}
+    assert server.request("GET", "/", Cookie=page.cookie, **linked).status == 200
+    framed = {**linked, "Sec_Fetch_Dest": "iframe"}
+    assert server.request("GET", "/", Cookie=page.cookie, **framed).status == 403
+
+
+def test_an_upload_that_is_too_large_is_refused_while_it_arrives(server: Server, page: Response, folder: Path) -> None:
+    sent = {
+        "Cookie": page.cookie,
+        "Origin": f"http://127.0.0.1:{server.port}",
+        "Sec_Fetch_Site": "same-origin",
+        "Content_Type": "multipart/form-data; boundary=edge",
+    }
+    declared = server.request("POST", "/trials/0/recording", b"", Content_Length=str(MOST_UPLOAD + 1), **sent)
+    assert (declared.status, "too large" in declared.text) == (413, True)
+    delivered = 0
+
+    def endless() -> Iterator[bytes]:
+        nonlocal delivered
+        yield b'--edge\r\nContent-Disposition: form-data; name="file"; filename="a.csv"\r\n\r\n'
+        while delivered <= 2 * MOST_UPLOAD:
+            delivered += 2**20
+            yield bytes(2**20)
+
+    try:
+        answer = server.request("POST", "/trials/0/recording", endless(), **sent)
+    except (BrokenPipeError, ConnectionResetError):
+        pass  # the server has closed the connection
+    else:
+        assert answer.status == 413
+    assert delivered < 2 * MOST_UPLOAD
+    assert trials(folder)[0].state == "open"
+    assert server.request("GET", "/").status == 200
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "sentence"),
+    [
+        ("failure", {"reason": "  "}, "a failure needs a reason"),
+        ("distance", {"distance": "far"}, "the distance must be a number, got 'far'."),
+        ("distance", {"distance": "nan"}, "the distance must be a number, got 'nan'."),
+        ("distance", {"distance": "-1"}, "must be"),
+        ("recording", {}, "choose the file of the recording"),
+    ],
+)
+def test_a_form_that_cannot_be_used_is_refused_in_place(
+    server: Server, page: Response, folder: Path, kind: str, fields: dict[str, str], sentence: str
+) -> None:
+    answer = post(server, f"/trials/0/{kind}", page, fields)
+    assert (answer.status, sentence in problem(answer)) == (422, True), problem(answer)
+    assert f'id="{kind}-0-problem"' in answer.text
+    assert trials(folder)[0].state == "open"
+
+
+@pytest.mark.parametrize(
+    ("content", "fields", "sentence"),
+    [
+        (b"", {}, "run.csv must have a header and at least two rows."),
+        (b"a,b\n1,2\n3,4\n", {}, "run.csv must have the columns t, position [m], speed [m/s], force [N]; it has a, b."),
+        (SHORT, {}, "must have 21 times"),
+        (b"\x00\xff\xfe", {}, "run.csv cannot be read as CSV"),
+        (b"t,position [ft],speed,force\n0,0,0,1\n0.1,0,0,1\n", {}, "ft"),
+        (
+            b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n",
+            {"tolerance": "wide"},
+            "the start tolerance must be a number",
+        ),
+        (b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n", {"tolerance": "-1"}, "the start tolerance must be a finite"),
+        (b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n", {"resample": "on"}, "ends after 0.1 s, and 2 s are needed"),
+    ],
+)
+def test_a_wrong_file_is_refused_as_tell_refuses_it(
+    server: Server, page: Response, folder: Path, content: bytes, fields: dict[str, str], sentence: str
+) -> None:
+    answer = upload(server, 0, page, content, **fields)
+    assert (answer.status, sentence in problem(answer)) == (422, True), problem(answer)
+    assert "/tmp" not in problem(answer)
+    assert trials(folder)[0].state == "open"
+
+
+@pytest.mark.parametrize(
+    "name", ["../../evil.csv", "..\\\\evil.csv", ".csv", "a" * 300 + ".csv", "<b>.csv", "x\x01.npz"]
+)
+def test_the_name_of_an_upload_leads_nowhere(server: Server, page: Response, name: str) -> None:
+    answer = upload(server, 0, page, b"nothing", name)
+    assert answer.status in (400, 422)
+    assert "<b>" not in answer.text
+    assert "../" not in problem(answer)
+
+
+def test_nonsense_is_refused(server: Server, page: Response) -> None:
+    assert post(server, "/trials/0/nothing", page, {}).status == 404
+    assert post(server, "/trials/99999999999999999999/failure", page, {"reason": "a"}).status == 422
+    assert post(server, "/trials/7/failure", page, {"reason": "a"}).status == 422
+    assert post(server, "/choose", page, {"seen": "1"}).status == 422
+    assert post(server, "/choose", page, {"how": "own", "seen": "1", "parameter-0": "9"}).status == 422
+    assert post(server, "/choose", page, {"how": "again", "seen": "1", "trial": "x"}).status == 422
+    broken = server.request(
+        "POST",
+        "/trials/0/recording",
+        b"nothing",
+        Cookie=page.cookie,
+        Origin=f"http://127.0.0.1:{server.port}",
+        Content_Type="multipart/form-data; boundary=edge",
+    )
+    assert broken.status in (400, 403)
+    for path in (
+        "/trials/0/files/..%2f..%2fa",
+        "/trials/3/files/task.json",
+        "/pictures/nothing.svg",
+        "/static/..%2fapp.py",
+    ):
+        assert server.request("GET", path, Cookie=page.cookie).status == 404, path
+    assert server.request("DELETE", "/", Cookie=page.cookie, Origin=f"http://127.0.0.1:{server.port}").status == 405
+
+
+def test_files_are_those_that_ask_writes(server: Server, page: Response, folder: Path) -> None:
+    archive = server.request("GET", "/trials/0/files/task.json", Cookie=page.cookie)
+    assert archive.text == (folder / "a.trials" / "0" / "task.json").read_text()
+    assert archive.headers["content-disposition"] == 'attachment; filename="trial-0-task.json"'
+
+
+def wait_for(server: Server, text: str, page: Response, seconds: float = 60) -> str:
+    """Load the page again until it has a text."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        found = server.request("GET", "/", Cookie=page.cookie).text
+        if text in found:
+            return found
+        time.sleep(0.1)
+    raise AssertionError(f"{text!r} is not in {found}")
+
+
+def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
+    new_store(tmp_path)
+    recording = record(tmp_path / "a.trials" / "0", tmp_path / "run.csv").read_bytes()
+    with serving(tmp_path) as server:
+        page = server.request("GET", "/")
+        told = upload(server, 0, page, recording, submission="one")
+        assert (told.status, told.headers["location"]) == (303, "/?told=0#message")
+        again = upload(server, 0, page, recording, submission="one")
+        assert again.status == 303  # the same form, sent twice
+        second = upload(server, 0, page, recording, submission="two")
+        assert second.status == 409
+        assert "Your result of trial 0 is not stored, because the trial has ended already" in problem(second)
+
+        asked = post(server, "/choose", page, {"how": "next", "seen": "1"})
+        assert asked.status == 303
+        wait_for(server, 'id="trial-1"', page)
+        stale = post(server, "/choose", page, {"how": "next", "seen": "1"})
+        assert (stale.status, "as trial 1" in problem(stale)) == (409, True)
+        assert post(server, "/trials/1/failure", page, {"reason": "the motor cut out"}).status == 303
+
+        asked = post(
+            server, "/choose", page, {"how": "again", "trial": "1", "because": "motor <replaced>", "seen": "2"}
+        )
+        assert asked.status == 303
+        found = wait_for(server, 'id="trial-2"', page)
+        assert "Since the last execution of this task: motor &lt;replaced&gt;." in found
+        assert post(server, "/trials/2/distance", page, {"distance": "0.04"}).status == 303
+        assert post(server, "/choose", page, {"how": "own", "parameter-0": "1.5", "seen": "3"}).status == 303
+        wait_for(server, 'id="trial-3"', page)
+        assert post(server, "/choose", page, {"how": "draw", "seen": "4"}).status == 303
+        wait_for(server, 'id="trial-4"', page)
+        wait_for(server, "/pictures/distance.svg", page)
+        picture = server.request("GET", "/pictures/distance.svg", Cookie=page.cookie)
+        assert picture.text.startswith("<?xml")
+        assert "sandbox" in picture.headers["content-security-policy"]
+        found = zipfile.ZipFile(io.BytesIO(server.request("GET", "/trials/3/files.zip", Cookie=page.cookie).content))
+        files = [f"trial-3/{name}" for name in ("controller.json", "controller.npz", "model.csv", "task.json")]
+        assert sorted(found.namelist()) == files
+        status, said = server.stop()
+    assert (status, "stopped. All executions are stored" in said) == (130, True)
+    stored = trials(tmp_path)
+    assert [(trial.state, trial.origin) for trial in stored] == [
+        ("completed", "initial"),
+        ("failed", "acquisition"),
+        ("completed", "manual"),
+        ("open", "manual"),
+        ("open", "iid"),
+    ]
+    assert stored[2].because == "motor <replaced>"
+    assert stored[3].parameters == {"goal": 1.5}
+
+
+def test_the_choices_are_those_of_the_command_line(tmp_path: Path) -> None:
+    by_hand, by_page = tmp_path / "hand", tmp_path / "page"
+    for folder in (by_hand, by_page):
+        folder.mkdir()
+        new_store(folder)
+    for number in range(2):
+        ctxval("tell", "a.sqlite", str(number), "--distance", "0.25", folder=by_hand)
+        ctxval("ask", "a.sqlite", folder=by_hand)
+    with serving(by_page) as server:
+        page = server.request("GET", "/")
+        for number in range(2):
+            assert post(server, f"/trials/{number}/distance", page, {"distance": "0.25"}).status == 303
+            assert post(server, "/choose", page, {"how": "next", "seen": str(number + 1)}).status == 303
+            wait_for(server, f'id="trial-{number + 1}"', page)
+    for one, other in zip(trials(by_hand), trials(by_page), strict=True):
+        assert one.unit_point.tobytes() == other.unit_point.tobytes()
+        assert one.note == other.note
+
+
+def test_other_computers_need_the_token(tmp_path: Path) -> None:
+    new_store(tmp_path)
+    with serving(tmp_path, "--host", "0.0.0.0") as server:
+        token = server.address.partition("?token=")[2]
+        assert len(token) == 32
+        bare = server.request("GET", "/")
+        assert (bare.status, "set-cookie" in bare.headers, "Trial 0" in bare.text) == (401, False, False)
+        for path in ("/events", "/trials/0/files/task.json", "/pictures/distance.svg"):
+            assert server.request("GET", path).status == 401
+        wrong = server.request("GET", "/?token=" + token[:-1])
+        assert (wrong.status, "set-cookie" in wrong.headers) == (401, False)
+        entered = server.request("GET", f"/?token={token}", Host=f"192.168.1.5:{server.port}")
+        assert (entered.status, token in entered.text) == (200, False)
+        page = server.request("GET", "/", Cookie=entered.cookie)
+        assert (page.status, "Trial 0" in page.text) == (200, True)
+        origin = f"http://127.0.0.1:{server.port}"
+        typed = {"Origin": origin, "Content_Type": "application/x-www-form-urlencoded"}
+        assert server.request("POST", "/enter", f"token={token}".encode(), **typed).status == 200
+        assert server.request("POST", "/enter", b"token=guess", **typed).status == 401
+        assert server.request("GET", "/", Host="evil.example", Cookie=entered.cookie).status == 403
+
+
+def test_a_name_can_be_allowed(tmp_path: Path) -> None:
+    new_store(tmp_path)
+    with serving(tmp_path, "--allow-host", "rig.example", "--threshold", "0.5") as server:
+        page = server.request("GET", "/", Host="rig.example")
+        assert (page.status, "0.5 m" in wait_for(server, "against 0.5 m", page)) == (200, True)
+
+
+def test_a_store_that_is_run_elsewhere_stays_usable(tmp_path: Path) -> None:
+    new_store(tmp_path)
+    elsewhere = Store.existing(tmp_path / "a.sqlite")
+    with serving(tmp_path) as server:
+        page = server.request("GET", "/")
+        with elsewhere.sole_writer():
+            assert post(server, "/choose", page, {"how": "next", "seen": "1"}).status == 303
+            found = wait_for(server, "waiting for another process that is running the store", page)
+            assert 'id="trial-0"' in found
+            assert post(server, "/trials/0/distance", page, {"distance": "0.25"}).status == 303
+        wait_for(server, 'id="trial-1"', page)
+        ctxval("tell", "a.sqlite", "1", "--failed", "the cable broke", folder=tmp_path)
+        wait_for(server, "the cable broke", page)
+    elsewhere.close()

@@ -1,0 +1,288 @@
+"""The operator's page in a real Chromium: what people at a rig do with it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from browser import accessibility_findings
+from ctxval.core.trial import Trial
+from ctxval.storage.store import Store
+from rig_page import ctxval, new_store, record, serving
+
+pytestmark = pytest.mark.slow
+
+WAIT = 60_000
+"""Milliseconds to wait for a choice or a verdict."""
+
+
+def stored(folder: Path) -> list[Trial]:
+    store = Store.existing(folder / "a.sqlite")
+    try:
+        return store.trials()
+    finally:
+        store.close()
+
+
+class Operator:
+    """A person with a browser of their own.
+
+    Attributes:
+        page: the page of playwright.
+        errors: what the browser's console said, and the requests to anywhere else.
+    """
+
+    def __init__(self, browser: Any, folder: Path, address: str, **options: Any) -> None:
+        self.context = browser.new_context(**options)
+        self.folder = folder
+        self.errors: list[str] = []
+        self.page = self.context.new_page()
+        self.page.on("console", lambda said: self.errors.append(said.text) if said.type in ("error", "warning") else 0)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("request", lambda request: request.url.startswith(address.partition("?")[0]) or self.note(request))
+        self.page.goto(address)
+
+    def note(self, request: Any) -> None:
+        self.errors.append(f"a request to {request.url}")
+
+    def choose(self) -> int:
+        """Choose the next task; return the number of its trial."""
+        seen = self.page.locator("section.open").count()
+        self.page.get_by_role("button", name=re.compile("Choose")).click()
+        return self.opened(seen)
+
+    def opened(self, before: int = 0) -> int:
+        """Wait for one more open trial with its files; return its number."""
+        last = self.page.locator("section.open").nth(before)
+        last.locator(".files").wait_for(timeout=WAIT)
+        return int(last.get_attribute("id").removeprefix("trial-"))
+
+    def files(self, number: int) -> Path:
+        """Download the task and the controller of a trial."""
+        folder = self.folder / f"download-{number}"
+        folder.mkdir(exist_ok=True)
+        for name in ("task.json", "controller.json"):
+            with self.page.expect_download() as download:
+                self.trial(number).get_by_role("link", name=name).click()
+            assert download.value.suggested_filename == f"trial-{number}-{name}"
+            download.value.save_as(folder / name)
+        return folder
+
+    def trial(self, number: int) -> Any:
+        return self.page.locator(f"#trial-{number}")
+
+    def upload(self, number: int, recording: Path) -> None:
+        """Report a recording, and wait for the answer."""
+        self.trial(number).get_by_label(f"Recording of trial {number}").set_input_files(recording)
+        with self.page.expect_navigation():
+            self.trial(number).get_by_role("button", name="Check and store the recording").click()
+
+    def message(self) -> str:
+        return str(self.page.locator("#message").inner_text())
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    new_store(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def address(folder: Path) -> Iterator[str]:
+    with serving(folder) as server:
+        yield server.address
+
+
+def test_a_whole_campaign_by_hand(browser: Any, folder: Path, address: str) -> None:
+    one = Operator(browser, folder, address, accept_downloads=True)
+    for number in range(5):
+        assert (one.opened() if number == 0 else one.choose()) == number
+        recording = record(one.files(number), folder / f"run{number}.csv")
+        one.upload(number, recording)
+        assert re.search(rf"Trial {number} has the distance 0\.\d+ m\.", one.message())
+        assert "told" not in one.page.url
+    one.page.locator(".answer").get_by_text("validated").wait_for(timeout=WAIT)
+    one.page.locator("#verdict .work").wait_for(state="detached", timeout=WAIT)
+    assert one.page.locator("#verdict img").evaluate_all("all => all.map((one) => one.naturalWidth > 0)") == [True] * 2
+    assert one.page.locator("#trials tbody tr").count() == 5
+    assert "with confidence 0.95" in one.page.locator("#verdict").inner_text()
+    assert accessibility_findings(one.page) == []
+    assert one.errors == []
+    assert [trial.state for trial in stored(folder)] == ["completed"] * 5
+
+
+def test_a_wrong_file_is_refused_in_place_and_the_right_one_taken(browser: Any, folder: Path, address: str) -> None:
+    one = Operator(browser, folder, address, accept_downloads=True)
+    number = one.opened()
+    files = one.files(number)
+    one.upload(number, record(files, folder / "short.csv", steps=7))
+    problem = one.trial(number).get_by_role("alert")
+    assert problem.inner_text() == "The trajectory must have 21 times, 20 steps of 0.1 s, got 7."
+    assert problem.evaluate("one => one === document.activeElement")
+    assert one.page.title().startswith("Error: ")
+    described = one.trial(number).locator("input[type=file]").get_attribute("aria-describedby")
+    assert problem.get_attribute("id") in described
+    assert accessibility_findings(one.page) == []
+    assert stored(folder)[0].state == "open"
+    large = folder / "large.csv"
+    with large.open("wb") as file:
+        file.truncate(65 * 2**20)
+    one.trial(number).locator("input[type=file]").set_input_files(large)
+    one.trial(number).get_by_role("button", name="Check and store").click()
+    assert "too large: at most 64 MiB" in one.trial(number).get_by_role("alert").inner_text()
+    one.upload(number, record(files, folder / "run.csv"))
+    assert one.message().startswith("Trial 0 has the distance")
+    assert one.errors == ["Failed to load resource: the server responded with a status of 422 (Unprocessable Content)"]
+
+
+def test_two_operators_lose_and_double_nothing(browser: Any, folder: Path, address: str) -> None:
+    first = Operator(browser, folder, address, accept_downloads=True)
+    second = Operator(browser, folder, address, accept_downloads=True)
+    number = first.opened()
+    recording = record(first.files(number), folder / "run.csv")
+    second.opened()
+    second.trial(number).get_by_label(f"Recording of trial {number}").set_input_files(recording)
+    first.upload(number, recording)
+    told = second.trial(number).get_by_role("alert")
+    told.wait_for(timeout=WAIT)
+    assert told.inner_text() == "This trial has ended in the meantime: somebody else recorded its result."
+    with second.page.expect_navigation():
+        second.trial(number).get_by_role("button", name="Check and store the recording").click()
+    assert re.match(
+        r"Your result of trial 0 is not stored, because the trial has ended already: trial 0 has the distance",
+        second.message(),
+    )
+    assert second.page.locator("section.open").count() == 0
+
+    second.page.get_by_text("Other ways to choose a task").click()
+    second.page.get_by_label("goal [m], from 0.5 to 2").fill("1.25")
+    assert first.choose() == 1
+    second.trial(1).wait_for(timeout=WAIT)
+    assert second.page.get_by_label("goal [m], from 0.5 to 2").input_value() == "1.25"
+    assert [(trial.state, trial.executed) for trial in stored(folder)] == [("completed", True), ("open", False)]
+    assert first.errors == []
+
+
+def test_a_reload_midway_loses_nothing(browser: Any, tmp_path: Path) -> None:
+    new_store(tmp_path, "my_rig:slow")
+    with serving(tmp_path) as server:
+        one = Operator(browser, tmp_path, server.address)
+        one.opened()
+        one.page.get_by_role("button", name="Choose another task").click()
+        one.page.locator("#choosing progress").wait_for()
+        one.page.reload()
+        assert one.page.locator("#choosing progress").count() == 1
+        one.trial(0).get_by_text("It failed, or there is no recording").click()
+        one.trial(0).get_by_label("Reason").fill("the motor cut")
+        one.trial(1).wait_for(timeout=WAIT)
+        assert one.trial(0).get_by_label("Reason").input_value() == "the motor cut"
+        assert one.page.locator("#news").inner_text() == "Trial 1 is open."
+        one.trial(0).get_by_label("Reason").press("Enter")
+        one.page.get_by_text("Trial 0 failed: the motor cut.").wait_for()
+        one.page.reload()
+        assert one.message() == ""
+        one.page.get_by_role("button", name="Choose another task").click()
+        one.page.locator("#choosing progress").wait_for()
+        server.process.kill()
+        server.process.wait()
+    assert [trial.state for trial in stored(tmp_path)][:2] == ["failed", "open"]
+    with serving(tmp_path) as server:
+        again = Operator(browser, tmp_path, server.address)
+        again.trial(1).locator(".files").wait_for(timeout=WAIT)
+        assert again.page.locator("#trials tbody tr").count() == len(stored(tmp_path))
+
+
+def test_hostile_names_are_text(browser: Any, tmp_path: Path) -> None:
+    new_store(tmp_path, "my_rig:hostile")
+    with serving(tmp_path) as server:
+        one = Operator(browser, tmp_path, server.address)
+        dialogs: list[str] = []
+        one.page.on("dialog", lambda dialog: (dialogs.append(dialog.message), dialog.dismiss()))
+        one.opened()
+        one.trial(0).get_by_text("It failed, or there is no recording").click()
+        one.trial(0).get_by_label("Distance in").fill("0.1")
+        one.trial(0).get_by_label("Distance in").press("Enter")
+        one.page.locator("#verdict img").first.wait_for(timeout=WAIT)
+        ctxval("ask", "a.sqlite", folder=tmp_path)
+        ctxval("tell", "a.sqlite", "1", "--failed", "<img src=x onerror=alert(2)>\x1b[2J\u202e", folder=tmp_path)
+        one.page.locator("#trials tr.failed").wait_for(timeout=WAIT)
+        text = one.page.locator("body").inner_text()
+        assert "<script>document.title='run'</script><img src=x onerror=alert(1)>" in text
+        assert "{{7*7}}" in text
+        assert r"<img src=x onerror=alert(2)>\x1b[2J\u202e" in text
+        assert one.page.title() != "run"
+        assert dialogs == []
+        assert one.page.locator("img[src=x]").count() == 0
+        assert accessibility_findings(one.page) == []
+        assert one.errors == []
+
+
+def test_everything_works_without_javascript(browser: Any, folder: Path, address: str) -> None:
+    one = Operator(browser, folder, address, java_script_enabled=False, accept_downloads=True)
+    for number in range(2):
+        while one.page.locator(f"#trial-{number} .files").count() == 0:
+            one.page.wait_for_timeout(300)
+            one.page.goto(address)
+        one.upload(number, record(one.files(number), folder / "run.csv"))
+        assert one.message().startswith(f"Trial {number} has the distance")
+        one.page.get_by_role("button", name="Choose the next task").click()
+    assert [trial.state for trial in stored(folder)][:2] == ["completed"] * 2
+
+
+def test_the_keyboard_reaches_everything_in_order(browser: Any, folder: Path, address: str) -> None:
+    one = Operator(browser, folder, address)
+    one.opened()
+    reached = []
+    for _ in range(12):
+        one.page.keyboard.press("Tab")
+        reached.append(one.page.evaluate("document.activeElement.innerText || document.activeElement.name"))
+    assert reached == [
+        *("To the next task", "Choose another task", "Other ways to choose a task"),
+        *("task.json", "controller.json", "controller.npz", "model.csv", "all files (zip)"),
+        *("file", "If the recording does not match", "Check and store the recording"),
+        "It failed, or there is no recording",
+    ]
+    one.page.keyboard.press("Enter")
+    one.page.keyboard.press("Tab")
+    one.page.keyboard.type("the cable broke")
+    one.page.keyboard.press("Enter")
+    one.page.get_by_text("Trial 0 failed: the cable broke.").wait_for()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_fits_a_small_screen_and_is_accessible(browser: Any, folder: Path, address: str, scheme: str) -> None:
+    ctxval("tell", "a.sqlite", "0", "--distance", "3", folder=folder)
+    ctxval("ask", "a.sqlite", folder=folder)
+    one = Operator(browser, folder, address, viewport={"width": 400, "height": 800}, color_scheme=scheme)
+    one.opened()
+    one.page.locator(".answer").get_by_text("falsified").wait_for(timeout=WAIT)
+    for summary in one.page.locator("summary").all():
+        summary.click()
+    assert accessibility_findings(one.page) == []
+    assert one.page.evaluate("document.documentElement.scrollWidth") <= 400
+    small = one.page.locator("button:visible, .files a:visible").evaluate_all(
+        "all => all.filter((one) => one.getBoundingClientRect().height < 40).map((one) => one.innerText)"
+    )
+    assert small == []
+    assert one.errors == []
+
+
+def test_the_entrance_is_accessible_and_the_token_leaves_the_address(browser: Any, folder: Path) -> None:
+    with serving(folder, "--host", "0.0.0.0", "--allow-host", "localhost") as server:
+        bare = f"http://127.0.0.1:{server.port}/"
+        one = Operator(browser, folder, bare)
+        assert accessibility_findings(one.page) == []
+        one.page.get_by_label("Token").fill("a wrong token of many letters")
+        one.page.get_by_role("button", name="Open the page").click()
+        assert one.page.get_by_role("alert").inner_text() == "This is not the token of this server."
+        token = server.address.partition("?token=")[2]
+        one.page.get_by_label("Token").fill(token)
+        one.page.get_by_role("button", name="Open the page").click()
+        one.opened()
+        two = Operator(browser, folder, f"{bare}?token={token}")
+        two.opened()
+        assert two.page.url == bare
