@@ -15,7 +15,8 @@ document.addEventListener("input", (event) => {
 function isInUse(section) {
   const active = document.activeElement;
   const field = active && active.matches("input, select, textarea") && section.contains(active);
-  return section.dataset.typed === "yes" || field;
+  // The reason why a form was not accepted stays until the operator sends the form again.
+  return section.dataset.typed === "yes" || field || section.querySelector("[data-focus]") !== null;
 }
 
 function replace(old, fresh) {
@@ -133,8 +134,11 @@ function problem(form, sentence) {
   place.textContent = sentence;
 }
 
-const refused = document.querySelector("[data-focus]");
-if (refused) refused.focus();
+// After the load, because a browser that goes to the fragment of an address takes the focus away.
+window.addEventListener("load", () => {
+  const refused = document.querySelector("[data-focus]");
+  if (refused) setTimeout(() => refused.focus());
+});
 // The address of a page with a result must not show the result again after a reload.
 if (location.search.includes("told=")) history.replaceState(null, "", "/");
 listen();
