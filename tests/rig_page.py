@@ -143,9 +143,9 @@ class Response:
 
 
 @contextmanager
-def serving(folder: Path, *arguments: str, store: str = "a.sqlite") -> Iterator[Server]:
-    """Serve a store on a free port."""
-    command = [*COMMAND, "serve", store, "--port", "0", *arguments]
+def serving(folder: Path, *arguments: str, port: int = 0) -> Iterator[Server]:
+    """Serve the store of a folder; port 0 is any free one."""
+    command = [*COMMAND, "serve", "a.sqlite", "--port", str(port), *arguments]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(
         command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
@@ -162,6 +162,9 @@ def serving(folder: Path, *arguments: str, store: str = "a.sqlite") -> Iterator[
     finally:
         if process.poll() is None:
             server.stop()
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                stream.close()
 
 
 def new_store(folder: Path, reference: str = "my_rig:experiment") -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ import pytest
 PAGES = sorted((Path(__file__).parents[1] / "docs" / "how-to").glob("*.md"))
 NEEDS = {"gymnasium": ["gymnasium", "mujoco"], "mujoco": ["mujoco"], "fmu": ["fmpy", "pythonfmu"], "mpc": ["casadi"]}
 NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-space": ["control"]}
+NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
 PROGRAMS: dict[str, list[str]] = {"python": [], "ctxval": ["-c", "from ctxval.cli import main; main()"]}
 
 
@@ -22,10 +25,30 @@ def blocks(page: Path) -> list[tuple[str, str]]:
     return re.findall(r"^```(\w+)\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
 
 
+def require_server(command: list[str]) -> None:
+    """Check that a server starts, at a free port, that its page can be read, and that Ctrl-C stops it."""
+    process = subprocess.Popen(
+        [*command, "--port", "0"], stdout=subprocess.PIPE, env={**os.environ, "PYTHONUNBUFFERED": "1"}, text=True
+    )
+    assert process.stdout is not None
+    try:
+        place = re.search(r":(\d+/\S*)$", process.stdout.readline().strip())
+        assert place is not None
+        with urllib.request.urlopen(f"http://127.0.0.1:{place[1]}") as page:
+            assert page.status == 200
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=30)
+    assert process.returncode == 130
+
+
 def run_console(lines: str) -> None:
     for line in lines.splitlines():
-        program, *arguments = shlex.split(line.removeprefix("$ "), comments=True)
+        program, *arguments = shlex.split(line.removeprefix("$ ").removesuffix(" &"), comments=True)
         command = [sys.executable, *PROGRAMS[program], *arguments]
+        if line.endswith(" &"):
+            require_server(command)
+            continue
         done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "100"})
         assert done.returncode == 0, line + done.stdout + done.stderr
 

@@ -141,7 +141,7 @@ def test_a_form_needs_the_token_of_its_session(server: Server, page: Response, f
         sent = {name: value.encode("utf-8", "replace").decode() for name, value in fields.items()}
         answer = post(server, "/trials/0/failure", page, {"reason": "forged", **sent})
         assert answer.status == 403
-        assert "earlier start of the server" in problem(answer)
+        assert "The server was started again" in problem(answer)
     assert post(server, "/trials/0/failure", page, {"reason": "forged"}, Cookie=None).status == 403
     forged = f"{page.cookie.partition('.')[0]}.{'0' * 64}"
     assert post(server, "/trials/0/failure", page, {"reason": "forged"}, Cookie=forged).status == 403

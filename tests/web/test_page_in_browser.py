@@ -196,10 +196,19 @@ def test_a_reload_midway_loses_nothing(browser: Any, tmp_path: Path) -> None:
         server.process.kill()
         server.process.wait()
     assert [trial.state for trial in stored(tmp_path)][:2] == ["failed", "open"]
-    with serving(tmp_path) as server:
-        again = Operator(browser, tmp_path, server.address)
-        again.trial(1).locator(".files").wait_for(timeout=WAIT)
-        assert again.page.locator("#trials tbody tr").count() == len(stored(tmp_path))
+    one.page.get_by_text("There is no connection to the server.").wait_for(timeout=WAIT)
+    one.trial(1).get_by_text("It failed, or there is no recording").click()
+    one.trial(1).get_by_label("Reason").fill("the power failed")
+    with serving(tmp_path, port=server.port):
+        one.page.locator("#connection", has_not_text="There is no connection").wait_for(state="attached", timeout=WAIT)
+        fields = one.page.locator("#trial-1 input[name=token]")
+        before = fields.first.get_attribute("value")
+        one.page.wait_for_function(
+            "before => document.querySelector('#trial-1 input[name=token]').value !== before", arg=before
+        )
+        one.trial(1).get_by_label("Reason").press("Enter")
+        one.page.get_by_text("Trial 1 failed: the power failed.").wait_for()
+        assert one.page.locator("#trials tbody tr").count() == len(stored(tmp_path))
 
 
 def test_hostile_names_are_text(browser: Any, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from importlib.resources import files as resources
 from typing import Any
 
+import python_multipart  # noqa: F401 (starlette reads forms with it, and would miss it only then)
 from starlette.applications import Starlette
 from starlette.datastructures import FormData, UploadFile
 from starlette.formparsers import MultiPartException
@@ -36,7 +37,10 @@ _KINDS = ("recording", "distance", "failure")
 
 _TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
-_OUT_OF_DATE = "This page is from an earlier start of the server. Its fields are kept, a file must be chosen again."
+_OUT_OF_DATE = (
+    "The server was started again after this page was loaded, and nothing is stored yet. Send the form once more; a "
+    "file must be chosen again."
+)
 
 Handler = Callable[[Request, str], Awaitable[Response]]
 
@@ -81,9 +85,7 @@ class OperatorPage:
             return HTMLResponse(self.page.enter(), 401)
         if session is not None:
             return HTMLResponse(self._campaign(request, session))
-        cookie = self.access.new_session()
-        session = self.access.session({self.access.cookie: cookie})
-        assert session is not None
+        session, cookie = self._new_session()
         return self._with_cookie(HTMLResponse(self._campaign(request, session)), cookie)
 
     async def enter(self, request: Request) -> Response:
@@ -106,7 +108,11 @@ class OperatorPage:
         return response
 
     def _inside(self, handler: Handler) -> Callable[[Request], Awaitable[Response]]:
-        """Return a handler that is called with the name of the session, and only if there is one."""
+        """Return a handler that is called with the name of the session.
+
+        A browser that needs no token gets a new session. The token of a form cannot be one of that session, so the form
+        is refused with its fields kept: the page was open while the server was started again.
+        """
 
         async def handle(request: Request) -> Response:
             session = self.access.session(request.cookies)
@@ -114,9 +120,17 @@ class OperatorPage:
                 return await handler(request, session)
             if self.access.needs_token:
                 return HTMLResponse(self.page.enter("Your session has ended. Nothing was stored."), 401)
-            return HTMLResponse(self.page.message("Open the page again", _OUT_OF_DATE), 403)
+            session, cookie = self._new_session()
+            return self._with_cookie(await handler(request, session), cookie)
 
         return handle
+
+    def _new_session(self) -> tuple[str, str]:
+        """Return the name and the cookie of a new session."""
+        cookie = self.access.new_session()
+        session = self.access.session({self.access.cookie: cookie})
+        assert session is not None
+        return session, cookie
 
     # Forms
 
@@ -251,10 +265,14 @@ class OperatorPage:
 def _event(kind: str, content: Any) -> str:
     if kind == "heartbeat":
         return ": the server is there\n\n"
-    if isinstance(content, Work):
-        stage = content.stage
-        content = {"text": stage.text, "done": stage.done, "expected": stage.expected, "seconds": content.seconds}
+    if kind == "work":
+        content = {name: _plain(work) for name, work in content.items()}
     return f"event: {kind}\ndata: {json.dumps(content)}\n\n"
+
+
+def _plain(work: Work) -> dict[str, Any]:
+    stage = work.stage
+    return {"text": stage.text, "done": stage.done, "expected": stage.expected, "seconds": work.seconds}
 
 
 def _texts(form: FormData) -> dict[str, str]:

@@ -114,7 +114,6 @@ class Page:
             again=[(trial.number, in_words(trial, description.space.units)) for trial in shown if trial.executed],
             parameters=self._parameters(),
             worst=None if snapshot.worst is None else self._row(snapshot.worst),
-            current=background.judged == snapshot.ended,
             news=self._news(),
             told=None if told is None else self.ended(told),
             problem=problem,

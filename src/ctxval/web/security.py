@@ -72,9 +72,10 @@ class Hosts:
     def permit(self, header: str | None) -> bool:
         """Return whether a Host header names this server."""
         try:
-            name = urlsplit(f"//{header or ''}").hostname
+            place = urlsplit(f"//{header or ''}")
         except ValueError:
             return False
+        name = None if "@" in place.netloc else place.hostname
         return bool(name) and (name in self.names or (self.any_address and is_address(str(name))))
 
     def __repr__(self) -> str:

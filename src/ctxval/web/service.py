@@ -86,14 +86,14 @@ class CampaignService:
         description: what does not change.
         snapshot: the trials as they were last read.
         background: what the background processes have found.
-        version: a number that grows with each change.
+        version: a number that grows with each change, also when the server is started again.
     """
 
     def __init__(self, desk: Desk, reopen: OpenCampaign) -> None:
         self._desk, self._reopen = desk, reopen
         self.description, self.snapshot = desk.description, desk.first
         self.background = Background(files={})
-        self.version = 0
+        self.version = time.time_ns()  # it grows when the server is started again, too
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Task[Any]] = set()
         self._preparing: dict[int, asyncio.Task[None]] = {}
@@ -191,8 +191,9 @@ class CampaignService:
                 seen = self.version
                 yield "version", seen
             else:
-                work = self.background.choosing or self.background.judging
-                yield ("stage", work) if work is not None else ("heartbeat", None)
+                both = {"choosing": self.background.choosing, "judging": self.background.judging}
+                work = {name: one for name, one in both.items() if one is not None}
+                yield ("work", work) if work else ("heartbeat", None)
             try:
                 async with asyncio.timeout(_HEARTBEAT):
                     await changed.wait()

@@ -80,30 +80,33 @@ function say(sentence) {
 }
 
 // The server counts the work; between two of its messages, only the seconds go on.
-let work = null;
+let work = {};
 
 function showWork() {
-  const stage = document.getElementById("stage");
-  if (!stage || !work) return;
-  const seconds = work.seconds + Math.floor((Date.now() - work.at) / 1000);
-  const share = work.expected ? `, ${work.done} of ${work.expected}` : "";
-  stage.textContent = `${work.text}${share}, ${seconds} s`;
-  const bar = stage.parentElement.querySelector("progress");
-  if (work.expected) { bar.max = work.expected; bar.value = work.done; } else bar.removeAttribute("value");
+  for (const place of document.querySelectorAll("[data-stage]")) {
+    const name = place.dataset.stage;
+    work[name] = work[name] || { text: place.dataset.text, seconds: Number(place.dataset.seconds), at: Date.now() };
+    const { text, done, expected, seconds, at } = work[name];
+    const passed = seconds + Math.floor((Date.now() - at) / 1000);
+    place.textContent = `${text}${expected ? `, ${done} of ${expected}` : ""}, ${passed} s`;
+    const bar = place.parentElement.querySelector("progress");
+    if (expected) { bar.max = expected; bar.value = done; } else bar.removeAttribute("value");
+  }
 }
 
 function listen() {
   const source = new EventSource("/events");
   source.addEventListener("open", () => say(""));
-  source.addEventListener("error", () => say("There is no connection to the server. The page shows what it knew last."));
-  source.addEventListener("version", (event) => { if (event.data !== version) update(); });
-  source.addEventListener("stage", (event) => { work = { ...JSON.parse(event.data), at: Date.now() }; showWork(); });
-  setInterval(() => {
-    const stage = document.getElementById("stage");
-    if (!stage) { work = null; return; }
-    if (!work) work = { text: stage.textContent.replace(/, \d+ s$/, ""), seconds: Number(stage.dataset.started), at: Date.now() };
+  source.addEventListener("error", () => say(source.readyState === EventSource.CLOSED
+    ? "The session has ended. Load the page again."
+    : "There is no connection to the server. The page shows what it knew last."));
+  source.addEventListener("version", (event) => { work = {}; if (event.data !== version) update(); });
+  source.addEventListener("work", (event) => {
+    work = JSON.parse(event.data);
+    for (const one of Object.values(work)) one.at = Date.now();
     showWork();
-  }, 1000);
+  });
+  setInterval(showWork, 1000);
 }
 
 // A file that is too large is refused before it is sent, and a form is sent once.
