@@ -141,7 +141,7 @@ def test_a_form_needs_the_token_of_its_session(server: Server, page: Response, f
         sent = {name: value.encode("utf-8", "replace").decode() for name, value in fields.items()}
         answer = post(server, "/trials/0/failure", page, {"reason": "forged", **sent})
         assert answer.status == 403
-        assert "The server was started again" in problem(answer)
+        assert "the server was started again" in problem(answer)
     assert post(server, "/trials/0/failure", page, {"reason": "forged"}, Cookie=None).status == 403
     forged = f"{page.cookie.partition('.')[0]}.{'0' * 64}"
     assert post(server, "/trials/0/failure", page, {"reason": "forged"}, Cookie=forged).status == 403
@@ -295,7 +295,9 @@ def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
         assert again.status == 303  # the same form, sent twice
         second = upload(server, 0, page, recording, submission="two")
         assert second.status == 409
-        assert "Your result of trial 0 is not stored, because the trial has ended already" in problem(second)
+        assert "somebody else has recorded the result of this trial already: trial 0 has the distance" in problem(
+            second
+        )
 
         asked = post(server, "/choose", page, {"how": "next", "seen": "1"})
         assert asked.status == 303

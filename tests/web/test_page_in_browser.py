@@ -126,7 +126,7 @@ def test_a_wrong_file_is_refused_in_place_and_the_right_one_taken(browser: Any, 
     files = one.files(number)
     one.upload(number, record(files, folder / "short.csv", steps=7))
     problem = one.trial(number).get_by_role("alert")
-    assert problem.inner_text() == "The trajectory must have 21 times, 20 steps of 0.1 s, got 7."
+    assert problem.inner_text() == "Not stored: the trajectory must have 21 times, 20 steps of 0.1 s, got 7."
     one.page.locator("[data-focus]:focus").wait_for()
     assert one.page.title().startswith("Error: ")
     described = one.trial(number).locator("input[type=file]").get_attribute("aria-describedby")
@@ -158,7 +158,7 @@ def test_two_operators_lose_and_double_nothing(browser: Any, folder: Path, addre
     with second.page.expect_navigation():
         second.trial(number).get_by_role("button", name="Check and store the recording").click()
     assert re.match(
-        r"Your result of trial 0 is not stored, because the trial has ended already: trial 0 has the distance",
+        r"Not stored: somebody else has recorded the result of this trial already: trial 0 has the distance",
         second.message(),
     )
     assert second.page.locator("section.open").count() == 0

@@ -38,8 +38,7 @@ _KINDS = ("recording", "distance", "failure")
 _TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
 _OUT_OF_DATE = (
-    "The server was started again after this page was loaded, and nothing is stored yet. Send the form once more; a "
-    "file must be chosen again."
+    "the server was started again after this page was loaded. Send the form once more; a file must be chosen again."
 )
 
 Handler = Callable[[Request, str], Awaitable[Response]]
@@ -163,7 +162,7 @@ class OperatorPage:
                     return self._problem(request, session, Problem(where, _OUT_OF_DATE, fields, 403))
                 await self._tell(number, kind, form)
         except MultiPartException as error:
-            problem = Problem(where, f"The form cannot be read: {error.message}", fields, 400)
+            problem = Problem(where, f"the form cannot be read: {error.message}", fields, 400)
             return self._problem(request, session, problem)
         except CtxvalError as error:
             return self._problem(request, session, self._not_told(number, kind, error, fields))
@@ -188,7 +187,7 @@ class OperatorPage:
         sentence = shortened(str(error))
         ended = self.page.ended(number)
         if ended is not None:
-            sentence = f"Your result of trial {number} is not stored, because the trial has ended already: {ended}."
+            sentence = f"somebody else has recorded the result of this trial already: {ended}."
         status = 409 if ended is not None else 500 if isinstance(error, StoreError | CampaignError) else 422
         return Problem(self._where(number, kind), sentence, fields, status)
 

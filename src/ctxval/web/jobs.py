@@ -15,6 +15,7 @@ from ctxval.campaign.by_hand import write_files
 from ctxval.campaign.telling import parameters_of_trial
 from ctxval.campaign.trials import OpenTrial
 from ctxval.certificates import Certificate, Verdict
+from ctxval.certificates import judge as judge_trials
 from ctxval.certificates.bounds import with_error
 from ctxval.core.experiment import labels_of
 from ctxval.errors import InputError, StoreAccessError
@@ -144,12 +145,17 @@ def _files(served: ServedCampaign, opened: OpenTrial) -> Files:
 
 
 def judge(served: ServedCampaign, tell: TellStage) -> Judgement | None:
-    """Return the verdict on the present trials; None if there is no threshold."""
+    """Return the verdict on the trials that have ended; None if there is no threshold.
+
+    A certificate refuses open trials, because somebody may have left open what failed. At a rig a trial is nearly
+    always open, so the page judges the others, and says which ones do not count.
+    """
     if served.threshold is None:
         return None
     tell(Stage("computing the verdict"))
     served.campaign.refresh()
-    verdict = served.campaign.verdict(served.threshold, certificate=served.certificate)
+    ended = [trial for trial in served.campaign.trials if trial.state != "open"]
+    verdict = judge_trials(ended, served.threshold, served.certificate, served.campaign.provenance)
     return _judgement(verdict, verdict.certificate, served.experiment.units)
 
 
