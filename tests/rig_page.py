@@ -92,7 +92,7 @@ class Server:
     ) -> Response:
         """Send one request; an underscore in the name of a header is a hyphen, and None leaves a header out."""
         given = {name.replace("_", "-"): value for name, value in headers.items()}
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
         try:
             connection.putrequest(method, path, skip_host="Host" in given, skip_accept_encoding=True)
             chunked = body is not None and not isinstance(body, bytes)
@@ -112,7 +112,7 @@ class Server:
     def stop(self) -> tuple[int, str]:
         """Stop the server as Ctrl-C does; return its status and what it printed on stderr."""
         self.process.send_signal(signal.SIGINT)
-        _, said = self.process.communicate(timeout=30)
+        _, said = self.process.communicate(timeout=120)
         return self.process.returncode, said
 
 
@@ -154,7 +154,7 @@ def serving(folder: Path, *arguments: str, port: int = 0) -> Iterator[Server]:
     first = process.stdout.readline()
     found = re.search(r"http://\S+?:(\d+)/\S*", first)
     if found is None:
-        _, said = process.communicate(timeout=30)
+        _, said = process.communicate(timeout=120)
         raise AssertionError(f"{first}{said}")
     server = Server(process, found[0], int(found[1]))
     try:

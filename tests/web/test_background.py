@@ -15,6 +15,9 @@ from ctxval.web.background import BackgroundProcess, Stage, TellStage
 
 pytestmark = pytest.mark.slow
 
+WAIT = 120
+"""Seconds to wait for a process."""
+
 
 def open_nothing() -> Any:
     return "opened"
@@ -56,35 +59,35 @@ def process(stages: list[Stage]) -> Iterator[BackgroundProcess]:
 
 def test_jobs_run_one_after_the_other_in_one_other_process(process: BackgroundProcess, stages: list[Stage]) -> None:
     first, second = (process.submit(own_process, number) for number in (1, 2))
-    served, child, number = first.result(30)
+    served, child, number = first.result(WAIT)
     assert (served, number) == ("opened", 1)
     assert child != os.getpid()
-    assert second.result(30) == ("opened", child, 2)
+    assert second.result(WAIT) == ("opened", child, 2)
     assert stages[:2] == [Stage("loading the experiment"), Stage("working", 1, 2)]
 
 
 def test_a_job_that_fails_is_an_error_and_the_next_one_runs(process: BackgroundProcess) -> None:
     with pytest.raises(CampaignError, match="KeyboardInterrupt"):
-        process.submit(fail).result(30)
-    assert process.submit(own_process).result(30)[0] == "opened"
+        process.submit(fail).result(WAIT)
+    assert process.submit(own_process).result(WAIT)[0] == "opened"
 
 
 def test_a_process_that_dies_is_an_error_and_is_started_again(process: BackgroundProcess) -> None:
-    before = process.submit(own_process).result(30)[1]
+    before = process.submit(own_process).result(WAIT)[1]
     with pytest.raises(CampaignError, match=r"ended with the status -9\. Try again\."):
-        process.submit(die).result(30)
-    assert process.submit(own_process).result(30)[1] != before
+        process.submit(die).result(WAIT)
+    assert process.submit(own_process).result(WAIT)[1] != before
 
 
 def test_a_campaign_that_cannot_be_opened_is_an_error_of_the_job() -> None:
     process = BackgroundProcess(refuse, lambda stage: None)
     with pytest.raises(CampaignError, match=r"there is no such experiment\."):
-        process.submit(own_process).result(30)
+        process.submit(own_process).result(WAIT)
     process.close()
 
 
 def test_closing_ends_the_process_at_once(process: BackgroundProcess, stages: list[Stage]) -> None:
-    child = process.submit(own_process).result(30)[1]
+    child = process.submit(own_process).result(WAIT)[1]
     waiting = process.submit(wait)
     while Stage("waiting") not in stages:
         time.sleep(0.01)

@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -55,6 +56,7 @@ class BackgroundProcess:
         self._thread = cf.ThreadPoolExecutor(1, "background")
         self._process: Any = None
         self._pipe: Connection | None = None
+        self._lock = threading.Lock()  # a process must not start while this object is closed
         self._closed = False
 
     def submit(self, job: Job, *arguments: Any) -> cf.Future[Any]:
@@ -66,18 +68,20 @@ class BackgroundProcess:
 
     def close(self) -> None:
         """End the process with everything that it started. Work that is not stored yet is lost."""
-        self._closed = True
-        self._thread.shutdown(wait=False, cancel_futures=True)
-        if self._process is not None and self._process.is_alive():
-            _kill(self._process.pid)
-            self._process.join()
+        with self._lock:
+            self._closed = True
+            self._thread.shutdown(wait=False, cancel_futures=True)
+            if self._process is not None and self._process.is_alive():
+                _kill(self._process.pid)
+                self._process.join()
         self._thread.shutdown()
 
     def _do(self, job: Job, arguments: tuple[Any, ...]) -> Any:
-        if self._closed:
-            raise CampaignError("the server is being stopped.")
-        if self._process is None or not self._process.is_alive():
-            self._start()
+        with self._lock:
+            if self._closed:
+                raise CampaignError("the server is being stopped.")
+            if self._process is None or not self._process.is_alive():
+                self._start()
         assert self._pipe is not None
         try:
             self._pipe.send((job, arguments))
