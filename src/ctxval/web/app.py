@@ -270,8 +270,7 @@ def _event(kind: str, content: Any) -> str:
 
 
 def _plain(work: Work) -> dict[str, Any]:
-    stage = work.stage
-    return {"text": stage.text, "done": stage.done, "expected": stage.expected, "seconds": work.seconds}
+    return {"text": work.text, "done": work.stage.done, "expected": work.stage.expected, "seconds": work.seconds}
 
 
 def _texts(form: FormData) -> dict[str, str]:

@@ -27,12 +27,15 @@ class Stage:
 
     Attributes:
         text: the work, as the beginning of a sentence.
-        done, expected: how much of it is done; None if it cannot be counted.
+        done: how much of it is done.
+        expected: how much there will be in all; None if it is not known.
+        unit: what is counted, such as "designs".
     """
 
     text: str
-    done: float | None = None
+    done: float = 0.0
     expected: float | None = None
+    unit: str = ""
 
 
 TellStage = Callable[[Stage], None]

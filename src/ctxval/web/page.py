@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -120,6 +121,7 @@ class Page:
             given=_given(problem),
             token=form_token,
             version=service.version,
+            pictures={name: f"{zlib.crc32(image):08x}" for name, image in background.pictures.images.items()},
             most=MOST_UPLOAD,
             submission=lambda: secrets.token_urlsafe(12),
         )

@@ -36,15 +36,42 @@ class Work:
     Attributes:
         stage: what it does at present.
         started: the time of its start, on the clock of ``time.monotonic``.
+        reached: the time of the start of the stage.
     """
 
     stage: Stage
     started: float
+    reached: float
+
+    @staticmethod
+    def begun(stage: str) -> Work:
+        """Return work that begins now."""
+        now = time.monotonic()
+        return Work(Stage(stage), now, now)
+
+    def at(self, stage: Stage) -> Work:
+        """Return the same work at a later stage, or at the same one with another count."""
+        return replace(self, stage=stage, reached=self.reached if stage.text == self.stage.text else time.monotonic())
 
     @property
     def seconds(self) -> int:
         """Whole seconds since the start."""
         return int(time.monotonic() - self.started)
+
+    @property
+    def left(self) -> int | None:
+        """Expected seconds until the end of the stage; None if they cannot be estimated."""
+        done, expected = self.stage.done, self.stage.expected
+        if expected is None or not 0 < done <= expected:
+            return None
+        return round((time.monotonic() - self.reached) * (expected - done) / done)
+
+    @property
+    def text(self) -> str:
+        """The stage, how much of it is done, and how long it takes, in words."""
+        stage, unit = self.stage, f" {self.stage.unit}".rstrip()
+        counted = "" if stage.expected is None else f", {stage.done:g} of {stage.expected:g}{unit}"
+        return f"{stage.text}{counted}" + ("" if self.left is None else f", about {self.left} s left")
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +165,7 @@ class CampaignService:
                 f"another task was opened since this page was loaded, as trial {len(self.snapshot.trials) - 1}. If you "
                 "need one more task, ask again."
             )
-        work = Work(Stage("choosing a task"), time.monotonic())
-        self._update(choosing=work, choice_error=None, chosen=None)
+        self._update(choosing=Work.begun("choosing a task"), choice_error=None, chosen=None)
         self._spawn(self._choose(request))
 
     async def tell(self, number: int, report: Report, submission: str) -> Trial:
@@ -221,7 +247,7 @@ class CampaignService:
         if work is None:
             return
         counts = stage.text == work.stage.text
-        changes: dict[str, Any] = {kind: replace(work, stage=stage)}
+        changes: dict[str, Any] = {kind: work.at(stage)}
         self.background = replace(self.background, **changes)
         self.version += not counts
         self._notify()
@@ -277,7 +303,7 @@ class CampaignService:
         for number in waiting - set(files) - set(self._preparing):
             self._preparing[number] = self._spawn(self._prepare(number))
         if self.background.judging is None and self.background.judged != self.snapshot.ended:
-            self.background = replace(self.background, judging=Work(Stage("drawing the pictures"), time.monotonic()))
+            self.background = replace(self.background, judging=Work.begun("drawing the pictures"))
             self._spawn(self._evaluate())
 
     async def _prepare(self, number: int) -> None:

@@ -88,7 +88,7 @@ function showWork() {
     work[name] = work[name] || { text: place.dataset.text, seconds: Number(place.dataset.seconds), at: Date.now() };
     const { text, done, expected, seconds, at } = work[name];
     const passed = seconds + Math.floor((Date.now() - at) / 1000);
-    place.textContent = `${text}${expected ? `, ${done} of ${expected}` : ""}, ${passed} s`;
+    place.textContent = `${text}, ${passed} s`;
     const bar = place.parentElement.querySelector("progress");
     if (expected) { bar.max = expected; bar.value = done; } else bar.removeAttribute("value");
   }
