@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import signal
 import time
 import zipfile
 from collections.abc import Iterator
@@ -256,7 +257,8 @@ def test_nonsense_is_refused(server: Server, page: Response) -> None:
         Origin=f"http://127.0.0.1:{server.port}",
         Content_Type="multipart/form-data; boundary=edge",
     )
-    assert broken.status in (400, 403)
+    assert (broken.status, "the form cannot be read" in problem(broken)) == (400, True)
+    assert server.request("GET", f"/trials/{'1' * 5000}/files.zip", Cookie=page.cookie).status == 414
     for path in (
         "/trials/0/files/..%2f..%2fa",
         "/trials/3/files/task.json",
@@ -295,9 +297,7 @@ def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
         assert again.status == 303  # the same form, sent twice
         second = upload(server, 0, page, recording, submission="two")
         assert second.status == 409
-        assert "somebody else has recorded the result of this trial already: trial 0 has the distance" in problem(
-            second
-        )
+        assert "a result of this trial is recorded already: trial 0 has the distance" in problem(second)
 
         asked = post(server, "/choose", page, {"how": "next", "seen": "1"})
         assert asked.status == 303
@@ -377,6 +377,22 @@ def test_other_computers_need_the_token(tmp_path: Path) -> None:
         assert server.request("POST", "/enter", f"token={token}".encode(), **typed).status == 200
         assert server.request("POST", "/enter", b"token=guess", **typed).status == 401
         assert server.request("GET", "/", Host="evil.example", Cookie=entered.cookie).status == 403
+
+
+def test_the_server_ends_at_once_although_a_task_is_being_chosen(tmp_path: Path) -> None:
+    new_store(tmp_path, "my_rig:slow")
+    recording = record(tmp_path / "a.trials" / "0", tmp_path / "run.csv").read_bytes()
+    with serving(tmp_path) as server:
+        page = server.request("GET", "/")
+        assert upload(server, 0, page, recording).status == 303
+        assert post(server, "/choose", page, {"how": "next", "seen": "1"}).status == 303
+        wait_for(server, "choosing a task", page)
+        server.process.send_signal(signal.SIGINT)
+        time.sleep(0.2)
+        status, said = server.stop()
+    assert status == 130
+    assert "Traceback" not in said
+    assert [trial.state for trial in trials(tmp_path)] == ["completed"]
 
 
 def test_a_name_can_be_allowed(tmp_path: Path) -> None:

@@ -154,11 +154,11 @@ def test_two_operators_lose_and_double_nothing(browser: Any, folder: Path, addre
     first.upload(number, recording)
     told = second.trial(number).get_by_role("alert")
     told.wait_for(timeout=WAIT)
-    assert told.inner_text() == "This trial has ended in the meantime: somebody else recorded its result."
+    assert told.inner_text() == "This trial has ended in the meantime: a result of it is recorded already."
     with second.page.expect_navigation():
         second.trial(number).get_by_role("button", name="Check and store the recording").click()
     assert re.match(
-        r"Not stored: somebody else has recorded the result of this trial already: trial 0 has the distance",
+        r"Not stored: a result of this trial is recorded already: trial 0 has the distance",
         second.message(),
     )
     assert second.page.locator("section.open").count() == 0

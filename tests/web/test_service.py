@@ -15,11 +15,12 @@ def test_work_that_cannot_be_counted_says_what_it_is() -> None:
 
 
 def test_work_that_is_counted_says_how_long_it_takes() -> None:
-    begun = Work.begun("choosing a task")
-    counted = replace(begun.at(Stage("designing controllers", 10, 40, "designs")), reached=time.monotonic() - 5)
-    assert counted.text == "designing controllers, 10 of 40 designs, about 15 s left"
-    assert counted.at(Stage("designing controllers", 20, 40)).left == 5
+    begun = replace(Work.begun("choosing a task"), reached=time.monotonic() - 5)
+    counted = begun.at(Stage("choosing a task", 10, 40, "designs"))
+    assert counted.text == "choosing a task, 10 of 40 designs, about 15 s left"
+    assert counted.at(Stage("choosing a task", 20, 40)).left == 5
+    assert replace(counted, counted=time.monotonic() - 60).left == 0
     assert counted.at(Stage("another stage", 20, 40)).left == 0
-    assert counted.at(Stage("designing controllers", 0, 40)).left is None
-    assert counted.at(Stage("designing controllers", 41, 40)).left is None
+    assert counted.at(Stage("choosing a task", 0, 40)).left is None
+    assert counted.at(Stage("choosing a task", 41, 40)).left is None
     assert begun.started == counted.started

@@ -15,7 +15,7 @@ from typing import Any
 import python_multipart  # noqa: F401 (starlette reads forms with it, and would miss it only then)
 from starlette.applications import Starlette
 from starlette.datastructures import FormData, UploadFile
-from starlette.formparsers import MultiPartException
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route
@@ -161,8 +161,8 @@ class OperatorPage:
                 if not self.access.allows_form(session, fields.get("token", "")):
                     return self._problem(request, session, Problem(where, _OUT_OF_DATE, fields, 403))
                 await self._tell(number, kind, form)
-        except MultiPartException as error:
-            problem = Problem(where, f"the form cannot be read: {error.message}", fields, 400)
+        except HTTPException as error:
+            problem = Problem(where, f"the form cannot be read: {error.detail}", fields, error.status_code)
             return self._problem(request, session, problem)
         except CtxvalError as error:
             return self._problem(request, session, self._not_told(number, kind, error, fields))
@@ -187,7 +187,7 @@ class OperatorPage:
         sentence = shortened(str(error))
         ended = self.page.ended(number)
         if ended is not None:
-            sentence = f"somebody else has recorded the result of this trial already: {ended}."
+            sentence = f"a result of this trial is recorded already: {ended}."
         status = 409 if ended is not None else 500 if isinstance(error, StoreError | CampaignError) else 422
         return Problem(self._where(number, kind), sentence, fields, status)
 

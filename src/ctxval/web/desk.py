@@ -104,6 +104,7 @@ class Desk:
 
     def __init__(self, open_campaign: OpenCampaign) -> None:
         self._thread = cf.ThreadPoolExecutor(1, "campaign")
+        self._closed = False
         try:
             self._served: ServedCampaign = self._thread.submit(open_campaign).result()
             self.description = self._thread.submit(self._describe).result()
@@ -134,9 +135,11 @@ class Desk:
         return await self._in_thread(lambda: self._tell(number, report))
 
     def close(self) -> None:
-        """Close the store after the present work."""
-        self._thread.submit(lambda: self._served.campaign.store.close()).result()
-        self._thread.shutdown()
+        """Close the store after the present work; a second call does nothing."""
+        if not self._closed:
+            self._closed = True
+            self._thread.submit(lambda: self._served.campaign.store.close()).result()
+            self._thread.shutdown()
 
     async def _in_thread(self, function: Callable[[], Result]) -> Result:
         return await asyncio.get_running_loop().run_in_executor(self._thread, _guarded(function))

@@ -139,7 +139,7 @@ class Page:
 
     def _open_view(self, trial: Trial, snapshot: Snapshot) -> OpenView:
         task = snapshot.tasks[trial.number]
-        found = (self._service.background.files or {}).get(trial.number)
+        found = self._service.background.files.get(trial.number)
         files: Files = found if isinstance(found, dict) else {}
         return OpenView(
             trial.number,

@@ -36,6 +36,9 @@ HEADERS = {
     "Cache-Control": "no-store",
 }
 
+_LONGEST_PATH = 500
+"""Largest number of characters of an address without its query."""
+
 _SAFE = ("GET", "HEAD")
 
 
@@ -148,8 +151,9 @@ class Guard:
         headers = Headers(scope=scope)
         guarded = _with_headers(send)
         reason = refusal(scope["method"], headers, self.hosts)
-        if reason is not None:
-            await _refused(403, reason)(scope, receive, guarded)
+        if reason is not None or len(scope["path"]) > _LONGEST_PATH:
+            status, said = (403, reason) if reason is not None else (414, "The address is too long.")
+            await _refused(status, said)(scope, receive, guarded)
             return
         if (declared := headers.get("content-length", "0")).isdecimal() and int(declared) > self.most:
             await self._too_large(scope, receive, guarded)

@@ -79,7 +79,10 @@ def serve(
             ws="none",
         )
         on_start(page_address(address.host, port), token)
-        _Server(config, service.end_events).run(sockets=[listener])
+        try:
+            _Server(config, service.end_events).run(sockets=[listener])
+        finally:
+            service.close()  # a second Ctrl-C skips the end of the application
 
 
 class _Server(uvicorn.Server):

@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ctxval._util.representation import call, counted
@@ -37,21 +37,25 @@ class Work:
         stage: what it does at present.
         started: the time of its start, on the clock of ``time.monotonic``.
         reached: the time of the start of the stage.
+        counted: the time at which the stage told how much is done.
     """
 
     stage: Stage
     started: float
     reached: float
+    counted: float
 
     @staticmethod
     def begun(stage: str) -> Work:
         """Return work that begins now."""
         now = time.monotonic()
-        return Work(Stage(stage), now, now)
+        return Work(Stage(stage), now, now, now)
 
     def at(self, stage: Stage) -> Work:
         """Return the same work at a later stage, or at the same one with another count."""
-        return replace(self, stage=stage, reached=self.reached if stage.text == self.stage.text else time.monotonic())
+        now = time.monotonic()
+        reached = self.reached if stage.text == self.stage.text else now
+        return replace(self, stage=stage, reached=reached, counted=now)
 
     @property
     def seconds(self) -> int:
@@ -64,7 +68,8 @@ class Work:
         done, expected = self.stage.done, self.stage.expected
         if expected is None or not 0 < done <= expected:
             return None
-        return round((time.monotonic() - self.reached) * (expected - done) / done)
+        left = (self.counted - self.reached) * (expected - done) / done - (time.monotonic() - self.counted)
+        return max(round(left), 0)
 
     @property
     def text(self) -> str:
@@ -97,8 +102,8 @@ class Background:
     judgement: Judgement | None = None
     judged: tuple[int, int] | None = None
     judgement_error: str | None = None
-    pictures: Pictures = Pictures()  # noqa: RUF009 (it is never changed)
-    files: dict[int, Files | str] | None = None
+    pictures: Pictures = field(default_factory=Pictures)
+    files: dict[int, Files | str] = field(default_factory=dict)
     store_error: str | None = None
 
 
@@ -117,38 +122,37 @@ class CampaignService:
     """
 
     def __init__(self, desk: Desk, reopen: OpenCampaign) -> None:
-        self._desk, self._reopen = desk, reopen
+        self._desk = desk
         self.description, self.snapshot = desk.description, desk.first
-        self.background = Background(files={})
+        self.background = Background()
         self.version = time.time_ns()  # it grows when the server is started again, too
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Task[Any]] = set()
         self._preparing: dict[int, asyncio.Task[None]] = {}
         self._submitted: OrderedDict[str, int] = OrderedDict()
         self._closing = False
+        self._chooser = BackgroundProcess(reopen, lambda stage: self._told("choosing", stage))
+        self._judge = BackgroundProcess(reopen, lambda stage: self._told("judging", stage))
 
     async def start(self) -> None:
         """Start the background processes and the observation of the store."""
-        loop = asyncio.get_running_loop()
-
-        def told(stage: Stage, kind: str) -> None:
-            loop.call_soon_threadsafe(self._set_stage, kind, stage)
-
-        self._chooser = BackgroundProcess(self._reopen, lambda stage: told(stage, "choosing"))
-        self._judge = BackgroundProcess(self._reopen, lambda stage: told(stage, "judging"))
+        self._loop = asyncio.get_running_loop()
         self._spawn(self._background(self._chooser, jobs.warm_up))
         self._follow()
         self._spawn(self._watch())
 
     async def stop(self) -> None:
-        """End the background processes, and close the store."""
+        """End all work in progress, and close everything."""
         self.end_events()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        loop = asyncio.get_running_loop()
-        for close in (self._chooser.close, self._judge.close, self._desk.close):
-            await loop.run_in_executor(None, close)
+        await self._loop.run_in_executor(None, self.close)
+
+    def close(self) -> None:
+        """End the background processes, and close the store, at once; a second call does nothing."""
+        for part in (self._chooser, self._judge, self._desk):
+            part.close()
 
     # What operators do
 
@@ -201,7 +205,7 @@ class CampaignService:
         """
         if number in self._preparing:
             await asyncio.shield(self._preparing[number])
-        found = (self.background.files or {}).get(number)
+        found = self.background.files.get(number)
         if isinstance(found, dict):
             return found
         raise InputError(found or f"trial {number} is not open, so there are no files of it.")
@@ -242,6 +246,10 @@ class CampaignService:
         changed, self._changed = self._changed, asyncio.Event()
         changed.set()
 
+    def _told(self, kind: str, stage: Stage) -> None:
+        """Take a stage from the thread of a background process."""
+        self._loop.call_soon_threadsafe(self._set_stage, kind, stage)
+
     def _set_stage(self, kind: str, stage: Stage) -> None:
         work: Work | None = getattr(self.background, kind)
         if work is None:
@@ -267,7 +275,7 @@ class CampaignService:
         except CtxvalError as error:
             self._update(choosing=None, choice_error=str(error))
         else:
-            self._update(choosing=None, chosen=number, files={**(self.background.files or {}), number: files})
+            self._update(choosing=None, chosen=number, files={**self.background.files, number: files})
         await self._look()
 
     async def _watch(self) -> None:
@@ -298,7 +306,7 @@ class CampaignService:
     def _follow(self) -> None:
         """Prepare the files of open trials, forget those of others, and judge the trials that have ended."""
         waiting = {trial.number for trial in self.snapshot.waiting if not trial.attempts}
-        files = self.background.files or {}
+        files = self.background.files
         self.background = replace(self.background, files={n: kept for n, kept in files.items() if n in waiting})
         for number in waiting - set(files) - set(self._preparing):
             self._preparing[number] = self._spawn(self._prepare(number))
@@ -315,7 +323,7 @@ class CampaignService:
         finally:
             self._preparing.pop(number, None)
         if any(trial.number == number for trial in self.snapshot.waiting):
-            self._update(files={**(self.background.files or {}), number: found})
+            self._update(files={**self.background.files, number: found})
 
     async def _evaluate(self) -> None:
         """Draw and judge until the results are those of the present trials."""
@@ -325,7 +333,7 @@ class CampaignService:
                 self._update(pictures=await self._background(self._judge, jobs.draw))
                 judgement = await self._background(self._judge, jobs.judge)
             except CtxvalError as error:
-                self._update(judged=ended, judgement_error=str(error))
+                self._update(judged=ended, judgement=None, judgement_error=str(error))
             else:
                 self._update(judged=ended, judgement=judgement, judgement_error=None)
         self._update(judging=None)

@@ -43,7 +43,7 @@ function replaceOpenTrials(page) {
     const note = document.createElement("p");
     note.className = "problem";
     note.setAttribute("role", "alert");
-    note.textContent = "This trial has ended in the meantime: somebody else recorded its result.";
+    note.textContent = "This trial has ended in the meantime: a result of it is recorded already.";
     old.querySelector("h2").after(note);
   }
   for (const [id, one] of fresh) if (!document.getElementById(id)) list.append(document.adoptNode(one));
