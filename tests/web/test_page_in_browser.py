@@ -83,7 +83,9 @@ class Operator:
 
     def upload(self, number: int, recording: Path) -> None:
         """Report a recording, and wait for the answer."""
-        self.trial(number).get_by_label(f"Recording of trial {number}").set_input_files(recording)
+        with self.page.expect_file_chooser() as chooser:
+            self.trial(number).get_by_label(f"Recording of trial {number}").click()
+        chooser.value.set_files(recording)
         with self.page.expect_navigation():
             self.trial(number).get_by_role("button", name="Check and store the recording").click()
 
@@ -150,7 +152,9 @@ def test_two_operators_lose_and_double_nothing(browser: Any, folder: Path, addre
     number = first.opened()
     recording = record(first.files(number), folder / "run.csv")
     second.opened()
-    second.trial(number).get_by_label(f"Recording of trial {number}").set_input_files(recording)
+    with second.page.expect_file_chooser() as chooser:
+        second.trial(number).get_by_label(f"Recording of trial {number}").click()
+    chooser.value.set_files(recording)
     first.upload(number, recording)
     told = second.trial(number).get_by_role("alert")
     told.wait_for(timeout=WAIT)

@@ -6,11 +6,21 @@ let version = main.dataset.version;
 let loading = false;
 let again = false;
 
-// A section with something typed or chosen in it is never replaced.
-document.addEventListener("input", (event) => {
+// A section with something typed or chosen in it is never replaced, nor one for which a file is being chosen.
+function markAsUsed(event) {
   const section = event.target.closest("[data-live]");
-  if (section) section.dataset.typed = "yes";
-});
+  if (section && (event.type === "input" || event.target.matches("input[type=file]"))) section.dataset.typed = "yes";
+}
+document.addEventListener("input", markAsUsed);
+document.addEventListener("click", markAsUsed);
+
+// What matters of a section: not the tokens of its forms, nor what the operator has unfolded.
+function shape(section) {
+  const copy = section.cloneNode(true);
+  copy.querySelectorAll("input[type=hidden]").forEach((one) => one.removeAttribute("value"));
+  copy.querySelectorAll("details").forEach((one) => one.removeAttribute("open"));
+  return copy.innerHTML;
+}
 
 function isInUse(section) {
   const active = document.activeElement;
@@ -20,7 +30,7 @@ function isInUse(section) {
 }
 
 function replace(old, fresh) {
-  if (old.innerHTML === fresh.innerHTML || isInUse(old)) return;
+  if (shape(old) === shape(fresh) || isInUse(old)) return;
   const open = [...old.querySelectorAll("details")].map((details) => details.open);
   const focused = old.contains(document.activeElement) ? document.activeElement : null;
   const place = focused ? [...old.querySelectorAll("a, button, summary, [tabindex]")].indexOf(focused) : -1;
