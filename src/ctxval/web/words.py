@@ -37,7 +37,7 @@ def why(trial: Trial, units: str) -> list[str]:
     """
     note = trial.note or {}
     found = [_reason(trial, note, units)]
-    if isinstance(note.get("why"), str):
+    if isinstance(note.get("why"), str) and note.get("how") != "initial":
         found.append(f"The search does not use the prediction of the learned dynamics: {text(note['why'])}.")
     if trial.because is not None:
         found.append(f"Since the last execution of this task: {text(trial.because)}.")
