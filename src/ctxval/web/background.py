@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
+from ctxval._util.progress import Progress, listening
 from ctxval._util.representation import call
 from ctxval._util.texts import reason_of
 from ctxval.errors import CampaignError, CtxvalError
@@ -142,7 +143,9 @@ def _serve(pipe: Connection, open_campaign: OpenCampaign) -> None:
                 if served is None:
                     pipe.send(("stage", Stage("loading the experiment")))
                     served = open_campaign()
-                reply = "done", job(served, _Teller(pipe), *arguments)
+                tell = _Teller(pipe)
+                with listening(tell.hear):
+                    reply = "done", job(served, tell, *arguments)
             except CtxvalError as error:
                 reply = "failed", str(error)
             except BaseException as error:  # users' code may raise anything
@@ -165,3 +168,8 @@ class _Teller:
         if stage.text != self._text or now - self._at >= _INTERVAL:
             self._text, self._at = stage.text, now
             self._pipe.send(("stage", stage))
+
+    def hear(self, progress: Progress) -> None:
+        """Send a report of long work as a stage."""
+        if not progress.ended:
+            self(Stage(progress.stage, progress.done, progress.expected, progress.unit))
