@@ -21,6 +21,7 @@ from conftest import make_validation
 from ctxval import (
     Campaign,
     Experiment,
+    Labels,
     Normal,
     Store,
     Task,
@@ -211,6 +212,7 @@ BY_POSTERIOR = certificates.CertificateOptions.posterior()
 EXAMPLES: dict[str, Callable[[], object]] = {
     "Campaign": campaign,
     "Experiment": lambda: Experiment("pendulum", make_validation(), threshold=0.5, units="rad"),
+    "Labels": lambda: Labels(("angle [rad]", "rate [rad/s]"), ("torque [N m]",), "rad"),
     "OpenTrial": lambda: Campaign(make_validation()).ask({"goal": 0.5}),
     "Outcome": lambda: make_validation().outcome([0.5]),
     "Parameters": lambda: SPACE.parameters([1, 2, 3, 4]),

@@ -14,6 +14,7 @@ from ctxval._util.registry import part
 from ctxval.campaign import Campaign, OpenTrial
 from ctxval.certificates.verdict import Verdict
 from ctxval.core.experiment import Experiment
+from ctxval.core.labels import Labels
 from ctxval.core.plan import Outcome, Plan
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
@@ -46,6 +47,7 @@ __all__ = [
     "Array",
     "Campaign",
     "Experiment",
+    "Labels",
     "Normal",
     "OpenTrial",
     "Outcome",

@@ -2,7 +2,7 @@
 
 A function that draws one plot has the argument ``ax`` and returns the matplotlib axes. By default, these are new axes
 of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show them. A function that draws several panels
-returns a figure.
+returns a figure. Names and units are those of the validation, unless the arguments state others.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import record
+from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
@@ -69,30 +70,48 @@ class Curve:
         return record(self)
 
 
-def overview(campaign: Results, *, units: str = "", ax: Axes | None = None) -> Axes:
+def overview(
+    campaign: Results,
+    *,
+    units: str = "",
+    threshold: float | None = None,
+    bound: float | None = None,
+    ax: Axes | None = None,
+) -> Axes:
     """Draw the most informative single plot of a campaign.
 
     It is the surrogate if there is one task parameter and two distances are known, and :func:`convergence` otherwise.
 
     Args:
         campaign: a campaign with at least one distance.
-        units: the units of the distance.
+        units: the units of the distance; by default, those of the validation.
+        threshold: tau, drawn as a line; None if there is none.
+        bound: a bound on d* from a certificate, drawn as a line; None if there is none.
         ax: the axes to draw into; new ones by default.
 
     Raises:
         InputError: if no distance is known.
     """
     if campaign.validation.space.dimension == 1 and len(campaign.completed) >= 2:
-        return surrogate_slice(campaign, units=units, ax=ax)
-    return convergence(campaign, units=units, ax=ax)
+        return surrogate_slice(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
+    return convergence(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
 
 
-def convergence(campaign: Results, *, units: str = "", ax: Axes | None = None) -> Axes:
+def convergence(
+    campaign: Results,
+    *,
+    units: str = "",
+    threshold: float | None = None,
+    bound: float | None = None,
+    ax: Axes | None = None,
+) -> Axes:
     """Draw the distance of each trial and the largest distance so far, and mark the trials without a distance.
 
     Args:
         campaign: a campaign with at least one distance.
-        units: the units of the distance.
+        units: the units of the distance; by default, those of the validation.
+        threshold: tau, drawn as a line; None if there is none.
+        bound: a bound on d* from a certificate, drawn as a line; None if there is none.
         ax: the axes to draw into; new ones by default.
 
     Raises:
@@ -111,15 +130,23 @@ def convergence(campaign: Results, *, units: str = "", ax: Axes | None = None) -
     if without:
         bottom = axes.get_xaxis_transform()
         axes.plot(without, [0.03] * len(without), "x", color=_ORANGE, transform=bottom, label="no distance is known")
+    _draw_limits(axes, threshold, bound)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("trial")
-    axes.set_ylabel(_distance_label(units))
+    axes.set_ylabel(_distance_label(campaign, units))
     axes.legend(loc="best", fontsize=8, framealpha=0.9)
     return axes
 
 
 def surrogate_slice(
-    campaign: Results, axis: int = 0, *, truth: Curve | None = None, units: str = "", ax: Axes | None = None
+    campaign: Results,
+    axis: int = 0,
+    *,
+    truth: Curve | None = None,
+    units: str = "",
+    threshold: float | None = None,
+    bound: float | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Draw the Gaussian process along one task parameter, through the worst executed task, with its 95 % band.
 
@@ -127,7 +154,9 @@ def surrogate_slice(
         campaign: a campaign with at least two distances.
         axis: index of the scalar task parameter, from 0.
         truth: the true distance, which is drawn if the task space has one dimension.
-        units: the units of the distance.
+        units: the units of the distance; by default, those of the validation.
+        threshold: tau, drawn as a line; None if there is none.
+        bound: a bound on d* from a certificate, drawn as a line; None if there is none.
         ax: the axes to draw into; new ones by default.
 
     Raises:
@@ -139,12 +168,20 @@ def surrogate_slice(
     fitted, worst = campaign.surrogate(), _worst(campaign)
     axes = _axes(ax)
     _draw_slice(axes, campaign, fitted, worst, axis, truth)
-    axes.set_ylabel(_distance_label(units))
+    _draw_limits(axes, threshold, bound)
+    axes.set_ylabel(_distance_label(campaign, units))
     axes.legend(loc="best", fontsize=8, framealpha=0.9)
     return axes
 
 
-def surrogate(campaign: Results, *, truth: Curve | None = None, units: str = "") -> Figure:
+def surrogate(
+    campaign: Results,
+    *,
+    truth: Curve | None = None,
+    units: str = "",
+    threshold: float | None = None,
+    bound: float | None = None,
+) -> Figure:
     """Draw the Gaussian process over the task space with its 95 % band, the samples and the maximum.
 
     For one task parameter, the figure shows the complete function. For several, it shows a slice along each axis
@@ -153,7 +190,9 @@ def surrogate(campaign: Results, *, truth: Curve | None = None, units: str = "")
     Args:
         campaign: a campaign with at least two distances.
         truth: the true distance, which is drawn if the task space has one dimension.
-        units: the units of the distance.
+        units: the units of the distance; by default, those of the validation.
+        threshold: tau, drawn as a line; None if there is none.
+        bound: a bound on d* from a certificate, drawn as a line; None if there is none.
 
     Raises:
         InputError: if fewer than two distances are known.
@@ -167,8 +206,9 @@ def surrogate(campaign: Results, *, truth: Curve | None = None, units: str = "")
     for axis in range(space.dimension):
         axes = figure.add_subplot(rows, columns, axis + 1)
         _draw_slice(axes, campaign, fitted, worst, axis, truth)
+        _draw_limits(axes, threshold, bound)
         if axis % columns == 0:
-            axes.set_ylabel(_distance_label(units))
+            axes.set_ylabel(_distance_label(campaign, units))
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
     return figure
 
@@ -179,9 +219,10 @@ def _draw_slice(axes: Axes, campaign: Results, fitted: Surrogate, worst: Trial, 
     unit[:, axis] = np.linspace(0, 1, _RESOLUTION)
     x = space.from_unit(unit)[:, axis]
     mean, deviation = fitted.predict(unit)
-    band = _NORMAL_95 * deviation
-    axes.fill_between(x, mean - band, mean + band, color=_GREY, alpha=0.6, linewidth=0, label="95 % band of the GP")
-    axes.plot(x, mean, color=_BLUE, linewidth=1.8, label="GP mean")
+    # A distance is never below 0, but the Gaussian process does not know it.
+    low, high = (np.maximum(mean + sign * _NORMAL_95 * deviation, 0.0) for sign in (-1, 1))
+    axes.fill_between(x, low, high, color=_GREY, alpha=0.6, linewidth=0, label="95 % band of the GP")
+    axes.plot(x, np.maximum(mean, 0.0), color=_BLUE, linewidth=1.8, label="GP mean")
     if space.dimension == 1:
         _draw_samples(axes, campaign, lambda trial: space.from_unit(trial.unit_point)[axis])
     at = space.from_unit(worst.unit_point)[axis]
@@ -191,6 +232,14 @@ def _draw_slice(axes: Axes, campaign: Results, fitted: Surrogate, worst: Trial, 
     if truth is not None and space.dimension == 1:
         axes.plot(truth.points, truth.values, color=_ORANGE, linestyle="--", linewidth=1.6, label="true distance")
     axes.set_xlabel(space.labels[axis])
+
+
+def _draw_limits(axes: Axes, threshold: float | None, bound: float | None) -> None:
+    """Draw the threshold and the bound as horizontal lines, which differ in style and not only in colour."""
+    if threshold is not None:
+        axes.axhline(threshold, color=_ORANGE, linestyle="-.", linewidth=1.4, label=f"threshold {threshold:.4g}")
+    if bound is not None:
+        axes.axhline(bound, color=_BLACK, linestyle=":", linewidth=1.6, label=f"bound on d* {bound:.4g}")
 
 
 def _draw_samples(axes: Axes, campaign: Results, place: Callable[[Trial], float]) -> None:
@@ -212,7 +261,7 @@ def worst_trajectories(campaign: Results, *, states: Sequence[str] = (), inputs:
 
     Args:
         campaign: a campaign with at least one distance.
-        states, inputs: axis labels, with units.
+        states, inputs: axis labels, with units; by default, those of the validation.
 
     Raises:
         InputError: if no distance is known.
@@ -223,9 +272,12 @@ def worst_trajectories(campaign: Results, *, states: Sequence[str] = (), inputs:
         raise InputError(f"the trajectories of trial {worst.number} are not in the store.")
     space = campaign.validation.space
     reference = campaign.validation.task(space.parameters(space.from_unit(worst.unit_point))).reference
-    figure = trajectories(model, system, reference=reference, states=states, inputs=inputs)
+    named = campaign.validation.names(model.states.shape[-1], model.inputs.shape[-1])
+    own_states, own_inputs = map(labels_of, named)
+    figure = trajectories(model, system, reference=reference, states=states or own_states, inputs=inputs or own_inputs)
     task = ", ".join(f"{name} = {_compact(value)}" for name, value in worst.parameters.items())
-    figure.suptitle(f"worst task executed: {task} (distance {_known(worst):.4g})", fontsize=10)
+    distance = f"{_known(worst):.4g} {campaign.validation.labels.units}".rstrip()
+    figure.suptitle(f"worst task executed: {task} (distance {distance})", fontsize=10)
     return figure
 
 
@@ -245,25 +297,59 @@ def trajectories(
         states, inputs: axis labels, with units.
     """
     n, m = model.states.shape[-1], model.inputs.shape[-1]
-    panels = [
-        *[(states[i] if i < len(states) else f"state {i}", model.states[:, i], system.states[:, i]) for i in range(n)],
-        *[(inputs[i] if i < len(inputs) else f"input {i}", model.inputs[:, i], system.inputs[:, i]) for i in range(m)],
+    names = [
+        *(states[i] if i < len(states) else f"state {i}" for i in range(n)),
+        *(inputs[i] if i < len(inputs) else f"input {i}" for i in range(m)),
     ]
-    figure = _figure(6.4, 1.0 + 1.7 * len(panels))
+    figure = _figure(6.4, 1.0 + 1.7 * len(names))
     first: Axes | None = None
-    for row, (name, of_model, of_system) in enumerate(panels):
-        axes = figure.add_subplot(len(panels), 1, row + 1, sharex=first)
+    for row, name in enumerate(names):
+        axes = figure.add_subplot(len(names), 1, row + 1, sharex=first)
         first = axes if first is None else first
-        if reference is not None and row < n and reference[:, row].any():
-            axes.plot(model.times, reference[:, row], color=_BLACK, linestyle=":", linewidth=1.2, label="reference")
-        times = model.times[: len(of_model)]
-        axes.plot(times, of_system, color=_ORANGE, linewidth=1.8, label="system S")
-        axes.plot(times, of_model, color=_BLUE, linestyle="--", linewidth=1.6, label="model M")
-        axes.set_ylabel(name)
-        axes.grid(alpha=0.25)
+        signal(model, system, row, label=name, reference=reference, ax=axes)
+        axes.set_xlabel("")
     figure.axes[-1].set_xlabel("time [s]")
     figure.axes[0].legend(loc="best", fontsize=8, framealpha=0.9)
     return figure
+
+
+def signal(
+    model: Trajectory,
+    system: Trajectory,
+    component: int,
+    *,
+    label: str = "",
+    reference: Array | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw one state or input of two trajectories over time.
+
+    Args:
+        model, system: the two trajectories of one task.
+        component: index of the state from 0; the inputs follow the n states.
+        label: label of the vertical axis, with the unit.
+        reference: the reference of the states, ``(H + 1, n)``; it is drawn for a state if it is not zero everywhere.
+        ax: the axes to draw into; new ones by default.
+
+    Raises:
+        InputError: if there is no such state or input.
+    """
+    n, m = model.states.shape[-1], model.inputs.shape[-1]
+    if not 0 <= component < n + m:
+        raise InputError(f"component must be from 0 to {n + m - 1}, the {n} states and {m} inputs, got {component}.")
+    axes = _axes(ax)
+    if reference is not None and component < n and reference[:, component].any():
+        axes.plot(model.times, reference[:, component], color=_BLACK, linestyle=":", linewidth=1.2, label="reference")
+    for one, style in (
+        (system, {"color": _ORANGE, "linewidth": 1.8, "label": "system S"}),
+        (model, {"color": _BLUE, "linestyle": "--", "linewidth": 1.6, "label": "model M"}),
+    ):
+        values = one.states[:, component] if component < n else one.inputs[:, component - n]
+        axes.plot(one.times[: len(values)], values, **style)  # type: ignore[arg-type]
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel(label)
+    axes.grid(alpha=0.25)
+    return axes
 
 
 def save(figure: Figure, path: str | Path) -> Path:
@@ -294,8 +380,9 @@ def _axes(ax: Axes | None) -> Axes:
     return pyplot.subplots(layout="constrained")[1]
 
 
-def _distance_label(units: str) -> str:
-    return f"distance [{units}]" if units else "distance"
+def _distance_label(campaign: Results, units: str) -> str:
+    known = units or campaign.validation.labels.units
+    return f"distance [{known}]" if known else "distance"
 
 
 def _worst(campaign: Results) -> Trial:

@@ -17,7 +17,8 @@ from ctxval.campaign.choices import OpenTrial
 from ctxval.campaign.known import KnownExecution, TrialResult, check_known
 from ctxval.core.controller import AffineFeedback
 from ctxval.core.exchange import write_controller, write_task
-from ctxval.core.experiment import Experiment, labels_of
+from ctxval.core.experiment import Experiment
+from ctxval.core.labels import labels_of
 from ctxval.core.plan import Plan
 from ctxval.core.space import TaskSpace
 from ctxval.core.trajectory import Trajectory

@@ -22,6 +22,7 @@ from ctxval.certificates.dynamics_evidence import (
     StateInputGap,
     UntriedParameter,
 )
+from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
@@ -120,10 +121,21 @@ class CampaignDynamics:
             worst.left_out,
             learned.posterior.noise,
             self._checked(trials),
-            _coverage(learned.coverage, learned.posterior.data.inputs),
+            _coverage(learned.coverage, self._coordinates(learned)),
             groups=len(worst.maxima) // len(learned.posterior.components),
             unplanned=worst.unplanned,
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
+        )
+
+    def _coordinates(self, learned: LearnedDynamics) -> tuple[str, ...]:
+        """Return the labels of the states and inputs, with units; ``x[0], ..., u[0], ...`` for those without names."""
+        inputs = learned.posterior.data.inputs
+        states = len(learned.coverage.resolution) - inputs
+        named = self._study.validation.names(states, inputs)
+        return tuple(
+            f"{letter}[{i}]" if label == f"{letter}{i}" else label
+            for letter, labels in zip("xu", map(labels_of, named), strict=True)
+            for i, label in enumerate(labels)
         )
 
     def _learn(self, executed: Sequence[tuple[Trial, Trajectory]]) -> LearnedDynamics | None:
@@ -185,10 +197,7 @@ class CampaignDynamics:
         return call(self, self._study)
 
 
-def _coverage(found: Coverage, inputs: int) -> StateInputCoverage:
-    states = len(found.resolution) - inputs
-    names = [*(f"x[{i}]" for i in range(states)), *(f"u[{i}]" for i in range(inputs))]
-
+def _coverage(found: Coverage, names: Sequence[str]) -> StateInputCoverage:
     def named(values: Array) -> dict[str, float]:
         return dict(zip(names, values.tolist(), strict=True))
 

@@ -150,17 +150,26 @@ class CampaignResults:
         """
         return display.to_dataframe(self.trials, self.validation.space)
 
-    def plot(self, *, units: str = "", ax: Axes | None = None) -> Axes:
+    def plot(
+        self,
+        *,
+        units: str = "",
+        threshold: float | None = None,
+        bound: float | None = None,
+        ax: Axes | None = None,
+    ) -> Axes:
         """Draw the surrogate over one task parameter, or else the distances in their order; return the axes.
 
         Args:
-            units: the units of the distance.
+            units: the units of the distance; by default, those of the validation.
+            threshold: tau, drawn as a line; None if there is none.
+            bound: a bound on d* from a certificate, drawn as a line; None if there is none.
             ax: matplotlib axes to draw into; new ones of ``matplotlib.pyplot`` by default.
 
         Raises:
             InputError: if no distance is known.
         """
-        return overview(self, units=units, ax=ax)
+        return overview(self, units=units, threshold=threshold, bound=bound, ax=ax)
 
     def _distances(self) -> tuple[Array, Array]:
         """Return the points of the unit cube with a distance ``(n, d)``, and the distances ``(n,)``."""

@@ -378,4 +378,6 @@ def _details(sample: Sample, evidence: DynamicsEvidence, bound: float, error: fl
 
 
 def _texts(values: dict[str, float]) -> str:
-    return ", ".join(f"{name} {value:.2g}" for name, value in values.items())
+    """Return numbers with their names; the unit of a label ``name [unit]`` follows its number."""
+    parts = ((*name.partition(" [")[::2], value) for name, value in values.items())
+    return ", ".join(f"{name} {value:.2g} {unit.removesuffix(']')}".rstrip() for name, unit, value in parts)

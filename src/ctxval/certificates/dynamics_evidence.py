@@ -64,7 +64,7 @@ class StateInputGap:
 
     Attributes:
         size: its size, as a share of the visited range.
-        coordinates: its coordinates, such as ``x[1]`` or ``u[0]``.
+        coordinates: its coordinates, such as ``angle [rad]``, or ``x[1]`` and ``u[0]`` if they have no names.
         place: the visited state and input, by coordinate, in the units of the system.
     """
 

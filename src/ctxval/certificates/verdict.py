@@ -46,6 +46,13 @@ class Verdict:
     expected: Forecast | None = None
     rests_on: str | None = None
 
+    @property
+    def bound(self) -> float | None:
+        """The bound on d* of its certificate; None if there is none, it is withdrawn, or it leaves out a volume."""
+        found = self.certificate
+        usable = found is not None and found.doubt is None and not found.volume and np.isfinite(found.upper_bound)
+        return found.upper_bound if found is not None and usable else None
+
     def __str__(self) -> str:
         return f"{self.answer}: {self.reason}"
 

@@ -148,7 +148,7 @@ def run(
     known = experiment.truth() if truth and experiment.truth is not None else None
     verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
     report = _report(campaign, experiment, settings, total, path, verdict, known)
-    report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path)]
+    report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path, verdict)]
     if not as_json:
         _print_report(report, verdict)
     return report, _status(campaign, verdict)
@@ -217,26 +217,26 @@ def _report(
     return report
 
 
-def _save_pictures(campaign: Campaign, experiment: Experiment, path: Path) -> list[Path]:
+def _save_pictures(campaign: Campaign, experiment: Experiment, path: Path, verdict: Verdict | None) -> list[Path]:
     try:
-        return _draw_pictures(campaign, experiment, path)
+        return _draw_pictures(campaign, experiment, path, verdict)
     except Exception as error:
         # An error in a figure must not hide the verdict, for which executions were paid.
         err.say(f"no pictures: {reason_of(error)}")
         return []
 
 
-def _draw_pictures(campaign: Campaign, experiment: Experiment, path: Path) -> list[Path]:
+def _draw_pictures(campaign: Campaign, experiment: Experiment, path: Path, verdict: Verdict | None) -> list[Path]:
     if campaign.worst is None:
         return []
-    drawn = [
-        plot.save(
-            plot.worst_trajectories(campaign, states=experiment.states, inputs=experiment.inputs),
-            path.with_suffix(".worst.png"),
-        )
-    ]
+    drawn = [plot.save(plot.worst_trajectories(campaign), path.with_suffix(".worst.png"))]
     if len(campaign.completed) >= 2:
-        figure = plot.surrogate(campaign, truth=_true_curve(experiment), units=experiment.units)
+        figure = plot.surrogate(
+            campaign,
+            truth=_true_curve(experiment),
+            threshold=None if verdict is None else verdict.threshold,
+            bound=None if verdict is None else verdict.bound,
+        )
         drawn.append(plot.save(figure, path.with_suffix(".surrogate.png")))
     return drawn
 

@@ -12,7 +12,8 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.costs import ThinkingCosts
-from ctxval.core.experiment import Experiment, labels_of
+from ctxval.core.experiment import Experiment
+from ctxval.core.labels import labels_of
 from ctxval.core.plan import Plan
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory

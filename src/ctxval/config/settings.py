@@ -17,7 +17,8 @@ from ctxval.config.certificate_table import CertificateTable
 from ctxval.config.experiments import named_experiment
 from ctxval.config.parts import argument, part, require_types, space_of, task_function, with_distribution
 from ctxval.config.signatures import code_named, signed, unsigned, verifies
-from ctxval.core.experiment import Experiment, labels_of
+from ctxval.core.experiment import Experiment
+from ctxval.core.labels import labels_of
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError, UnknownNameError
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH

@@ -15,6 +15,7 @@ from ctxval._util.representation import call, lines, shown
 from ctxval._util.texts import reason_of, text_of
 from ctxval.core.controller import Synthesizer
 from ctxval.core.distance import Distance
+from ctxval.core.labels import Labels
 from ctxval.core.model import Model, Step, as_model
 from ctxval.core.plan import Measurement, Outcome, Plan, require_execution
 from ctxval.core.rollout import rollout
@@ -54,6 +55,7 @@ class Validation:
         start_tolerance: the largest permitted difference between the first state of an execution and the initial state
             of its task. It is a fraction of the range of each state in the trajectory of the model, or of its initial
             value if that is larger.
+        labels: the names and units of states, inputs and distance for files, pictures and reports.
 
     Raises:
         InputError: if one of them has the wrong type; the message names it and what is missing.
@@ -69,6 +71,7 @@ class Validation:
         synthesizer: Synthesizer,
         distance: Distance,
         start_tolerance: float = START,
+        labels: Labels | None = None,
     ) -> None:
         _require("space", space, isinstance(space, TaskSpace), "a TaskSpace")
         _require("task", task, callable(task), "a function p -> Task")
@@ -79,6 +82,7 @@ class Validation:
         _require(
             "distance", distance, callable(distance), "a function (model_trajectory, system_trajectory, task) -> d"
         )
+        _require("labels", labels, labels is None or isinstance(labels, Labels), "Labels(states, inputs, units)")
         _require("start_tolerance", start_tolerance, _is_share(start_tolerance), "a finite number >= 0")
         self.space = space
         self.task = task
@@ -87,6 +91,7 @@ class Validation:
         self.synthesizer = synthesizer
         self.distance = distance
         self.start_tolerance = float(start_tolerance)
+        self.labels = Labels() if labels is None else labels
 
     def describe(self) -> dict[str, Any]:
         """Return the description that identifies this validation in a store."""
@@ -102,15 +107,7 @@ class Validation:
         Raises:
             InputError: if it is not a function.
         """
-        return Validation(
-            space=self.space,
-            task=self.task,
-            system=self.system,
-            model=self.model,
-            synthesizer=self.synthesizer,
-            distance=distance,
-            start_tolerance=self.start_tolerance,
-        )
+        return self._with(distance=distance)
 
     def with_space(self, space: TaskSpace) -> Validation:
         """Return this validation with another task space of the same parameters, for example with a distribution.
@@ -118,15 +115,26 @@ class Validation:
         Raises:
             InputError: if it is not a task space.
         """
-        return Validation(
-            space=space,
-            task=self.task,
-            system=self.system,
-            model=self.model,
-            synthesizer=self.synthesizer,
-            distance=self.distance,
-            start_tolerance=self.start_tolerance,
-        )
+        return self._with(space=space)
+
+    def with_labels(self, labels: Labels) -> Validation:
+        """Return this validation with other names and units.
+
+        Raises:
+            InputError: if they are not labels.
+        """
+        return self._with(labels=labels)
+
+    def _with(self, **changed: Any) -> Validation:
+        parts = ("space", "task", "system", "model", "synthesizer", "distance", "start_tolerance", "labels")
+        return Validation(**{**{part: getattr(self, part) for part in parts}, **changed})
+
+    def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
+        """Return the names of n states and m inputs with their units: those of the labels, else of the system.
+
+        If neither has names, they are ``x0, x1, ...`` and ``u0, u1, ...``.
+        """
+        return self.labels.names(self.system, states, inputs)
 
     # One task, step by step
 
