@@ -169,6 +169,8 @@ def experiment(
         threshold=settings.threshold if name == settings.distance else None,
         truth=lambda: cached_truth(validation, search_truth),
         units="m",
+        states=("y [m]", "z [m]", "heading [rad]"),
+        inputs=("speed [m/s]", "turn rate [rad/s]"),
     )
 
 

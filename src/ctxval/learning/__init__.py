@@ -16,6 +16,7 @@ from ctxval.learning.dynamics_posterior import DynamicsDraws, DynamicsPosterior,
 from ctxval.learning.dynamics_study import DynamicsStudy, LearnedDynamics
 from ctxval.learning.execution_prediction import ExecutionPrediction, PredictionScore
 from ctxval.learning.prediction import DistancePredictor, predict_distance
+from ctxval.learning.replays import Replay, replay_executed
 from ctxval.learning.vector import predict_composed
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "LearnedCovariance",
     "LearnedDynamics",
     "PredictionScore",
+    "Replay",
     "Residual",
     "ResidualsWithout",
     "learn_covariance",
@@ -37,4 +39,5 @@ __all__ = [
     "learn_residual",
     "predict_composed",
     "predict_distance",
+    "replay_executed",
 ]

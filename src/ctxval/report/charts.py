@@ -1,0 +1,308 @@
+"""Charts as inline SVG: axes with ticks, lines, bands, marks, limits, and maps.
+
+Colours are those of the style sheet, by the kind of what is drawn, so that a chart is legible on a light and on a dark
+page. Each kind also differs in its line style or in the shape of its marks, for grey print and for colour blindness.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from markupsafe import Markup
+
+from ctxval._util.arrays import Array, ArrayLike
+from ctxval._util.representation import record
+from ctxval.report.markup import element, number
+
+WIDTH, HEIGHT = 480, 280
+"""Size of a chart in its own units; on the page it is as wide as its column."""
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 12, 46
+_TICKS = 5
+
+Kind = Literal[
+    "mean", "model", "system", "corrected", "reference", "best", "threshold", "bound", "sample", "initial", "covering",
+    "failed", "worst", "band", "weak", "identity", "bar",
+]  # fmt: skip
+"""What is drawn, which decides its colour, its line style and its mark."""
+
+_MARKS: dict[str, str] = {
+    "sample": "M-3.6,0a3.6,3.6 0 1,0 7.2,0a3.6,3.6 0 1,0 -7.2,0z",
+    "initial": "M-3.4,-3.4h6.8v6.8h-6.8z",
+    "covering": "M0,-4.6L4.2,3.2H-4.2z",
+    "failed": "M-4,-4L4,4M-4,4L4,-4",
+    "worst": "M0,-8L2.1,-2.6L7.6,-2.4L3.3,1.1L4.7,6.6L0,3.5L-4.7,6.6L-3.3,1.1L-7.6,-2.4L-2.1,-2.6z",
+    "corrected": "M0,-4.6L4.6,0L0,4.6L-4.6,0z",
+    "mean": "M-3.6,0a3.6,3.6 0 1,0 7.2,0a3.6,3.6 0 1,0 -7.2,0z",
+    "weak": "M-4,-4L4,4M-4,4L4,-4",
+}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of a chart.
+
+    Attributes:
+        label: its name with the unit.
+        low, high: its ends; if they are equal or not finite, it is widened to a range around them.
+    """
+
+    label: str
+    low: float
+    high: float
+
+    @classmethod
+    def over(cls, label: str, *values: ArrayLike, zero: bool = False, room: float = 0.06) -> Axis:
+        """Return an axis that holds all finite values, with some room around them.
+
+        Args:
+            label: its name with the unit.
+            values: arrays or numbers that must be visible.
+            zero: whether it starts at 0; values are then expected to be at least 0.
+            room: share of the range that is left free at each end.
+        """
+        flat = np.concatenate([np.ravel(np.asarray(one, dtype=np.float64)) for one in values] or [np.zeros(1)])
+        finite = flat[np.isfinite(flat) & (np.abs(flat) < 1e300)]
+        low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
+        low = 0.0 if zero else low - room * (high - low)
+        return cls(label, low, high + room * (high - low))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Its ends, which are different."""
+        if self.high - self.low > 1e-12 * max(abs(self.low), abs(self.high)):
+            return self.low, self.high
+        width = 0.5 * abs(self.low) or 0.5
+        return self.low - width, self.low + width
+
+    def ticks(self, count: int = _TICKS) -> list[float]:
+        """Return round numbers within the axis, about so many."""
+        low, high = self.ends
+        raw = (high - low) / count
+        power = 10.0 ** np.floor(np.log10(raw))
+        step = power * next(one for one in (1.0, 2.0, 2.5, 5.0, 10.0) if one * power >= raw * (1 - 1e-9))
+        first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
+        return [float(k * step) for k in np.arange(first, last + 1)][: 4 * count]
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(eq=False)
+class Chart:
+    """A chart with two axes, to which lines, bands and marks are added in the order of drawing.
+
+    Attributes:
+        title: what it shows; screen readers read it, and it stands below the chart.
+        x, y: the axes.
+        width, height: its size in its own units.
+    """
+
+    title: str
+    x: Axis
+    y: Axis
+    width: int = WIDTH
+    height: int = HEIGHT
+    _parts: list[Markup] = field(default_factory=list, init=False)
+    _legend: dict[str, tuple[str, str]] = field(default_factory=dict, init=False)
+
+    # Positions
+
+    def across(self, values: ArrayLike) -> Array:
+        """Return the horizontal positions of values of x; NaN stays NaN."""
+        low, high = self.x.ends
+        share = (np.asarray(values, dtype=np.float64) - low) / (high - low)
+        return np.asarray(_LEFT + np.clip(share, -0.02, 1.02) * (self.width - _LEFT - _RIGHT))
+
+    def up(self, values: ArrayLike) -> Array:
+        """Return the vertical positions of values of y; NaN stays NaN."""
+        low, high = self.y.ends
+        share = (np.asarray(values, dtype=np.float64) - low) / (high - low)
+        return np.asarray(self.height - _BOTTOM - np.clip(share, -0.02, 1.02) * (self.height - _TOP - _BOTTOM))
+
+    # What is drawn
+
+    def line(self, x: ArrayLike, y: ArrayLike, kind: Kind, label: str = "") -> Chart:
+        """Add a line; it is interrupted at values that are not finite."""
+        at = np.stack([self.across(x), self.up(y)], axis=-1)
+        self._named(kind, label, "line")
+        self._parts += [_path(run, f"line {kind}") for run in _runs(at) if len(run) > 1]
+        return self
+
+    def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, label: str = "") -> Chart:
+        """Add a band between two lines."""
+        xs = self.across(x)
+        outline = np.concatenate([np.stack([xs, self.up(low)], -1), np.stack([xs, self.up(high)], -1)[::-1]])
+        self._named("band", label, "area")
+        if np.isfinite(outline).all():
+            self._parts.append(_path(outline, "band", closed=True))
+        return self
+
+    def marks(
+        self, x: ArrayLike, y: ArrayLike, kind: Kind, label: str = "", names: Sequence[str] | None = None
+    ) -> Chart:
+        """Add marks; their names appear if the pointer rests on them."""
+        xs, ys = np.ravel(self.across(x)), np.ravel(self.up(y))
+        self._named(kind, label, "mark")
+        for k, (left, top) in enumerate(zip(xs.tolist(), ys.tolist(), strict=True)):
+            if np.isfinite(left + top):
+                name = None if names is None else element("title", names[k])
+                where = f"translate({left:.1f} {top:.1f})"
+                self._parts.append(element("path", name, d=_MARKS[kind], transform=where, class_=f"mark {kind}"))
+        return self
+
+    def whiskers(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, kind: Kind) -> Chart:
+        """Add vertical intervals."""
+        for left, bottom, top in zip(
+            np.ravel(self.across(x)), np.ravel(self.up(low)), np.ravel(self.up(high)), strict=True
+        ):
+            if np.isfinite(left + bottom + top):
+                self._parts.append(_path(np.array([[left, bottom], [left, top]]), f"whisker {kind}"))
+        return self
+
+    def limit(self, value: float | None, kind: Kind, label: str) -> Chart:
+        """Add a horizontal line across the chart; nothing if the value is None."""
+        if value is not None and np.isfinite(value):
+            self.line(self.x.ends, [value, value], kind, f"{label} {number(value)}")
+        return self
+
+    def bars(self, values: ArrayLike, names: Sequence[str]) -> Chart:
+        """Add one vertical bar for each name, at 0, 1, ..."""
+        room = 0.7 * float(self.across(1.0) - self.across(0.0))
+        for k, value in enumerate(np.ravel(np.asarray(values, dtype=np.float64)).tolist()):
+            top, bottom = float(self.up(max(value, 0.0))), float(self.up(0.0))
+            left = float(self.across(k)) - 0.5 * room
+            shape = {"x": f"{left:.1f}", "y": f"{top:.1f}", "width": f"{room:.1f}", "height": f"{bottom - top:.1f}"}
+            self._parts.append(element("rect", element("title", f"{names[k]}: {number(value)}"), class_="bar", **shape))
+        return self
+
+    def image(self, values: Array, low: float, high: float) -> Chart:
+        """Add a map of values ``(rows, columns)``, the first row at the bottom, in a colour scale from low to high."""
+        left, right = (float(self.across(end)) for end in self.x.ends)
+        bottom, top = (float(self.up(end)) for end in self.y.ends)
+        shape = {"x": f"{left:.1f}", "y": f"{top:.1f}", "width": f"{right - left:.1f}", "height": f"{bottom - top:.1f}"}
+        picture = data_uri(values, low, high)
+        self._parts.append(element("image", href=picture, preserveAspectRatio="none", class_="map", **shape))
+        return self
+
+    def _named(self, kind: str, label: str, form: str) -> None:
+        if label:
+            self._legend[label] = (kind, form)
+
+    # The chart
+
+    def __html__(self) -> str:
+        """Return the chart with its legend, as templates and elements insert it."""
+        return str(self.render())
+
+    def render(self, *below: Markup) -> Markup:
+        """Return the chart as a figure with a legend and its title; elements ``below`` follow the legend."""
+        drawing = element(
+            "svg",
+            element("title", self.title),
+            self._frame(),
+            element("g", *self._parts),
+            viewBox=f"0 0 {self.width} {self.height}",
+            role="img",
+            class_="chart",
+        )
+        return element("figure", drawing, legend(self._legend), *below, element("figcaption", self.title))
+
+    def _frame(self) -> Markup:
+        left, right = _LEFT, self.width - _RIGHT
+        top, bottom = _TOP, self.height - _BOTTOM
+        box = element("path", d=f"M{left},{top}V{bottom}H{right}", class_="axis")
+        middle = 0.5 * (top + bottom)
+        names = (
+            element("text", self.x.label, x=0.5 * (left + right), y=self.height - 8, class_="axis-label"),
+            element("text", self.y.label, transform=f"translate(13 {middle}) rotate(-90)", class_="axis-label"),
+        )
+        return element("g", *self._ticks_across(bottom), *self._ticks_up(left, right), box, *names)
+
+    def _ticks_across(self, bottom: float) -> list[Markup]:
+        found = []
+        for value in self.x.ticks():
+            at = round(float(self.across(value)), 1)
+            found.append(element("path", d=f"M{at},{bottom}v4", class_="axis"))
+            found.append(element("text", number(value), x=at, y=bottom + 18, class_="tick across"))
+        return found
+
+    def _ticks_up(self, left: float, right: float) -> list[Markup]:
+        found = []
+        for value in self.y.ticks():
+            at = round(float(self.up(value)), 1)
+            found.append(element("path", d=f"M{left},{at}H{right}", class_="grid"))
+            found.append(element("text", number(value), x=left - 6, y=at + 4, class_="tick up"))
+        return found
+
+    def __repr__(self) -> str:
+        return f"Chart({self.title!r}, {self.x!r}, {self.y!r})"
+
+
+def legend(named: dict[str, tuple[str, str]]) -> Markup | None:
+    """Return a legend, from labels with the kind and the form (line, area or mark) of each; None if there is none."""
+    if not named:
+        return None
+    swatches = (element("li", _swatch(kind, form), element("span", label)) for label, (kind, form) in named.items())
+    return element("ul", *swatches, class_="legend")
+
+
+def _swatch(kind: str, form: str) -> Markup:
+    if form == "mark":
+        inside = element("path", d=_MARKS[kind], transform="translate(13 8)", class_=f"mark {kind}")
+    elif form == "area":
+        inside = element("path", d="M1,3H25V13H1z", class_="band")
+    else:
+        inside = element("path", d="M1,8H25", class_=f"line {kind}")
+    return element("svg", inside, viewBox="0 0 26 16", aria_hidden="true", class_="swatch")
+
+
+def data_uri(values: Array, low: float, high: float) -> str:
+    """Return a picture of values ``(rows, columns)`` as a data URI, the first row at the bottom.
+
+    The colours are those of cividis, which is the same for people with and without colour blindness, and whose
+    brightness grows with the value.
+    """
+    from matplotlib.image import imsave  # imported here: loading it takes longer than a short campaign
+
+    buffer = io.BytesIO()
+    imsave(buffer, values, vmin=low, vmax=high, cmap="cividis", origin="lower", format="png")
+    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def colour_scale(low: float, high: float, label: str) -> Markup:
+    """Return the scale of a map."""
+    shades = element(
+        "image", href=data_uri(np.linspace(0, 1, 64)[None], 0, 1), width=200, height=10, x=140,
+        preserveAspectRatio="none",
+    )  # fmt: skip
+    ends = element("text", number(low), x=134, y=10, class_="tick up"), element("text", number(high), x=346, y=10)
+    name = element("text", label, x=240, y=28, class_="axis-label")
+    return element("svg", shades, *ends, name, viewBox="0 0 480 34", class_="chart scale", aria_hidden="true")
+
+
+def _runs(at: Array) -> list[Array]:
+    """Return the stretches of points ``(k, 2)`` that are finite."""
+    finite = np.isfinite(at).all(axis=-1)
+    edges = np.flatnonzero(np.diff(finite.astype(int))) + 1
+    return [
+        run for run, keep in zip(np.split(at, edges), np.split(finite, edges), strict=True) if len(keep) and keep[0]
+    ]
+
+
+def _path(at: Array, class_: str, *, closed: bool = False) -> Markup:
+    """Return a path through points ``(k, 2)``, in relative coordinates, which are shorter."""
+    rounded = np.rint(10 * at).astype(int)
+    steps = np.diff(rounded, axis=0)
+    start = f"M{_tenth(rounded[0, 0])},{_tenth(rounded[0, 1])}"
+    rest = "".join(f"l{_tenth(dx)},{_tenth(dy)}" for dx, dy in steps.tolist())
+    return element("path", d=start + rest + ("z" if closed else ""), class_=class_)
+
+
+def _tenth(value: int) -> str:
+    return f"{value / 10:g}"

@@ -1,0 +1,282 @@
+"""What a report is made from: the trials of a store, and the experiment if it is known. Nothing here executes S."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import call
+from ctxval.campaign.campaign import Campaign
+from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
+from ctxval.core.labels import Labels, labels_of
+from ctxval.core.space import TaskSpace
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Change, Trial
+from ctxval.core.validation import Validation
+from ctxval.errors import InputError
+from ctxval.learning.replays import Replay, replay_executed
+from ctxval.report.distance_model import DistanceModel
+from ctxval.storage.store import Store
+
+MOST_REPLAYS = 120
+"""Largest number of trials that are replayed on the corrected model: those with the largest distances."""
+
+_SLOW_REPLAYS = 40
+"""The same, if the synthesizer designs one controller at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The trajectories of one trial.
+
+    Attributes:
+        model: the closed loop on M.
+        system: the execution of S.
+    """
+
+    model: Trajectory
+    system: Trajectory
+
+    def __repr__(self) -> str:
+        return call(self, self.model, self.system)
+
+
+@dataclass(frozen=True, eq=False)
+class ReportContext:
+    """Everything that the sections of a report read.
+
+    Attributes:
+        name: the name of the experiment.
+        space: the task space.
+        trials: all trials, in the order of asking.
+        store: the store of the trials.
+        verdict: the verdict; None if there is no threshold.
+        validation: the map p -> d(p), which is never executed; None if the experiment is not loaded.
+        missing: why the experiment is not loaded, as a sentence; empty if it is.
+        labels: names and units of states, inputs and the distance.
+        budget: the budget of the campaign; None if it is not known.
+        settings: the settings in the store, which make the experiment again; empty if it has none.
+        description: the description of the experiment in the store.
+        changes: the later changes of the store.
+        provenance: what a certificate knows besides the trials.
+    """
+
+    name: str
+    space: TaskSpace
+    trials: tuple[Trial, ...]
+    store: Store
+    verdict: Verdict | None = None
+    validation: Validation | None = None
+    missing: str = ""
+    labels: Labels = field(default_factory=Labels)
+    budget: int | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    description: Mapping[str, Any] = field(default_factory=dict)
+    changes: tuple[Change, ...] = ()
+    provenance: Provenance = field(default_factory=Provenance)
+
+    # Trials
+
+    @functools.cached_property
+    def completed(self) -> tuple[Trial, ...]:
+        """The trials with a distance."""
+        return tuple(trial for trial in self.trials if trial.distance is not None)
+
+    @functools.cached_property
+    def failed(self) -> tuple[Trial, ...]:
+        """The trials that failed or could not be measured."""
+        return tuple(trial for trial in self.trials if trial.state in ("failed", "unmeasured"))
+
+    @property
+    def executions(self) -> int:
+        """The number of executions of S that have ended."""
+        return sum(trial.executed for trial in self.trials)
+
+    @functools.cached_property
+    def worst_first(self) -> tuple[Trial, ...]:
+        """The trials with a distance, the largest first."""
+        return tuple(sorted(self.completed, key=lambda trial: -distance_of(trial)))
+
+    @functools.cached_property
+    def points(self) -> Array:
+        """The points of the unit cube with a distance ``(n, d)``."""
+        return np.array([trial.unit_point for trial in self.completed]).reshape(-1, self.space.dimension)
+
+    @functools.cached_property
+    def distances(self) -> Array:
+        """The distances ``(n,)`` of these points."""
+        return np.array([distance_of(trial) for trial in self.completed])
+
+    def coordinates(self, trials: Sequence[Trial]) -> Array:
+        """Return the tasks of trials in the units of the parameters, ``(n, d)``."""
+        points = np.array([trial.unit_point for trial in trials]).reshape(-1, self.space.dimension)
+        return self.space.from_unit(points)
+
+    @property
+    def threshold(self) -> float | None:
+        """The threshold of the verdict; None if there is none."""
+        return None if self.verdict is None else self.verdict.threshold
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """The certificate of the verdict; None if there is none."""
+        return None if self.verdict is None else self.verdict.certificate
+
+    @property
+    def bound(self) -> float | None:
+        """The bound on d*; None if there is none, or it is withdrawn."""
+        return None if self.verdict is None else self.verdict.bound
+
+    # Trajectories
+
+    @functools.cached_property
+    def recordings(self) -> dict[int, Recording]:
+        """The trajectories of the trials that have both, by number; those that do not fit to the others are left out."""
+        found: dict[int, Recording] = {}
+        sizes: tuple[int, int] | None = None
+        for trial in self.worst_first:
+            one = self._recording(trial)
+            if one is None:
+                continue
+            own = (one.system.states.shape[-1], one.system.inputs.shape[-1])
+            sizes = own if sizes is None else sizes
+            if own == sizes:
+                found[trial.number] = one
+        return found
+
+    def _recording(self, trial: Trial) -> Recording | None:
+        model = self.store.trajectory(trial.number, "model")
+        system = self.store.trajectory(trial.number, "system")
+        if model is None or system is None or model.batch_shape or system.batch_shape:
+            return None
+        same = model.states.shape == system.states.shape and model.inputs.shape == system.inputs.shape
+        return Recording(model, system) if same and model.horizon and model.finite and system.finite else None
+
+    @functools.cached_property
+    def signals(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The labels of the states and of the inputs, with units."""
+        if not self.recordings:
+            return (), ()
+        first = next(iter(self.recordings.values())).system
+        system = None if self.validation is None else self.validation.system
+        named = self.labels.names(system, first.states.shape[-1], first.inputs.shape[-1])
+        of_states, of_inputs = map(labels_of, named)
+        return of_states, of_inputs
+
+    @property
+    def distance_label(self) -> str:
+        """The label of an axis of the distance."""
+        return f"distance [{self.labels.units}]" if self.labels.units else "distance"
+
+    # What follows from them
+
+    @functools.cached_property
+    def distance_model(self) -> DistanceModel | None:
+        """The distance over the tasks as the trials show it; None if it cannot be fitted."""
+        return DistanceModel.of(self.completed)
+
+    @functools.cached_property
+    def replays(self) -> dict[int, Replay]:
+        """The replays of the trials with recordings on the corrected model, by number; empty without the experiment."""
+        if self.validation is None or not self.recordings:
+            return {}
+        quick = bool(getattr(self.validation.synthesizer, "batched", False))
+        by_number = {trial.number: trial for trial in self.completed}
+        numbers = list(self.recordings)[: MOST_REPLAYS if quick else _SLOW_REPLAYS]
+        executed = [(by_number[number].unit_point, one.system) for number, one in self.recordings.items()]
+        found = replay_executed(self.validation, executed, [by_number[number].unit_point for number in numbers])
+        return {number: one for number, one in zip(numbers, found, strict=True) if one is not None}
+
+    def __repr__(self) -> str:
+        return call(self, self.name, trials=len(self.trials), verdict=self.verdict)
+
+
+def distance_of(trial: Trial) -> float:
+    """Return the distance of a completed trial."""
+    assert trial.distance is not None
+    return trial.distance
+
+
+def context_of_campaign(
+    campaign: Campaign,
+    verdict: Verdict | None = None,
+    *,
+    threshold: float | None = None,
+    certificate: CertificateOptions | None = None,
+    budget: int | None = None,
+) -> ReportContext:
+    """Return what a report of a campaign is made from.
+
+    Args:
+        campaign: the campaign.
+        verdict: its verdict, if it was computed before.
+        threshold: tau, for a verdict that is computed now; None to use ``verdict``.
+        certificate: the kind and the options of the certificate of that verdict.
+        budget: the budget of the campaign.
+    """
+    found = verdict
+    if found is None and threshold is not None:
+        found = campaign.verdict(threshold, certificate=certificate)
+    return ReportContext(
+        campaign.name,
+        campaign.validation.space,
+        campaign.trials,
+        campaign.store,
+        found,
+        campaign.validation,
+        labels=campaign.validation.labels,
+        budget=budget,
+        settings=campaign.store.settings(),
+        description=campaign.store.description(),
+        changes=tuple(campaign.store.history()),
+        provenance=campaign.provenance,
+    )
+
+
+def context_of_store(
+    store: Store,
+    threshold: float | None = None,
+    *,
+    certificate: CertificateOptions | None = None,
+    missing: str = "",
+    labels: Labels | None = None,
+) -> ReportContext:
+    """Return what a report of a store is made from, if its experiment is not loaded. No code is imported or run.
+
+    Args:
+        store: the store.
+        threshold: tau; without it there is no verdict.
+        certificate: the kind and the options of the certificate.
+        missing: why the experiment is not loaded, as a sentence.
+        labels: names and units.
+
+    Raises:
+        InputError: if the store does not describe its task space, or its trials do not lie in it.
+        StoreError: if the store cannot be read.
+    """
+    description, changes, trials = store.description(), store.history(), store.trials()
+    provenance = Provenance.of(description, changes)
+    space = provenance.space
+    if space is None or any(len(trial.unit_point) != space.dimension for trial in trials):
+        raise InputError(f"{store.name} has no readable task space, so there is nothing to report.")
+    name = description.get("name")
+    context = ReportContext(
+        name if isinstance(name, str) else "",
+        space,
+        tuple(trials),
+        store,
+        missing=missing or "the experiment is not loaded",
+        labels=labels or Labels(),
+        settings=store.settings(),
+        description=description,
+        changes=tuple(changes),
+        provenance=provenance,
+    )
+    if threshold is None:
+        return context
+    return replace(context, verdict=judge(trials, threshold, certificate, provenance))

@@ -1,0 +1,124 @@
+"""The distance over the tasks as the trials show it: a Gaussian process whose bands are never below zero."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.representation import call
+from ctxval.core.trial import Trial
+from ctxval.gp.regression import GaussianProcess
+from ctxval.gp.surrogate import Learned, learn
+
+NORMAL_95 = 1.96
+"""Number of standard deviations of a band of 95 %."""
+
+_TASKS = 4096
+"""Number of random tasks from which shares of the task space are estimated."""
+
+_SOBOL = 256
+"""Number of base points of the sensitivity indices, a power of two; d + 2 times as many tasks are predicted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Predicted distances of several tasks.
+
+    Attributes:
+        median: the medians ``(m,)``.
+        low, high: the ends of their bands of 95 %, ``(m,)``; none is below 0.
+    """
+
+    median: Array
+    low: Array
+    high: Array
+
+    def __repr__(self) -> str:
+        return call(self, len(self.median))
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceModel:
+    """The Gaussian process of the distance, or of its logarithm if that fits clearly better.
+
+    Attributes:
+        points: points of the unit cube with a known distance ``(n, d)``.
+        values: their distances ``(n,)``.
+        learned: its hyperparameters and its scale.
+        process: the process, conditioned on the distances.
+    """
+
+    points: Array
+    values: Array
+    learned: Learned
+    process: GaussianProcess
+
+    @classmethod
+    def of(cls, trials: Sequence[Trial]) -> DistanceModel | None:
+        """Return the model of completed trials; None if fewer than two distances are known, or none can be fitted."""
+        known = [trial for trial in trials if trial.distance is not None]
+        points = np.array([trial.unit_point for trial in known])
+        values = np.array([trial.distance for trial in known], dtype=np.float64)
+        if len(known) < 2:
+            return None
+        with single_threaded(), np.errstate(all="ignore"):
+            learned = learn(points, values)
+            process = learned.condition(points, values)
+        return cls(points, values, learned, process) if np.isfinite(process.alpha).all() else None
+
+    def predict(self, points: Array) -> Band:
+        """Return the distances predicted at points of the unit cube ``(m, d)``."""
+        with single_threaded():
+            return self._band(*self.process.predict(points))
+
+    @functools.cached_property
+    def left_out(self) -> Band:
+        """The distance of each trial as all other trials predict it."""
+        return self._band(*self.process.left_out())
+
+    @functools.cached_property
+    def calibration(self) -> float:
+        """Root mean square of the standardised leave-one-out errors; about 1 if the bands are as wide as the errors."""
+        mean, variance = self.process.left_out()
+        return float(np.sqrt(np.mean((self.process.y - mean) ** 2 / np.maximum(variance, 1e-300))))
+
+    @functools.cached_property
+    def tasks(self) -> Array:
+        """Random tasks, points of the unit cube ``(m, d)``."""
+        return np.random.default_rng(0).random((_TASKS, self.points.shape[1]))
+
+    @functools.cached_property
+    def over_tasks(self) -> Band:
+        """The distances predicted at the random tasks."""
+        return self.predict(self.tasks)
+
+    @functools.cached_property
+    def sensitivity(self) -> Array:
+        """Total Sobol index of each parameter ``(d,)``: its share in the variance of the predicted distance.
+
+        It includes the interactions of the parameter with others, so that the indices may sum to more than 1.
+        """
+        d = self.points.shape[1]
+        if d == 1:
+            return np.ones(1)
+        from scipy.stats import sobol_indices, uniform  # imported here, because it is slow to load
+
+        with np.errstate(all="ignore"):
+            found = sobol_indices(func=lambda x: self.predict(x.T).median[None], n=_SOBOL, dists=[uniform()] * d, rng=0)
+        return np.clip(np.nan_to_num(np.ravel(found.total_order)), 0.0, 1.0)
+
+    def _band(self, mean: Array, variance: Array) -> Band:
+        def on_own_scale(standardised: Array) -> Array:
+            with np.errstate(all="ignore"):
+                values = self.learned.warp.backward(self.learned.shift + self.learned.scale * standardised)
+            return np.maximum(values, 0.0)
+
+        half = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
+        return Band(on_own_scale(mean), on_own_scale(mean - half), on_own_scale(mean + half))
+
+    def __repr__(self) -> str:
+        return call(self, trials=len(self.values), dimension=self.points.shape[1])

@@ -1,0 +1,58 @@
+"""Findings of a report: one sentence with its numbers, and a light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from ctxval._util.representation import record
+from ctxval._util.texts import reason_of
+from ctxval.report.context import ReportContext
+
+Light = Literal["good", "attention", "bad", "unknown"]
+"""A traffic light: nothing speaks against it; read it; it speaks against M or the verdict; it is not known."""
+
+WORDS: dict[Light, str] = {"good": "good", "attention": "attention", "bad": "problem", "unknown": "not known"}
+"""The word of each light, which stands beside its colour."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that the trials show.
+
+    Attributes:
+        name: what it is about, in a few words.
+        light: how it is to be taken.
+        text: one or more sentences with the numbers.
+        numbers: the same numbers for JSON, by name.
+    """
+
+    name: str
+    light: Light
+    text: str
+    numbers: dict[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all attributes, ready for JSON."""
+        return {"name": self.name, "light": self.light, "text": self.text, "numbers": self.numbers}
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+Question = Callable[[ReportContext], Finding | None]
+"""A function that looks for one thing; it returns None if there is nothing to say."""
+
+
+def findings_of(questions: Iterable[tuple[str, Question]], context: ReportContext) -> list[Finding]:
+    """Return what questions find; a question that fails is a finding that is not known."""
+    found = (_asked(name, question, context) for name, question in questions)
+    return [one for one in found if one is not None]
+
+
+def _asked(name: str, question: Question, context: ReportContext) -> Finding | None:
+    try:
+        return question(context)
+    except Exception as error:  # one question about odd data must not hide the answers to the others
+        return Finding(name, "unknown", f"This could not be computed: {reason_of(error)}.")

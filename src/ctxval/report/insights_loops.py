@@ -1,0 +1,240 @@
+"""Insights on the closed loops: which states err and when, and whether the controllers are sound."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ctxval._util.arrays import Array, Mask
+from ctxval.core.controller import Limits
+from ctxval.core.distance import ComposedDistance
+from ctxval.core.trajectory import Trajectory
+from ctxval.report.context import Recording, ReportContext
+from ctxval.report.findings import Finding
+from ctxval.report.markup import number, percent
+
+_WORST = 5
+"""Number of trials with the largest distances that these insights look at."""
+
+_NEAR = 0.1
+"""Two tasks are neighbours if they are nearer than this, in diagonals of the task space."""
+
+_FLIPPED = 0.5
+"""Controllers of neighbours flip if their inputs on M differ by more than this share of the range of the inputs."""
+
+_UNUSUAL = 3.0
+"""A state of M is unusual if it is this many times as large as in the median trial."""
+
+_MISSED = 0.1
+"""M misses its goal if it ends farther away than this, as a share of the range of a state."""
+
+_SATURATED = 0.01
+"""Least share of steps at a limit that is worth a note."""
+
+
+def components(context: ReportContext) -> Finding | None:
+    """Which states err in the worst trials, and when their errors peak."""
+    if not context.recordings:
+        return None
+    worst = list(context.recordings.values())[:_WORST]
+    spans = _spans(one.system.states for one in context.recordings.values())
+    errors = [np.abs(one.system.states - one.model.states) / spans for one in worst]
+    peaks = np.mean([one.max(axis=0) for one in errors], axis=0)
+    j = int(peaks.argmax())
+    times = [float(one.system.times[error[:, j].argmax()]) for one, error in zip(worst, errors, strict=True)]
+    end = float(np.mean([one.system.times[-1] for one in worst]))
+    label, when = context.signals[0][j], float(np.median(times))
+    text = (
+        f"In the {len(worst)} worst trials, S differs from M most in {label}: by {percent(float(peaks[j]))} of its "
+        f"range at the peak, which is at {number(when, 3)} s of {number(end, 3)} s."
+    )
+    shares = _shares(context, worst)
+    numbers = {"state": label, "peak": float(peaks[j]), "time": when, "shares": shares}
+    if shares:
+        text += " Of the error that the distance measures, " + _listed(shares) + "."
+    return Finding("What errs, and when", "attention", text, numbers)
+
+
+def _shares(context: ReportContext, worst: list[Recording]) -> dict[str, float]:
+    """Return the shares of the states in the error that the distance is composed of; empty if they are not known."""
+    validation = context.validation
+    distance = None if validation is None else validation.distance
+    if validation is None or not isinstance(distance, ComposedDistance) or not hasattr(distance, "components"):
+        return {}
+    compared = distance.components
+    labels = context.signals[0]
+    names = labels if compared is None else [labels[i] for i in compared]
+    tasks = [context.replays[k].task for k in list(context.recordings)[:_WORST] if k in context.replays]
+    errors = np.array([distance.error(one.model, one.system, task) for one, task in zip(worst, tasks, strict=False)])
+    if errors.ndim != 2 or errors.shape[1] != len(names) or not np.abs(errors).sum() > 0:
+        return {}
+    sizes = np.abs(errors).mean(axis=0)
+    return {name: float(size) for name, size in zip(names, sizes / sizes.sum(), strict=True)}
+
+
+def _listed(shares: dict[str, float]) -> str:
+    largest = sorted(shares.items(), key=lambda item: -item[1])[:3]
+    return " and ".join(f"{percent(share)} is in {name}" for name, share in largest)
+
+
+def flips(context: ReportContext) -> Finding | None:
+    """Whether the controllers of neighbouring tasks differ abruptly."""
+    if len(context.recordings) < 2:
+        return None
+    by_number = {trial.number: trial for trial in context.completed}
+    numbers = list(context.recordings)
+    points = np.array([by_number[k].unit_point for k in numbers]) / np.sqrt(context.space.dimension)
+    pairs = sorted(KDTree(points).query_pairs(_NEAR))
+    inputs = [context.recordings[k].model.inputs for k in numbers]
+    spans = _spans(inputs)
+    changes = [
+        (float((np.abs(inputs[i] - inputs[j]) / spans).max()), i, j)
+        for i, j in pairs
+        if inputs[i].shape == inputs[j].shape and inputs[i].size
+    ]
+    if not changes:
+        return None
+    size, i, j = max(changes)
+    flipped = sum(change > _FLIPPED for change, _, _ in changes)
+    values = {"neighbours": len(changes), "flipped": flipped, "largest_change": size}
+    if not flipped:
+        text = (
+            f"The controllers of the {len(changes)} pairs of neighbouring tasks are alike: their inputs on M differ by "
+            f"at most {percent(size)} of the range of the inputs."
+        )
+        return Finding("Controllers flip", "good", text, values)
+    text = (
+        f"{flipped} of {len(changes)} pairs of neighbouring tasks have controllers that differ abruptly, for example "
+        f"trials {numbers[i]} and {numbers[j]}: their inputs on M differ by {percent(size)} of the range of the "
+        "inputs. A planner that jumps between solutions makes the distance jump, too."
+    )
+    return Finding("Controllers flip", "attention", text, values)
+
+
+def unusual_motion(context: ReportContext) -> Finding | None:
+    """Whether M itself makes an unusual motion in the worst trials, such as turning over."""
+    if len(context.recordings) < 4:
+        return None
+    sizes = np.array(
+        [np.abs(one.model.states - one.model.states[0]).max(axis=0) for one in context.recordings.values()]
+    )
+    usual = np.maximum(np.median(sizes, axis=0), 1e-3 * sizes.max(axis=0) + 1e-300)
+    ratios = sizes[:_WORST] / usual
+    row, j = (int(k) for k in np.unravel_index(int(ratios.argmax()), ratios.shape))
+    trial, label, ratio = list(context.recordings)[row], context.signals[0][j], float(ratios[row, j])
+    values = {"trial": trial, "state": label, "times_the_median": ratio}
+    if ratio < _UNUSUAL:
+        text = f"In the worst trials M moves like in the others: at most {number(ratio, 2)} times as far as usual."
+        return Finding("Motion of M", "good", text, values)
+    text = (
+        f"In trial {trial} M itself moves {number(float(sizes[row, j]))} in {label}, {number(ratio, 2)} times as far as "
+        "in the median trial: the controller asks for an unusual motion, which may explain the distance better than an "
+        "error of M."
+    )
+    return Finding("Motion of M", "attention", text, values)
+
+
+def saturation(context: ReportContext) -> Finding | None:
+    """Whether inputs stay at their limits."""
+    executed = [one.system.inputs for one in context.recordings.values() if one.system.inputs.size]
+    if not executed:
+        return None
+    together = np.concatenate(executed)
+    at_limit, known = _at_limit(context, together)
+    share = at_limit.mean(axis=0)
+    j = int(share.argmax())
+    label = context.signals[1][j]
+    values = {"input": label, "share_of_steps": float(share[j]), "limits_known": known}
+    if share[j] < _SATURATED:
+        return Finding("Inputs saturate", "good", f"The inputs stay off their limits in {_rest(share[j])}.", values)
+    text = f"{label} is at its limit in {percent(float(share[j]))} of all steps" + (
+        "." if known else " (the limits are taken from the records, in which the extreme value repeats)."
+    )
+    return Finding("Inputs saturate", "attention", text, values)
+
+
+def _rest(share: float) -> str:
+    return "all steps" if not share else f"{percent(1 - float(share), 4)} of the steps"
+
+
+def _at_limit(context: ReportContext, inputs: Array) -> tuple[Mask, bool]:
+    """Return which inputs ``(N, m)`` are at a limit, and whether the limits are those of the synthesizer."""
+    given = None if context.validation is None else getattr(context.validation.synthesizer, "limits", None)
+    spans = np.maximum(np.ptp(inputs, axis=0), 1e-300)
+    if given is not None:
+        limits = Limits.of(given, inputs.shape[-1])
+        near = 1e-6 * spans
+        return (inputs <= limits.low + near) | (inputs >= limits.high - near), True
+    low, high = inputs.min(axis=0), inputs.max(axis=0)
+    at = (inputs <= low + 1e-9 * spans) | (inputs >= high - 1e-9 * spans)
+    # An extreme value that occurs once is no limit.
+    return at & (at.sum(axis=0) > 2 + len(context.recordings)) & (np.ptp(inputs, axis=0) > 0), False
+
+
+def converged(context: ReportContext) -> Finding | None:
+    """Whether the designs of the controllers converged."""
+    told = {k: one.converged for k, one in context.replays.items() if one.converged is not None}
+    if not told:
+        return None
+    failed = [k for k, one in told.items() if not one]
+    values = {"designs": len(told), "not_converged": failed}
+    if not failed:
+        text = f"The design of the controller converged in all {len(told)} trials that were designed again."
+        return Finding("Designs converge", "good", text, values)
+    text = (
+        f"The design of the controller did not converge in {len(failed)} of {len(told)} trials: it stopped at its limit "
+        f"of iterations. {len([k for k in list(context.recordings)[:_WORST] if k in failed])} of them are among the "
+        f"{_WORST} worst."
+    )
+    return Finding("Designs converge", "attention", text, values)
+
+
+def goals(context: ReportContext) -> Finding | None:
+    """Whether M itself reaches its goals under the controllers that are designed on it."""
+    if context.validation is None:
+        text = f"Not known, because the goals need the experiment: {context.missing}"
+        return Finding("M reaches its goals", "unknown", text)
+    if not context.replays:
+        return None
+    weighed = _weighed(context)
+    if not len(weighed):
+        text = "Not known: the synthesizer does not tell which states it brings to a goal."
+        return Finding("M reaches its goals", "unknown", text)
+    spans = _spans(one.model.states for one in context.recordings.values())[weighed]
+    numbers = list(context.replays)
+    misses = np.array([_miss(context.recordings[k].model, context.replays[k].task.goal)[weighed] for k in numbers])
+    shares = misses / spans
+    missed = shares.max(axis=1) > _MISSED
+    row, j = (int(k) for k in np.unravel_index(int(shares.argmax()), shares.shape))
+    label, size = context.signals[0][int(weighed[j])], float(misses[row, j])
+    values = {"missed": int(missed.sum()), "trials": len(numbers), "largest_miss": size, "state": label}
+    text = (
+        f"M ends within {percent(_MISSED)} of the range of each weighted state from its goal in "
+        f"{len(numbers) - int(missed.sum())} of {len(numbers)} trials; it misses most in {label}, by {number(size)}, in "
+        f"trial {numbers[row]}."
+    )
+    if missed.any():
+        text += " A controller that fails on M cannot be expected to work on S."
+    return Finding("M reaches its goals", "attention" if missed.any() else "good", text, values)
+
+
+def _miss(trajectory: Trajectory, goal: Array) -> Array:
+    return np.abs(trajectory.final_state - goal)
+
+
+def _weighed(context: ReportContext) -> Array:
+    """Return the indices of the states that the controller brings to their goals; none if it does not tell."""
+    n = len(context.signals[0])
+    cost = None if context.validation is None else getattr(context.validation.synthesizer, "cost", None)
+    weights = getattr(cost, "Q_final", getattr(cost, "Q", None))
+    if weights is None or np.shape(weights) != (n, n):
+        return np.empty(0, dtype=int)
+    return np.flatnonzero(np.diag(weights) > 0)
+
+
+def _spans(parts: Iterator[Array] | list[Array]) -> Array:
+    """Return the range of each column over all trajectories, which is never 0."""
+    ends = np.array([[part.min(axis=0), part.max(axis=0)] for part in parts if part.size])
+    return np.asarray(np.maximum(ends[:, 1].max(axis=0) - ends[:, 0].min(axis=0), 1e-300))

@@ -1,0 +1,176 @@
+"""Insights on the distance over the tasks: where M is weak, how biased it is, and whether dynamics explain it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Mask
+from ctxval.report.context import ReportContext, distance_of
+from ctxval.report.findings import Finding
+from ctxval.report.markup import number, percent, quantity
+
+_NARROW = 0.7
+"""A region is described by the parameters in which it is narrower than this share of the range."""
+
+_RARE = 0.002
+"""Below this share of weak tasks the random tasks hold too few of them, and the executed ones describe the region."""
+
+_NAMED = 3
+"""Largest number of parameters that describe a region."""
+
+_EXPLAINED = 0.8
+"""Least share of the distance that a corrected model must predict to explain it."""
+
+
+def weak_region(context: ReportContext) -> Finding | None:
+    """Where the distance exceeds the threshold, executed and predicted."""
+    tau, units = context.threshold, context.labels.units
+    if tau is None or not len(context.distances):
+        return None
+    above = context.distances > tau
+    largest = quantity(float(context.distances.max()), units)
+    model = context.distance_model
+    share = 0.0 if model is None else float((model.over_tasks.median > tau).mean())
+    numbers = {"executed_above": int(above.sum()), "executed": len(above), "predicted_share_above": share}
+    if not above.any():
+        ratio = percent(float(context.distances.max()) / tau, 3)
+        text = (
+            f"No executed task exceeds {quantity(tau, units)}: the largest distance is {largest}, {ratio} of the "
+            f"threshold. The trials predict that {percent(share)} of the tasks exceed it."
+        )
+        return Finding("Where M is weak", "good" if not share else "attention", text, numbers)
+    weak = context.points[above] if model is None or share < _RARE else model.tasks[model.over_tasks.median > tau]
+    text = (
+        f"{int(above.sum())} of {len(above)} executed tasks exceed {quantity(tau, units)}, the largest with {largest}: "
+        f"{region_text(context, weak)}. The trials predict that {percent(share)} of all tasks exceed it."
+    )
+    return Finding("Where M is weak", "bad", text, numbers)
+
+
+def region_text(context: ReportContext, points: Array) -> str:
+    """Return where points of the unit cube ``(m, d)`` lie, by the parameters in which they differ from all tasks."""
+    low, high = np.quantile(points, [0.05, 0.95], axis=0)
+    width = high - low
+    narrow = [int(j) for j in np.argsort(width) if width[j] < _NARROW][:_NAMED]
+    if not narrow:
+        return "they are spread over the task space"
+    ends = context.space.from_unit(np.stack([low, high]))
+    parts = [_interval(context.space.labels[j], number(ends[0, j], 3), number(ends[1, j], 3)) for j in narrow]
+    return f"most of them have {' and '.join(parts)}"
+
+
+def _interval(label: str, low: str, high: str) -> str:
+    return f"{label} at {low}" if low == high else f"{label} from {low} to {high}"
+
+
+def weak_states(context: ReportContext) -> Finding | None:
+    """Which states and inputs the system visits where M is weak, and not elsewhere."""
+    if len(context.recordings) < 4:
+        return None
+    weak = _weak_rows(context)
+    ranges = np.array([_extent(one.system.states, one.system.inputs) for one in context.recordings.values()])
+    low, high = ranges[:, 0], ranges[:, 1]
+    inside_low, inside_high = low[~weak].min(axis=0), high[~weak].max(axis=0)
+    span = np.maximum(high.max(axis=0) - low.min(axis=0), 1e-300)
+    beyond = np.maximum(high[weak].max(axis=0) - inside_high, inside_low - low[weak].min(axis=0)) / span
+    j = int(beyond.argmax())
+    label = [label for labels in context.signals for label in labels][j]
+    which = "above the threshold" if _is_above(context) else "with the largest distances"
+    numbers = {"signal": label, "beyond": float(beyond[j])}
+    if beyond[j] < 0.05:
+        text = f"The {int(weak.sum())} trials {which} visit the same states and inputs as the others."
+        return Finding("States visited there", "good", text, numbers)
+    text = (
+        f"The {int(weak.sum())} trials {which} lead to {label} from {number(low[weak, j].min())} to "
+        f"{number(high[weak, j].max())}; all others stay within {number(inside_low[j])} and {number(inside_high[j])}."
+    )
+    return Finding("States visited there", "attention", text, numbers)
+
+
+def _extent(states: Array, inputs: Array) -> Array:
+    """Return the smallest and the largest value of each state and input, shape ``(2, n + m)``."""
+    lows = np.concatenate([states.min(axis=0), inputs.min(axis=0)])
+    return np.stack([lows, np.concatenate([states.max(axis=0), inputs.max(axis=0)])])
+
+
+def _is_above(context: ReportContext) -> bool:
+    return context.threshold is not None and _above(context).any() and not _above(context).all()
+
+
+def _above(context: ReportContext) -> Mask:
+    by_number = {trial.number: distance_of(trial) for trial in context.completed}
+    return np.array([by_number[number] for number in context.recordings]) > (context.threshold or np.inf)
+
+
+def _weak_rows(context: ReportContext) -> Mask:
+    """Return which recordings are weak: those above the threshold, or else the quarter with the largest distances."""
+    if _is_above(context):
+        return np.asarray(_above(context))
+    return np.arange(len(context.recordings)) < max(1, len(context.recordings) // 4)
+
+
+def bias(context: ReportContext) -> Finding | None:
+    """How the distance of a typical task compares with the largest one, and whether S errs to one side of M."""
+    model = context.distance_model
+    if model is None or not context.distances.max() > 0:
+        return None
+    typical = float(np.mean(model.over_tasks.median))
+    share = typical / float(context.distances.max())
+    text = (
+        f"The mean distance over all tasks is predicted to be {quantity(typical, context.labels.units)}, "
+        f"{percent(share)} of the largest executed one: "
+        + ("M errs nearly everywhere." if share > 0.6 else "M errs in a part of the tasks." if share > 0.2 else
+           "M errs in few tasks.")
+    )  # fmt: skip
+    numbers = {"mean_distance": typical, "share_of_largest": share}
+    sided = _side(context)
+    if sided is not None:
+        label, same = sided
+        text += (
+            f" At the end of the executed tasks S lies on the same side of M in {label} in {percent(same, 3)} of the "
+            "trials" + (", so the error is systematic." if same > 0.9 else ".")
+        )
+        numbers |= {"one_sided_share": same}
+    return Finding("Bias across the tasks", "attention" if share > 0.6 else "good", text, numbers)
+
+
+def _side(context: ReportContext) -> tuple[str, float] | None:
+    """Return the state with the largest final error, and the share of trials whose error has the usual sign."""
+    if len(context.recordings) < 4:
+        return None
+    errors = np.array([one.system.final_state - one.model.final_state for one in context.recordings.values()])
+    spans = np.maximum(np.ptp([one.system.final_state for one in context.recordings.values()], axis=0), 1e-300)
+    j = int((np.abs(errors) / spans).mean(axis=0).argmax())
+    return context.signals[0][j], float(max((errors[:, j] > 0).mean(), (errors[:, j] < 0).mean()))
+
+
+def explained(context: ReportContext) -> Finding | None:
+    """Whether the corrected model, learned from the other trials, predicts the distance."""
+    if context.validation is None:
+        text = f"Not known, because the corrected model needs the experiment: {context.missing}"
+        return Finding("Corrected model", "unknown", text)
+    by_number = {trial.number: distance_of(trial) for trial in context.completed}
+    pairs = [(by_number[k], one.distance) for k, one in context.replays.items() if np.isfinite(one.distance)]
+    if len(pairs) < 2:
+        return Finding("Corrected model", "unknown", "Not known: the trials do not teach a correction of M.")
+    executed, predicted = np.array(pairs).T
+    size = float(np.sqrt((executed**2).mean()))
+    error = float(np.sqrt(((executed - predicted) ** 2).mean()))
+    share = 1 - error / max(size, 1e-300)
+    numbers = {"share_explained": share, "error": error, "trials": len(pairs)}
+    said = (
+        f"M with a residual that is learned from the other trials predicts the distances of {len(pairs)} trials with "
+        f"an error of {quantity(error, context.labels.units)} (root mean square), "
+        f"{percent(error / max(size, 1e-300))} of the distances."
+    )
+    if share >= _EXPLAINED:
+        return Finding(
+            "Corrected model", "good",
+            f"{said} It explains the distance: the difference is a function of the recorded state and input, and a "
+            "model that is fitted to these data can remove it.", numbers,
+        )  # fmt: skip
+    return Finding(
+        "Corrected model", "attention",
+        f"{said} It does not explain the distance: a state that is not recorded, a contact, dry friction or noise is "
+        "the likely cause, or too few trials.", numbers,
+    )  # fmt: skip

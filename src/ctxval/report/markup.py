@@ -1,0 +1,149 @@
+"""HTML and SVG elements whose texts are always escaped, and the few shapes that sections are made of.
+
+A text that is not :class:`Markup` is escaped, its control characters are written out, and it is shortened. So a name
+from a store can neither script the page nor change its layout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from markupsafe import Markup, escape
+
+from ctxval._util.representation import shown
+from ctxval._util.texts import plain, shortened, visible
+
+LONGEST = 2_000
+"""Characters of one text."""
+
+_CELL = 300
+"""Characters of a cell of a table."""
+
+_VOID = ("br", "meta", "link", "input")
+
+
+def text(value: object, longest: int = LONGEST) -> Markup:
+    """Return a text that cannot be markup; :class:`Markup` stays as it is."""
+    if isinstance(value, Markup):
+        return value
+    return escape(shortened(visible(plain(value)), longest))
+
+
+def element(name: str, *children: object, **attributes: object) -> Markup:
+    """Return one element.
+
+    Args:
+        name: the name of the element.
+        children: elements, or texts that are escaped; None is left out.
+        attributes: its attributes. An underscore is a hyphen, and one at the end is dropped: ``class_``. An attribute
+            that is None is left out, and one that is True has no value.
+    """
+    inside = Markup("").join(text(child) for child in children if child is not None)
+    given = Markup("").join(_attribute(key, value) for key, value in attributes.items() if value is not None)
+    if name in _VOID:
+        return Markup("<{}{}>").format(Markup(name), given)
+    return Markup("<{0}{1}>{2}</{0}>").format(Markup(name), given, inside)
+
+
+def _attribute(key: str, value: object) -> Markup:
+    name = Markup(key.rstrip("_").replace("_", "-"))
+    if value is True:
+        return Markup(" {}").format(name)
+    return Markup(' {}="{}"').format(name, text(value, 1_000_000))
+
+
+def joined(parts: Iterable[Markup]) -> Markup:
+    """Return elements one after the other."""
+    return Markup("").join(parts)
+
+
+def paragraph(*children: object, class_: str | None = None) -> Markup:
+    """Return a paragraph."""
+    return element("p", *children, class_=class_)
+
+
+def heading(words: object, level: int = 3) -> Markup:
+    """Return a heading inside a section, whose own heading has level 2."""
+    return element(f"h{level}", words)
+
+
+def bullets(items: Iterable[object], class_: str | None = None) -> Markup:
+    """Return a list; an item that is an ``li`` element stays as it is."""
+    rows = (item if str(item).startswith("<li") and isinstance(item, Markup) else element("li", item) for item in items)
+    return element("ul", *rows, class_=class_)
+
+
+def table(caption: str, headers: Sequence[str], rows: Iterable[Sequence[object]], class_: str | None = None) -> Markup:
+    """Return a table with a caption; the first cell of each row is its header. Numbers have four digits.
+
+    Args:
+        caption: what the table shows.
+        headers: the names of the columns.
+        rows: one sequence of cells for each row; each cell is a number, a text or an element.
+        class_: further classes of the element.
+    """
+    head = element("tr", *(element("th", header, scope="col") for header in headers))
+    body = joined(_row(cells) for cells in rows)
+    inside = element("caption", caption), element("thead", head), element("tbody", body)
+    # A wide table scrolls by itself, so it can be reached by the keyboard.
+    return element(
+        "div",
+        element("table", *inside, class_=class_),
+        class_="scroll",
+        tabindex="0",
+        role="region",
+        aria_label=shortened(visible(caption), 120),
+    )
+
+
+def _row(cells: Sequence[object]) -> Markup:
+    first, *others = cells
+    return element("tr", element("th", cell(first), scope="row"), *(element("td", cell(one)) for one in others))
+
+
+def cell(value: object) -> Markup:
+    """Return the content of a cell: numbers with four digits, a dash for None."""
+    if value is None:
+        return Markup("&ndash;")
+    if isinstance(value, Markup):
+        return value
+    return text(value if isinstance(value, str) else number(value), _CELL)
+
+
+def number(value: object, digits: int = 4) -> str:
+    """Return a number as text, with so many significant digits; other values as at a prompt."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number):
+        return shown(value)
+    short = str(int(value)) if isinstance(value, int | np.integer) else f"{float(value):.{digits}g}"
+    return short.replace("-", "\u2212") if short != "-0" else "0"
+
+
+def percent(share: float, digits: int = 2) -> str:
+    """Return a share in percent; only a share of nothing is 0 %, and only a share of all is 100 %."""
+    value = 100 * share
+    if 0 < value < 0.01:
+        return "less than 0.01 %"
+    if 99.9 < value < 100:
+        return "more than 99.9 %"
+    return f"{value:.{max(digits, 3 if value >= 10 else digits)}g} %"
+
+
+def quantity(value: float | None, units: str = "") -> str:
+    """Return a number with its unit; a dash if it is None."""
+    return "\u2013" if value is None else f"{number(value)} {units}".rstrip()
+
+
+def code(words: str, label: str) -> Markup:
+    """Return a block to copy.
+
+    Args:
+        words: the code.
+        label: what it is, for screen readers.
+    """
+    return element("pre", element("code", words), tabindex="0", role="region", aria_label=label)
+
+
+def details(summary: str, *children: object, opened: bool = False) -> Markup:
+    """Return a part that can be folded; it is unfolded in print."""
+    return element("details", element("summary", summary), *children, open=opened or None)

@@ -1,0 +1,214 @@
+"""An appendix for the file, in the vocabulary of NASA-STD-7009B and of ASME V&V 10 and V&V 20."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from markupsafe import Markup
+
+from ctxval._util.representation import record
+from ctxval.certificates.bounds import at_most, with_error
+from ctxval.report.context import ReportContext, distance_of
+from ctxval.report.diagnostics import diagnostics, not_tested
+from ctxval.report.findings import WORDS
+from ctxval.report.markup import joined, number, paragraph, quantity, table
+from ctxval.report.sections.repeat import command_of, digest
+from ctxval.version import VERSION
+
+_NASA, _V10, _V20 = "NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry of the appendix.
+
+    Attributes:
+        term: the term of the standard.
+        standard: the standards that use it.
+        content: what this campaign has to say about it, in sentences.
+    """
+
+    term: str
+    standard: str
+    content: str
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+class AppendixSection:
+    """What a file on the credibility of a model holds, as far as this campaign knows it."""
+
+    title = "For the file"
+
+    def render(self, context: ReportContext) -> Markup:
+        """Return the entries as a table."""
+        rows = [(one.term, one.content, one.standard) for one in appendix(context)]
+        return joined(
+            [
+                paragraph(
+                    "The entries use the vocabulary of the named standards. They state what this campaign knows; they "
+                    "are no claim of conformance."
+                ),
+                table("Appendix for the file", ("Term", "Content", "Vocabulary of"), rows, class_="facts"),
+            ]
+        )
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"
+
+
+def appendix(context: ReportContext) -> list[Entry]:
+    """Return the entries of the appendix."""
+    return [
+        Entry("Intended use", f"{_NASA}, {_V10}", _intended_use(context)),
+        Entry("Response quantity of interest and validation metric", f"{_V10}, {_V20}", _metric(context)),
+        Entry("Acceptance criterion (accuracy requirement)", f"{_NASA}, {_V10}", _criterion(context)),
+        Entry("Referent data", f"{_NASA}, {_V10}", _referent(context)),
+        Entry("Comparison error E = S \u2212 D (here: M \u2212 S)", _V20, _error(context)),
+        Entry("Domain of validation, and what lies outside it", f"{_NASA}, {_V10}, {_V20}", _domain(context)),
+        Entry("Uncertainty characterization", f"{_NASA}, {_V10}, {_V20}", _uncertainty(context)),
+        Entry("Results robustness (sensitivity)", _NASA, _robustness(context)),
+        Entry("Assumptions", f"{_NASA}, {_V10}", _assumptions(context)),
+        Entry("Limits of the assessment: what was not tested", f"{_NASA}, {_V10}", " ".join(not_tested(context))),
+        Entry("Verification", f"{_NASA}, {_V10}", _verification(context)),
+        Entry("Changes during the campaign", _NASA, _changes(context)),
+        Entry("Provenance", _NASA, _provenance(context)),
+        Entry("Conclusion", f"{_NASA}, {_V10}", _conclusion(context)),
+    ]
+
+
+def appendix_json(context: ReportContext) -> list[dict[str, str]]:
+    """Return the entries of the appendix, ready for JSON."""
+    return [asdict(one) for one in appendix(context)]
+
+
+def _intended_use(context: ReportContext) -> str:
+    space = context.space
+    ranges = "; ".join(
+        f"{label} from {number(low)} to {number(high)}"
+        for label, low, high in zip(space.labels, space.low.tolist(), space.high.tolist(), strict=True)
+    )
+    spread = context.provenance.distribution
+    how = "uniform" if spread is None else spread
+    design = ""
+    if context.validation is not None:
+        design = f", with the synthesizer {type(context.validation.synthesizer).__name__}"
+    return (
+        f"The model predicts closed loops under controllers that are designed on it{design}, for the tasks of "
+        f"{context.name or 'this experiment'}: {ranges}. Distribution of tasks: {how}."
+    )
+
+
+def _metric(context: ReportContext) -> str:
+    parts = context.description.get("validation")
+    described = parts.get("distance") if isinstance(parts, dict) else None
+    kind = described.get("type", "a function") if isinstance(described, dict) else described or "not known"
+    return (
+        f"The context-specific distance d(p) between the trajectories of model and system under the same controller "
+        f"({kind}{f', in {context.labels.units}' if context.labels.units else ''}); the quantity of interest is its "
+        "largest value d* over all tasks."
+    )
+
+
+def _criterion(context: ReportContext) -> str:
+    if context.verdict is None:
+        return "None was stated."
+    tau, certificate = quantity(context.verdict.threshold, context.labels.units), context.certificate
+    confidence = "" if certificate is None else f", with confidence {number(certificate.confidence)}"
+    return f"d* is at most {tau}{confidence}."
+
+
+def _referent(context: ReportContext) -> str:
+    origins = {
+        origin: sum(trial.origin == origin for trial in context.trials)
+        for origin in sorted({t.origin for t in context.trials})
+    }
+    listed = ", ".join(f"{count} {origin}" for origin, count in origins.items())
+    return (
+        f"{context.executions} executions of the system in {len(context.trials)} trials ({listed or 'none'}), of which "
+        f"{len(context.completed)} gave a distance and {len(context.recordings)} a recorded trajectory. Digest of the "
+        f"description of the system: {_part_digest(context, 'system')}."
+    )
+
+
+def _error(context: ReportContext) -> str:
+    if not context.completed:
+        return "No distance is known."
+    units, values = context.labels.units, context.distances
+    worst = context.worst_first[0]
+    return (
+        f"Largest distance {quantity(distance_of(worst), units)} (trial {worst.number}), median "
+        f"{quantity(float(np.median(values)), units)}, smallest {quantity(float(values.min()), units)}, over "
+        f"{len(values)} executed tasks. The tasks were chosen by a search for large distances, so the median is not that "
+        "of all tasks."
+    )
+
+
+def _domain(context: ReportContext) -> str:
+    if not len(context.points):
+        return "Nothing was executed."
+    low, high = context.coordinates(context.completed).min(axis=0), context.coordinates(context.completed).max(axis=0)
+    executed = "; ".join(
+        f"{label} from {number(a)} to {number(b)}"
+        for label, a, b in zip(context.space.labels, low.tolist(), high.tolist(), strict=True)
+    )
+    return f"Executed: {executed}. Nothing is said about tasks outside the intended use."
+
+
+def _uncertainty(context: ReportContext) -> str:
+    found = context.certificate
+    if found is None:
+        return "No certificate was computed, so no uncertainty is stated for tasks that were not executed."
+    bound = with_error(found.upper_bound, found.error)
+    said = (
+        f"By the certificate {found.kind}, d* is at most {bound} with confidence {number(found.confidence)}"
+        f"{f', except for {at_most(100 * found.volume, 3)} % of the tasks' if found.volume else ''}. The uncertainty of "
+        "the measured trajectories themselves is not part of it."
+    )
+    return f"{said} The certificate is withdrawn: {found.doubt}." if found.doubt is not None else said
+
+
+def _robustness(context: ReportContext) -> str:
+    model = context.distance_model
+    if model is None:
+        return "Not known: fewer than two distances."
+    order = np.argsort(-model.sensitivity, kind="stable")[:5]
+    listed = "; ".join(f"{context.space.labels[j]} {number(float(model.sensitivity[j]), 2)}" for j in order)
+    return f"Total Sobol indices of the predicted distance, the largest first: {listed}."
+
+
+def _assumptions(context: ReportContext) -> str:
+    found = context.certificate
+    if found is None:
+        return "None beyond the recorded executions."
+    return "; ".join(found.assumptions) + "."
+
+
+def _verification(context: ReportContext) -> str:
+    said = "; ".join(f"{one.name}: {WORDS[one.light]}" for one in diagnostics(context))
+    return (
+        "Software and solution verification of the model itself are not part of this campaign. Diagnostics of the "
+        f"campaign: {said}."
+    )
+
+
+def _changes(context: ReportContext) -> str:
+    return "; ".join(f"{one.at[:19]} {one.what}: {one.why}" for one in context.changes) or "None is recorded."
+
+
+def _provenance(context: ReportContext) -> str:
+    return (
+        f"Store {context.store.name}; ctxval {VERSION}; command: {command_of(context) or 'none'}; digest of the "
+        f"description of the model: {_part_digest(context, 'model')}."
+    )
+
+
+def _part_digest(context: ReportContext, part: str) -> str:
+    parts = context.description.get("validation")
+    return digest(parts[part]) if isinstance(parts, dict) and part in parts else "not known"
+
+
+def _conclusion(context: ReportContext) -> str:
+    return "No verdict, because no threshold was stated." if context.verdict is None else f"{context.verdict}"

@@ -1,0 +1,78 @@
+"""The largest distance and the bound against the executions, and the time of each execution."""
+
+from __future__ import annotations
+
+import numpy as np
+from markupsafe import Markup
+
+from ctxval.report.charts import Axis, Chart
+from ctxval.report.context import ReportContext, distance_of
+from ctxval.report.markup import element, joined, number, paragraph
+
+
+class ConvergenceSection:
+    """How the search came to its worst task, and what the executions took."""
+
+    title = "Convergence"
+
+    def render(self, context: ReportContext) -> Markup:
+        """Return the chart of the distances and the chart of the times."""
+        if not context.completed:
+            return paragraph("No distance is known yet.")
+        return joined([element("div", _distances(context), _times(context), class_="charts"), _spent(context)])
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"
+
+
+def _distances(context: ReportContext) -> Chart:
+    numbers = np.array([trial.number for trial in context.completed], dtype=np.float64)
+    so_far = np.maximum.accumulate(context.distances)
+    last = float(max(trial.number for trial in context.trials))
+    limits = [one for one in (context.threshold, context.bound) if one is not None]
+    x = Axis.over("trial", [0.0, max(last, 1.0)], room=0.02)
+    chart = Chart(
+        "Distance of each trial and the largest one so far, with the threshold and the bound",
+        x,
+        Axis.over(context.distance_label, context.distances, limits, zero=True),
+    )
+    steps = np.repeat(numbers, 2)[1:], np.repeat(so_far, 2)[:-1]
+    chart.line(np.append(steps[0], last), np.append(steps[1], so_far[-1]), "best", "largest so far")
+    chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
+    names = [f"trial {trial.number}: {number(trial.distance)}" for trial in context.completed]
+    chart.marks(numbers, context.distances, "sample", "distance", names)
+    failed = [float(trial.number) for trial in context.failed]
+    if failed:
+        where = np.full(len(failed), 0.03 * chart.y.ends[1])
+        chart.marks(failed, where, "failed", "no distance is known")
+    return chart
+
+
+def _times(context: ReportContext) -> Chart | None:
+    timed = [(trial.number, trial.seconds) for trial in context.trials if trial.seconds is not None]
+    if not timed:
+        return None
+    numbers, seconds = np.array(timed, dtype=np.float64).T
+    chart = Chart(
+        "Time of each execution",
+        Axis.over("trial", [0.0, max(float(numbers.max()), 1.0)], room=0.02),
+        Axis.over("time [s]", seconds, zero=True),
+    )
+    return chart.marks(numbers, seconds, "sample", "time of the execution")
+
+
+def _spent(context: ReportContext) -> Markup:
+    timed = [trial.seconds for trial in context.trials if trial.seconds is not None]
+    attempts = sum(trial.attempts for trial in context.trials)
+    worst = context.worst_first[0]
+    said = (
+        f"{context.executions} executions in {len(context.trials)} trials, with {attempts} attempts. The largest "
+        f"distance, {number(distance_of(worst))}, was found in trial {worst.number}."
+    )
+    if timed:
+        said += (
+            f" The executions took {number(float(np.sum(timed)))} s, {number(float(np.median(timed)))} s in the median."
+        )
+    else:
+        said += " The times of the executions were not recorded."
+    return paragraph(said)

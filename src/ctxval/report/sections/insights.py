@@ -1,0 +1,24 @@
+"""Insights in words, each with its numbers."""
+
+from __future__ import annotations
+
+from markupsafe import Markup
+
+from ctxval.report.context import ReportContext
+from ctxval.report.insights import insights
+from ctxval.report.markup import paragraph
+from ctxval.report.sections.verdict import lights
+
+
+class InsightsSection:
+    """What the trials show of M, of the controllers and of the tasks."""
+
+    title = "Insights"
+
+    def render(self, context: ReportContext) -> Markup:
+        """Return the insights; nothing can be said of a campaign without distances."""
+        found = insights(context)
+        return lights(found) if found else paragraph("No distance is known yet, so nothing can be said.")
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"

@@ -1,0 +1,144 @@
+"""What repeats the campaign and each of its worst tasks: commands, seed, versions and digests."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import shlex
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from ctxval.core.trial import Trial
+from ctxval.report.context import ReportContext, distance_of
+from ctxval.report.markup import code, heading, joined, number, paragraph, table
+from ctxval.version import VERSION
+
+_WORST = 5
+_PACKAGES = ("numpy", "scipy")
+
+
+class RepeatSection:
+    """How to repeat the campaign, and each of the worst tasks."""
+
+    title = "To repeat it"
+
+    def render(self, context: ReportContext) -> Markup:
+        """Return the command, the seed, the versions, the digests and a snippet for each of the worst tasks."""
+        command = command_of(context)
+        parts = [
+            paragraph("The same command with the same versions makes the same choices.")
+            if command
+            else paragraph("No command made this store, so there is none that repeats it."),
+            code(command, "Command that repeats the campaign") if command else Markup(""),
+            table("What identifies this campaign", ("Name", "Value"), identity(context).items(), class_="facts"),
+            heading("The worst tasks"),
+            paragraph(
+                "Each snippet executes the system once. For a system that people operate, the command opens the task "
+                "again as a new trial, and writes its controller to files."
+            ),
+        ]
+        for trial in context.worst_first[:_WORST]:
+            parts += _snippets(context, trial)
+        return joined(parts)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"
+
+
+def identity(context: ReportContext) -> dict[str, str]:
+    """Return the seed, the versions and the digests by name."""
+    described = context.description
+    search = described.get("search")
+    parts = described.get("validation")
+    digests = {
+        f"digest of the {name}": digest(part)
+        for name, part in (parts.items() if isinstance(parts, Mapping) else ())
+        if name in ("space", "task", "system", "model", "synthesizer", "distance")
+    }
+    return {
+        "store": str(context.store.name),
+        "search": str(search.get("type")) if isinstance(search, Mapping) else "not known",
+        "seed": str(described.get("seed", "not known")),
+        "version of ctxval": VERSION,
+        "version of Python": platform.python_version(),
+        **{f"version of {name}": _version(name) for name in _PACKAGES},
+        "processor": platform.machine(),
+        **digests,
+        "digest of the trials": digest([_plain(trial) for trial in context.trials]),
+    }
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:  # a package without its metadata, as in a bundle
+        return "not known"
+
+
+def _plain(trial: Trial) -> list[Any]:
+    return [trial.number, trial.state, trial.unit_point.tolist(), trial.distance]
+
+
+def digest(value: Any) -> str:
+    """Return the SHA-256 of a value for JSON."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def command_of(context: ReportContext) -> str:
+    """Return the command that runs the campaign; empty if no command made the store."""
+    settings = context.settings
+    if not settings:
+        return ""
+    named = settings.get("experiment")
+    words = ["ctxval", "run", str(named) if named else f"{settings.get('name') or 'experiment'}.toml"]
+    search = settings.get("search")
+    given = {
+        "--search": search.get("name") if isinstance(search, Mapping) else None,
+        "--seed": settings.get("seed"),
+        "--budget": settings.get("budget") or context.budget,
+        "--threshold": settings.get("threshold"),
+    }
+    for option, value in given.items():
+        words += [option, str(value)] if value is not None else []
+    options = settings.get("options")
+    for name, value in options.items() if isinstance(options, Mapping) else ():
+        words += ["--option", f"{name}={value}"]
+    return shlex.join(words)
+
+
+def _snippets(context: ReportContext, trial: Trial) -> list[Markup]:
+    said = f"Trial {trial.number}, distance {number(distance_of(trial))} {context.labels.units}".rstrip()
+    return [
+        heading(said, 4),
+        code(python_snippet(context, trial), f"Python for trial {trial.number}"),
+        code(command_snippet(context, trial), f"Command for trial {trial.number}"),
+    ]
+
+
+def python_snippet(context: ReportContext, trial: Trial) -> str:
+    """Return Python that executes the task of a trial once. Texts of the store are literals in it."""
+    made = "validation = ...  # the Validation of the campaign"
+    if context.settings:
+        made = (
+            "from ctxval import Store\nfrom ctxval.config.settings import trusted_settings\n\n"
+            f"store = Store.existing({str(_path(context))!r})\n"
+            "validation = trusted_settings(store).load().validation"
+        )
+    return (
+        f"{made}\npoint = validation.space.point({trial.parameters!r})\noutcome = validation.outcome(point)\n"
+        f"print(outcome.distance)  # {distance_of(trial)!r} in the store"
+    )
+
+
+def command_snippet(context: ReportContext, trial: Trial) -> str:
+    """Return the command that opens the task of a trial again, and writes its controller to files."""
+    return shlex.join(["ctxval", "ask", str(_path(context)), "--again", str(trial.number)])
+
+
+def _path(context: ReportContext) -> Path | str:
+    return context.store.name if context.store.path is not None else "campaign.sqlite"

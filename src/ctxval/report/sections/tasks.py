@@ -1,0 +1,207 @@
+"""The distance over the tasks: as a curve, as a map, or as slices and parallel coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from markupsafe import Markup
+
+from ctxval._util.arrays import Array
+from ctxval.core.trial import Trial
+from ctxval.report.charts import Axis, Chart, Kind, colour_scale
+from ctxval.report.context import ReportContext
+from ctxval.report.diagnostics import stored_predictions
+from ctxval.report.distance_model import Band, DistanceModel
+from ctxval.report.markup import element, heading, joined, number, paragraph, percent
+from ctxval.report.parallel import parallel_coordinates
+from ctxval.report.region import region_map
+
+_CURVE, _GRID = 121, 48
+"""Number of points of a curve, and of each side of a map."""
+
+_SLICES = 12
+"""Largest number of slices: of the parameters to which the distance is most sensitive."""
+
+_ORIGINS: tuple[tuple[Kind, str, tuple[str, ...]], ...] = (
+    ("initial", "initial or chosen by a person", ("iid", "initial", "manual")),
+    ("covering", "chosen to cover the tasks", ("covering",)),
+    ("sample", "chosen by the search", ("acquisition",)),
+)
+
+
+class TasksSection:
+    """Where in the task space the distance is large, and how well that is known."""
+
+    title = "Distance over the tasks"
+
+    def render(self, context: ReportContext) -> Markup:
+        """Return the charts that suit the number of parameters, the sensitivity and the predictions."""
+        model = context.distance_model
+        if model is None:
+            return paragraph("Fewer than two distances are known, so no picture of the distance can be drawn.")
+        parts = [_space_charts(context, model), element("div", *_second_row(context, model), class_="charts")]
+        mapped = region_map(context)
+        if mapped is not None:
+            parts += [heading("Where the threshold is kept"), mapped]
+        return joined(parts)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"
+
+
+def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:
+    d = context.space.dimension
+    said = paragraph(
+        "The line and the band are a Gaussian process of the executed distances with its 95 % band, which is cut at "
+        "zero. It is a picture of what the trials suggest and not a certificate."
+    )
+    if d == 1:
+        return joined([said, element("div", _slice(context, model, 0, samples=True), class_="charts wide")])
+    if d == 2:
+        slices = (_slice(context, model, axis) for axis in range(2))
+        return joined([said, element("div", _map(context, model), *slices, class_="charts")])
+    axes = [int(j) for j in np.argsort(-model.sensitivity, kind="stable")[:_SLICES]]
+    left_out = d - len(axes)
+    more = paragraph(f"{left_out} parameters with less influence have no slice here.") if left_out else None
+    slices = (_slice(context, model, axis) for axis in axes)
+    return joined(
+        [
+            said,
+            heading("Slices through the worst task"),
+            element("div", *slices, class_="charts small"),
+            more or Markup(""),
+            heading("All tasks at once"),
+            parallel_coordinates(context),
+        ]
+    )
+
+
+def _slice(context: ReportContext, model: DistanceModel, axis: int, *, samples: bool = False) -> Chart:
+    """Return the distance along one parameter, through the worst executed task."""
+    space, worst = context.space, context.worst_first[0]
+    unit = np.tile(worst.unit_point, (_CURVE, 1))
+    unit[:, axis] = np.linspace(0, 1, _CURVE)
+    x, band = space.from_unit(unit)[:, axis], model.predict(unit)
+    label = space.labels[axis]
+    title = f"Distance over {label}" + ("" if space.dimension == 1 else ", through the worst executed task")
+    chart = Chart(title, Axis(label, float(space.low[axis]), float(space.high[axis])), _distance_axis(context, band))
+    chart.band(x, band.low, band.high, "95 % band").line(x, band.median, "mean", "Gaussian process")
+    chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
+    if samples:
+        _add_samples(chart, context, lambda trials: (context.coordinates(trials)[:, axis], _distances(trials)))
+        _add_failed(chart, context, axis)
+    at = context.coordinates([worst])[:, axis]
+    return chart.marks(at, _distances([worst]), "worst", "worst executed task", [_named(worst)])
+
+
+def _distance_axis(context: ReportContext, band: Band) -> Axis:
+    limits = [one for one in (context.threshold, context.bound) if one is not None]
+    # A threshold far above all distances would flatten the curve, so it may lie outside.
+    top = 3 * max(float(context.distances.max()), float(np.nanmax(band.median)))
+    shown = [one for one in limits if one <= top or top == 0]
+    high = np.minimum(band.high, max(top, *shown, 1e-300))
+    return Axis.over(context.distance_label, context.distances, high, shown, zero=True)
+
+
+def _map(context: ReportContext, model: DistanceModel) -> Markup:
+    """Return the map of two parameters, with the executed tasks."""
+    space = context.space
+    side = np.linspace(0, 1, _GRID)
+    unit = np.stack(np.meshgrid(side, side, indexing="xy"), axis=-1).reshape(-1, 2)
+    values = model.predict(unit).median.reshape(_GRID, _GRID)
+    low, high = 0.0, max(float(values.max()), float(context.distances.max()))
+    x, y = (Axis(space.labels[i], float(space.low[i]), float(space.high[i])) for i in range(2))
+    chart = Chart("Map of the distance over the two parameters, with the executed tasks", x, y, height=360)
+    chart.image(values, low, high)
+    tau = context.threshold
+    if tau is not None and (values > tau).any() and (values <= tau).any():
+        _add_contour(chart, space.from_unit(unit), values.ravel() > tau)
+    _add_samples(chart, context, lambda trials: tuple(context.coordinates(trials).T))
+    if context.failed:
+        chart.marks(
+            *context.coordinates(context.failed).T, "failed", "no distance is known", list(map(_named, context.failed))
+        )
+    worst = context.worst_first[0]
+    chart.marks(*context.coordinates([worst]).T, "worst", "worst executed task", [_named(worst)])
+    return chart.render(colour_scale(low, high, context.distance_label))
+
+
+def _add_contour(chart: Chart, points: Array, above: Array) -> None:
+    """Mark the edge of the region above the threshold, between the cells of the map."""
+    inside = above.reshape(_GRID, _GRID)
+    grid = points.reshape(_GRID, _GRID, 2)
+    half = 0.5 * (grid[1, 1] - grid[0, 0])
+    label = "edge of the region above the threshold"
+    for row, column in np.argwhere(inside[:, 1:] != inside[:, :-1]).tolist():
+        x, y = grid[row, column]
+        chart.line([x + half[0]] * 2, [y - half[1], y + half[1]], "threshold", label)
+    for row, column in np.argwhere(inside[1:] != inside[:-1]).tolist():
+        x, y = grid[row, column]
+        chart.line([x - half[0], x + half[0]], [y + half[1]] * 2, "threshold", label)
+
+
+def _add_samples(chart: Chart, context: ReportContext, place: object) -> None:
+    """Add the executed tasks, with a mark for each origin."""
+    for kind, label, origins in _ORIGINS:
+        trials = [trial for trial in context.completed if trial.origin in origins]
+        if trials:
+            chart.marks(*place(trials), kind, label, list(map(_named, trials)))  # type: ignore[operator]
+
+
+def _add_failed(chart: Chart, context: ReportContext, axis: int) -> None:
+    if context.failed:
+        x = context.coordinates(context.failed)[:, axis]
+        y = np.full(len(x), 0.03 * chart.y.ends[1])
+        chart.marks(x, y, "failed", "no distance is known", list(map(_named, context.failed)))
+
+
+def _distances(trials: list[Trial]) -> Array:
+    return np.array([trial.distance for trial in trials], dtype=np.float64)
+
+
+def _named(trial: Trial) -> str:
+    return f"trial {trial.number}: {'no distance' if trial.distance is None else number(trial.distance)}"
+
+
+def _second_row(context: ReportContext, model: DistanceModel) -> Iterator[Markup | Chart]:
+    """Yield the sensitivity to each parameter, and predicted against executed distances."""
+    if context.space.dimension > 1:
+        yield _sensitivity(context, model)
+    yield _predicted(context, model)
+
+
+def _sensitivity(context: ReportContext, model: DistanceModel) -> Markup:
+    labels, shares = context.space.labels, model.sensitivity
+    x, y = Axis("parameter, numbered from 0", -0.6, len(labels) - 0.4), Axis("share of the variance", 0.0, 1.0)
+    chart = Chart("Sensitivity of the distance to each parameter", x, y).bars(shares, labels)
+    largest = np.argsort(-shares, kind="stable")[:4]
+    listed = ", ".join(f"{j} = {labels[j]}: {percent(float(shares[j]))}" for j in largest)
+    note = paragraph(f"Total Sobol indices of the Gaussian process; the largest are {listed}.", class_="note")
+    return chart.render(note)
+
+
+def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
+    """Return predicted against executed distances, each predicted without its own execution."""
+    band = model.left_out
+    replayed = {k: one.distance for k, one in context.replays.items() if np.isfinite(one.distance)}
+    by_number = {trial.number: trial.distance or 0.0 for trial in context.completed}
+    # A wide interval would hide everything else.
+    top = 2 * float(context.distances.max())
+    axis = Axis.over(
+        context.distance_label, context.distances, np.minimum(band.median, top), list(replayed.values()), zero=True
+    )
+    y = Axis(f"predicted {context.distance_label}", axis.low, axis.high)
+    chart = Chart("Predicted against executed distance, each predicted without its own execution",
+                  Axis(f"executed {context.distance_label}", axis.low, axis.high), y)  # fmt: skip
+    chart.line(axis.ends, axis.ends, "identity", "predicted = executed")
+    chart.whiskers(model.values, band.low, band.high, "mean")
+    chart.marks(model.values, band.median, "mean", "by a Gaussian process of the distance, with its 95 % band")
+    if replayed:
+        executed = [by_number[k] for k in replayed]
+        chart.marks(executed, list(replayed.values()), "corrected", "by the corrected model")
+    beforehand = stored_predictions(context)
+    if beforehand:
+        x = [trial.distance or 0.0 for trial, _ in beforehand]
+        chart.marks(x, [one.median for _, one in beforehand], "covering", "stored before the execution")
+    return chart

@@ -1,0 +1,175 @@
+"""The trials: a table that can be sorted, the trajectories of each, and the five worst at once."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from ctxval._util.arrays import Array
+from ctxval.core.trial import Trial
+from ctxval.report.charts import Axis, Chart
+from ctxval.report.context import Recording, ReportContext
+from ctxval.report.markup import cell, details, element, heading, joined, number, paragraph, quantity
+from ctxval.report.recorded_lines import RecordedLines, recorded_lines
+
+DATA = "trial-data"
+"""Identifier of the element with the trajectories."""
+
+_ROWS = 1000
+"""Largest number of trials in the table: those with the largest distances, and those without a distance."""
+
+_WORST = 5
+_SIGNALS = 10
+"""Largest number of states and inputs that are drawn for each of the worst trials: those with the largest errors."""
+
+_POINTS = 90
+"""Number of points of a line of the worst trials."""
+
+
+class TrialsSection:
+    """All trials, and what S and M did in them."""
+
+    title = "Trials"
+
+    def render(self, context: ReportContext) -> Markup:
+        """Return the table, the place for one trial, its data, and the worst trials."""
+        if not context.trials:
+            return paragraph("There are no trials.")
+        lines = recorded_lines(context)
+        return joined(
+            [
+                paragraph(_left_out(context, lines)),
+                _table(context, lines),
+                element("div", id="trial", aria_live="polite", class_="needs-script"),
+                data_element(DATA, lines.data),
+                _worst(context),
+            ]
+        )
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"
+
+
+def data_element(identifier: str, data: Any) -> Markup:
+    """Return data for the page's script. The element is no script itself, and its content cannot end it."""
+    plain = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    for character in "<>&":
+        plain = plain.replace(character, f"\\u{ord(character):04x}")
+    return element("script", Markup(plain), type="application/json", id=identifier)
+
+
+def _left_out(context: ReportContext, lines: RecordedLines) -> str:
+    said = [f"The page has the trajectories of {len(lines.kept)} of {len(context.trials)} trials."]
+    if lines.left_out:
+        said.append(
+            f"Those of {len(lines.left_out)} trials with smaller distances are left out, so that the page stays small."
+        )
+    if lines.thinned:
+        said.append(f"Each line has about {lines.points} of the recorded points; `ctxval export` writes all of them.")
+    if not context.replays and context.missing:
+        said.append(f"The corrected model is not drawn, because it needs the experiment: {context.missing}")
+    elif context.replays:
+        said.append("The corrected model in each trial is learned from the other trials.")
+    return " ".join(said)
+
+
+def _table(context: ReportContext, lines: RecordedLines) -> Markup:
+    shown = [*context.worst_first, *(trial for trial in context.trials if trial.distance is None)][:_ROWS]
+    headers = (
+        *("trial", "distance", "state", "origin"),
+        *context.space.labels,
+        *("time [s]", "attempts", "remarks"),
+    )
+    heads = element("tr", *(element("th", label, scope="col") for label in headers))
+    points = context.coordinates(shown)
+    rows = [_row(trial, point, trial.number in lines.kept) for trial, point in zip(shown, points, strict=True)]
+    caption = f"Trials, the largest distance first{'' if len(shown) == len(context.trials) else f' ({_ROWS} of them)'}"
+    inside = element("caption", caption), element("thead", heads), element("tbody", *rows)
+    whole = element("table", *inside, class_="sortable", id="trials")
+    return element("div", whole, class_="scroll tall", tabindex="0", role="region", aria_label="Table of trials")
+
+
+def _row(trial: Trial, point: Array, recorded: bool) -> Markup:
+    first: object = trial.number
+    if recorded:
+        first = element(
+            "button", str(trial.number), type="button", data_trial=trial.number, aria_label=f"Show trial {trial.number}"
+        )
+    remarks = "; ".join(filter(None, (trial.failure, trial.because)))
+    values = (trial.distance, trial.state, trial.origin, *point.tolist(), trial.seconds, trial.attempts, remarks)
+    head = element("th", cell(first) if recorded else cell(trial.number), scope="row", data_value=trial.number)
+    return element("tr", head, *map(_cell, values))
+
+
+def _cell(value: object) -> Markup:
+    exact = repr(float(value)) if isinstance(value, int | float) else None
+    return element("td", cell(value) if value != "" else "", data_value=exact)
+
+
+def _worst(context: ReportContext) -> Markup:
+    """Return the trajectories of the worst trials, drawn without a script."""
+    numbers = list(context.recordings)[:_WORST]
+    if not numbers:
+        return paragraph("No trajectories are recorded, so the worst trials cannot be drawn.")
+    by_number = {trial.number: trial for trial in context.completed}
+    parts = [heading(f"The {len(numbers)} worst trials")]
+    for number_ in numbers:
+        trial = by_number[number_]
+        head = f"Trial {number_}: {quantity(trial.distance, context.labels.units)} at {_where(context, trial)}"
+        charts = element("div", *_signals(context, number_), class_="charts small")
+        parts.append(details(head, charts, opened=number_ == numbers[0]))
+    return joined(parts)
+
+
+def _where(context: ReportContext, trial: Trial) -> str:
+    values = context.coordinates([trial])[0].tolist()
+    listed = [f"{label} = {number(value)}" for label, value in zip(context.space.labels, values, strict=True)]
+    return ", ".join(listed[:4]) + (f" and {len(listed) - 4} more" if len(listed) > 4 else "")
+
+
+def _signals(context: ReportContext, number_: int) -> list[Chart]:
+    """Return one chart for each state and input of a trial, those with the largest errors if they are many."""
+    recording = context.recordings[number_]
+    replay = context.replays.get(number_)
+    corrected = None if replay is None else replay.corrected
+    labels = [label for named in context.signals for label in named]
+    of_model, of_system = _joined(recording, "model"), _joined(recording, "system")
+    n = recording.model.states.shape[-1]
+    sizes = [
+        float(np.abs(s - m).max(initial=0.0) / max(np.ptp(m), 1e-300)) for m, s in zip(of_model, of_system, strict=True)
+    ]
+    chosen = sorted(np.argsort(sizes)[::-1][:_SIGNALS].tolist())
+    drawn = []
+    for j in chosen:
+        lines = [of_system[j], of_model[j]]
+        if corrected is not None:
+            lines.append(corrected.states[:, j] if j < n else corrected.inputs[:, j - n])
+        reference = (
+            None if replay is None or j >= n or not replay.task.reference[:, j].any() else replay.task.reference[:, j]
+        )
+        drawn.append(_signal(f"{labels[j]} in trial {number_}", labels[j], recording.system.times, lines, reference))
+    return drawn
+
+
+def _joined(recording: Recording, side: str) -> list[Array]:
+    one = getattr(recording, side)
+    return [*one.states.T, *one.inputs.T]
+
+
+def _signal(title: str, label: str, times: Array, lines: list[Array], reference: Array | None) -> Chart:
+    every = [*lines, *([] if reference is None else [reference])]
+    chart = Chart(title, Axis("time [s]", float(times[0]), float(times[-1])), Axis.over(label, *every))
+    if reference is not None:
+        _thin(chart, times, reference, "reference", "reference")
+    kinds = (("system", "system S"), ("model", "model M"), ("corrected", "corrected model"))
+    for values, (kind, name) in zip(lines, kinds, strict=False):
+        _thin(chart, times, values, kind, name)
+    return chart
+
+
+def _thin(chart: Chart, times: Array, values: Array, kind: Any, name: str) -> None:
+    rows = np.unique(np.linspace(0, len(values) - 1, min(_POINTS, len(values))).astype(int))
+    chart.line(times[: len(values)][rows], values[rows], kind, name)

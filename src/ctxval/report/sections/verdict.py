@@ -1,0 +1,114 @@
+"""The verdict in one sentence, the diagnostics, and what was not tested."""
+
+from __future__ import annotations
+
+from markupsafe import Markup
+
+from ctxval._util.representation import shown
+from ctxval.certificates.bounds import at_most, with_error
+from ctxval.report.context import ReportContext, distance_of
+from ctxval.report.diagnostics import diagnostics, not_tested
+from ctxval.report.findings import WORDS, Finding
+from ctxval.report.markup import bullets, details, element, heading, joined, number, paragraph, quantity, table
+
+_SHAPES = {"good": "\u25cf", "attention": "\u25b2", "bad": "\u25a0", "unknown": "\u25cb"}
+"""A shape for each light, because colours alone tell nothing in grey print."""
+
+
+class VerdictSection:
+    """The verdict, with what it rests on."""
+
+    title = "Verdict"
+
+    def render(self, context: ReportContext) -> Markup:
+        """Return the sentence, the facts, the diagnostics and what was not tested."""
+        return joined(
+            [
+                paragraph(element("strong", _answer(context)), " ", _sentence(context), class_="verdict"),
+                _facts(context),
+                heading("Diagnostics"),
+                lights(diagnostics(context)),
+                heading("What was not tested"),
+                bullets(not_tested(context)),
+                _assumptions(context),
+            ]
+        )
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"
+
+
+def _answer(context: ReportContext) -> str:
+    return "no verdict." if context.verdict is None else f"{context.verdict.answer.capitalize()}."
+
+
+def _sentence(context: ReportContext) -> str:
+    """Return the verdict in one sentence."""
+    verdict = context.verdict
+    if verdict is None:
+        worst = context.worst_first[0] if context.worst_first else None
+        largest = "no distance is known" if worst is None else f"the largest executed distance is {_of(context)}"
+        return f"No threshold was given; {largest}."
+    reason = verdict.reason[:1].upper() + verdict.reason[1:]
+    return reason if verdict.rests_on is None else f"{reason} {verdict.rests_on}"
+
+
+def _of(context: ReportContext) -> str:
+    worst = context.worst_first[0]
+    return f"{quantity(distance_of(worst), context.labels.units)} in trial {worst.number}"
+
+
+def _facts(context: ReportContext) -> Markup:
+    verdict, certificate, units = context.verdict, context.certificate, context.labels.units
+    failed = len(context.failed)
+    rows: list[tuple[str, object]] = [
+        ("Experiment", context.name or "without a name"),
+        ("Threshold", None if verdict is None else quantity(verdict.threshold, units)),
+        ("Largest executed distance", _of(context) if context.worst_first else None),
+        ("Executions", f"{context.executions}" + ("" if context.budget is None else f" of {context.budget}")),
+        ("Executions without a distance", str(failed)),
+    ]
+    if certificate is not None:
+        rows += [
+            ("Certificate", certificate.kind + (" (withdrawn)" if certificate.doubt is not None else "")),
+            ("Bound", f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()),
+            ("Confidence", number(certificate.confidence)),
+            ("Volume left out", f"{at_most(100 * certificate.volume, 3)} %"),
+        ]
+    if verdict is not None and verdict.expected is not None:
+        rows.append(("Forecast", str(verdict.expected)))
+    if context.missing:
+        rows.append(("Experiment not loaded", context.missing))
+    return table("The verdict in numbers", ("Quantity", "Value"), rows, class_="facts")
+
+
+def _assumptions(context: ReportContext) -> Markup:
+    certificate = context.certificate
+    if certificate is None:
+        return Markup("")
+    return joined(
+        [
+            heading("What the certificate assumes"),
+            paragraph(certificate.statement) if certificate.doubt is None else Markup(""),
+            bullets(f"{one[:1].upper()}{one[1:]}." for one in certificate.assumptions),
+            details("Numbers of the certificate", _numbers(certificate.numbers)),
+        ]
+    )
+
+
+def _numbers(numbers: dict[str, object]) -> Markup:
+    rows = (
+        (name.replace("_", " "), value if isinstance(value, str) else shown(value)) for name, value in numbers.items()
+    )
+    return table("Numbers of the certificate", ("Name", "Value"), rows)
+
+
+def lights(findings: list[Finding]) -> Markup:
+    """Return findings as a list with their lights: a shape, a colour and a word."""
+    return element("ul", *map(_light, findings), class_="lights")
+
+
+def _light(finding: Finding) -> Markup:
+    shape = element("span", _SHAPES[finding.light], class_="shape", aria_hidden="true")
+    word = element("span", shape, " ", WORDS[finding.light], class_=f"light {finding.light}")
+    return element("li", word, " ", element("strong", f"{finding.name}."), " ", finding.text)
