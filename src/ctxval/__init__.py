@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from ctxval import gp as gp
     from ctxval import models as models
     from ctxval import plot as plot
+    from ctxval import report as report
     from ctxval import reproduce as reproduce
     from ctxval import searches as searches
     from ctxval import systems as systems
@@ -78,6 +79,7 @@ _SUBMODULES = (
     "gp",
     "models",
     "plot",
+    "report",
     "reproduce",
     "searches",
     "systems",

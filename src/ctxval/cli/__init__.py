@@ -1,10 +1,10 @@
 """The command line: a thin skin over the public interface."""
 
-from ctxval.cli import certify, files, hand, paper, remeasure, run, serve, stores
+from ctxval.cli import certify, files, hand, paper, remeasure, report, run, serve, stores
 from ctxval.cli.base import app
 from ctxval.cli.screen import print_anything
 
-__all__ = ["app", "certify", "files", "hand", "main", "paper", "remeasure", "run", "serve", "stores"]
+__all__ = ["app", "certify", "files", "hand", "main", "paper", "remeasure", "report", "run", "serve", "stores"]
 
 
 def main() -> None:

@@ -43,11 +43,14 @@ from ctxval.cli.options import (
     Workers,
     named_values,
 )
+from ctxval.cli.report import page_path
 from ctxval.cli.trust import AcceptChange, limit_of
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment
 from ctxval.core.truth import Truth
 from ctxval.errors import InputError
+from ctxval.report.context import context_of_campaign
+from ctxval.report.page import write_page
 from ctxval.storage.other_stores import other_stores
 
 Target = Annotated[
@@ -94,6 +97,13 @@ StoreFile = Annotated[
 WithTruth = Annotated[
     bool, typer.Option("--truth", help="Also compute the true maximum distance. This needs a simulated system.")
 ]
+WithReport = Annotated[
+    bool,
+    typer.Option(
+        "--report/--no-report",
+        help="Write a report next to the store: one HTML page with the verdict, insights and charts.",
+    ),
+]
 Variant = Annotated[str | None, typer.Option(help="Variant of a case; the same as --option variant=VALUE.")]
 ModelName = Annotated[str | None, typer.Option(help="Learned model of a case; the same as --option model=VALUE.")]
 Dimension = Annotated[int | None, typer.Option(help="Number of states of a case; the same as --option dim=VALUE.")]
@@ -118,6 +128,7 @@ def run(
     dask: Dask = None,
     timeout: Timeout = None,
     accept_change: AcceptChange = None,
+    with_report: WithReport = True,
     as_json: AsJson = False,
     option: PartOptions = None,
     variant: Variant = None,
@@ -149,6 +160,8 @@ def run(
     verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
     report = _report(campaign, experiment, settings, total, path, verdict, known)
     report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path, verdict)]
+    if with_report:
+        report["report"] = _save_report(campaign, verdict, total, path)
     if not as_json:
         _print_report(report, verdict)
     return report, _status(campaign, verdict)
@@ -239,6 +252,16 @@ def _draw_pictures(campaign: Campaign, experiment: Experiment, path: Path, verdi
         )
         drawn.append(plot.save(figure, path.with_suffix(".surrogate.png")))
     return drawn
+
+
+def _save_report(campaign: Campaign, verdict: Verdict | None, budget: int, path: Path) -> str | None:
+    """Write the report next to the store and return its path; None if it cannot be written."""
+    try:
+        return str(write_page(context_of_campaign(campaign, verdict, budget=budget), page_path(path)))
+    except Exception as error:
+        # The same holds for an error in the report.
+        err.say(f"no report: {reason_of(error)}")
+        return None
 
 
 def _true_curve(experiment: Experiment) -> plot.Curve | None:

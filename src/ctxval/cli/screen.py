@@ -19,7 +19,7 @@ _INDENT = "\n  "
 PANELS = {
     "Run": ("init", "check", "run", "remeasure"),
     "By hand": ("ask", "tell", "import", "serve"),
-    "Inspect": ("status", "certify", "export"),
+    "Inspect": ("status", "certify", "report", "export"),
     "Paper": ("cases", "reproduce"),
 }
 """Groups of commands in the help, in their order; a command that is in none comes first, without a group."""

@@ -22,12 +22,15 @@ from ctxval.report.markup import element, number
 WIDTH, HEIGHT = 480, 280
 """Size of a chart in its own units; on the page it is as wide as its column."""
 
+SMALL = {"width": 340, "height": 220}
+"""Size of a chart of which several stand side by side."""
+
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 12, 46
 _TICKS = 5
 
 Kind = Literal[
     "mean", "model", "system", "corrected", "reference", "best", "threshold", "bound", "sample", "initial", "covering",
-    "failed", "worst", "band", "weak", "identity", "bar",
+    "failed", "worst", "band", "weak", "identity",
 ]  # fmt: skip
 """What is drawn, which decides its colour, its line style and its mark."""
 
@@ -167,19 +170,13 @@ class Chart:
 
     def limit(self, value: float | None, kind: Kind, label: str) -> Chart:
         """Add a horizontal line across the chart; nothing if the value is None."""
-        if value is not None and np.isfinite(value):
-            self.line(self.x.ends, [value, value], kind, f"{label} {number(value)}")
-        return self
-
-    def bars(self, values: ArrayLike, names: Sequence[str]) -> Chart:
-        """Add one vertical bar for each name, at 0, 1, ..."""
-        room = 0.7 * float(self.across(1.0) - self.across(0.0))
-        for k, value in enumerate(np.ravel(np.asarray(values, dtype=np.float64)).tolist()):
-            top, bottom = float(self.up(max(value, 0.0))), float(self.up(0.0))
-            left = float(self.across(k)) - 0.5 * room
-            shape = {"x": f"{left:.1f}", "y": f"{top:.1f}", "width": f"{room:.1f}", "height": f"{bottom - top:.1f}"}
-            self._parts.append(element("rect", element("title", f"{names[k]}: {number(value)}"), class_="bar", **shape))
-        return self
+        if value is None or not np.isfinite(value):
+            return self
+        low, high = self.y.ends
+        if not low <= value <= high:
+            self._named(kind, f"{label} {number(value)}, {'above' if value > high else 'below'} this chart", "line")
+            return self
+        return self.line(self.x.ends, [value, value], kind, f"{label} {number(value)}")
 
     def image(self, values: Array, low: float, high: float) -> Chart:
         """Add a map of values ``(rows, columns)``, the first row at the bottom, in a colour scale from low to high."""
@@ -188,6 +185,14 @@ class Chart:
         shape = {"x": f"{left:.1f}", "y": f"{top:.1f}", "width": f"{right - left:.1f}", "height": f"{bottom - top:.1f}"}
         picture = data_uri(values, low, high)
         self._parts.append(element("image", href=picture, preserveAspectRatio="none", class_="map", **shape))
+        return self
+
+    def edges(self, segments: Array, label: str) -> Chart:
+        """Add line segments on a map ``(k, 2, 2)``: black under dashed white, which is visible on every colour."""
+        at = np.stack([self.across(segments[..., 0]), self.up(segments[..., 1])], axis=-1)
+        path = "".join(f"M{a:.1f},{b:.1f}L{c:.1f},{d:.1f}" for (a, b), (c, d) in at.tolist())
+        self._named("edge", label, "edge")
+        self._parts += [element("path", d=path, class_=f"line {kind}") for kind in ("edge-under", "edge")]
         return self
 
     def _named(self, kind: str, label: str, form: str) -> None:
@@ -200,7 +205,7 @@ class Chart:
         """Return the chart with its legend, as templates and elements insert it."""
         return str(self.render())
 
-    def render(self, *below: Markup) -> Markup:
+    def render(self, *below: Markup, with_legend: bool = True) -> Markup:
         """Return the chart as a figure with a legend and its title; elements ``below`` follow the legend."""
         drawing = element(
             "svg",
@@ -211,7 +216,8 @@ class Chart:
             role="img",
             class_="chart",
         )
-        return element("figure", drawing, legend(self._legend), *below, element("figcaption", self.title))
+        names = legend(self._legend) if with_legend else None
+        return element("figure", drawing, names, *below, element("figcaption", self.title))
 
     def _frame(self) -> Markup:
         left, right = _LEFT, self.width - _RIGHT
@@ -244,6 +250,15 @@ class Chart:
         return f"Chart({self.title!r}, {self.x!r}, {self.y!r})"
 
 
+def small_charts(charts: Sequence[Chart]) -> Markup:
+    """Return charts side by side, with one legend for all of them."""
+    named: dict[str, tuple[str, str]] = {}
+    for chart in charts:
+        named |= chart._legend
+    figures = (chart.render(with_legend=False) for chart in charts)
+    return element("div", legend(named), element("div", *figures, class_="charts small"))
+
+
 def legend(named: dict[str, tuple[str, str]]) -> Markup | None:
     """Return a legend, from labels with the kind and the form (line, area or mark) of each; None if there is none."""
     if not named:
@@ -257,6 +272,8 @@ def _swatch(kind: str, form: str) -> Markup:
         inside = element("path", d=_MARKS[kind], transform="translate(13 8)", class_=f"mark {kind}")
     elif form == "area":
         inside = element("path", d="M1,3H25V13H1z", class_="band")
+    elif form == "edge":
+        inside = element("g", *(element("path", d="M1,8H25", class_=f"line {one}") for one in ("edge-under", "edge")))
     else:
         inside = element("path", d="M1,8H25", class_=f"line {kind}")
     return element("svg", inside, viewBox="0 0 26 16", aria_hidden="true", class_="swatch")

@@ -136,7 +136,7 @@ class ReportContext:
 
     @functools.cached_property
     def recordings(self) -> dict[int, Recording]:
-        """The trajectories of the trials that have both, by number; those that do not fit to the others are left out."""
+        """The trajectories of the trials that have both, by number; those of another size are left out."""
         found: dict[int, Recording] = {}
         sizes: tuple[int, int] | None = None
         for trial in self.worst_first:

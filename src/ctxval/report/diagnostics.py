@@ -33,18 +33,15 @@ def diagnostics(context: ReportContext) -> list[Finding]:
 
 
 def _executions(context: ReportContext) -> Finding:
-    numbers = {
-        "executions": context.executions,
-        "failed": [trial.number for trial in context.trials if trial.state == "failed"],
-        "unmeasured": [trial.number for trial in context.trials if trial.state == "unmeasured"],
-        "open": [trial.number for trial in context.trials if trial.state == "open"],
-    }
-    bad = len(numbers["failed"]) + len(numbers["unmeasured"])  # type: ignore[arg-type]
-    if bad:
-        text = f"{bad} of {context.executions} executions gave no distance: nothing is known of d there."
+    states = ("failed", "unmeasured", "open")
+    listed = {state: [trial.number for trial in context.trials if trial.state == state] for state in states}
+    numbers = {"executions": context.executions, **listed}
+    without = len(listed["failed"]) + len(listed["unmeasured"])
+    if without:
+        text = f"{without} of {len(context.trials)} trials have no distance: nothing is known of d at their tasks."
         return Finding("Executions", "bad", text, numbers)
-    if numbers["open"]:
-        waiting = ", ".join(map(str, numbers["open"]))  # type: ignore[arg-type]
+    if listed["open"]:
+        waiting = ", ".join(map(str, listed["open"]))
         return Finding("Executions", "attention", f"Trials are open and wait for their results: {waiting}.", numbers)
     if not context.executions:
         return Finding("Executions", "unknown", "Nothing was executed.", numbers)

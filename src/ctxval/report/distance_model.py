@@ -109,7 +109,7 @@ class DistanceModel:
 
         with np.errstate(all="ignore"):
             found = sobol_indices(func=lambda x: self.predict(x.T).median[None], n=_SOBOL, dists=[uniform()] * d, rng=0)
-        return np.clip(np.nan_to_num(np.ravel(found.total_order)), 0.0, 1.0)
+        return np.asarray(np.clip(np.nan_to_num(np.ravel(found.total_order)), 0.0, 1.0))
 
     def _band(self, mean: Array, variance: Array) -> Band:
         def on_own_scale(standardised: Array) -> Array:

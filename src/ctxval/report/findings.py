@@ -10,10 +10,17 @@ from ctxval._util.representation import record
 from ctxval._util.texts import reason_of
 from ctxval.report.context import ReportContext
 
-Light = Literal["good", "attention", "bad", "unknown"]
-"""A traffic light: nothing speaks against it; read it; it speaks against M or the verdict; it is not known."""
+Light = Literal["good", "note", "attention", "bad", "unknown"]
+"""A traffic light: nothing speaks against M or the verdict; neither good nor bad; read it; it speaks against it; it is
+not known."""
 
-WORDS: dict[Light, str] = {"good": "good", "attention": "attention", "bad": "problem", "unknown": "not known"}
+WORDS: dict[Light, str] = {
+    "good": "good",
+    "note": "note",
+    "attention": "attention",
+    "bad": "problem",
+    "unknown": "not known",
+}
 """The word of each light, which stands beside its colour."""
 
 

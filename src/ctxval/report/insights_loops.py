@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial import KDTree
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.controller import Limits
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.trajectory import Trajectory
@@ -54,7 +54,7 @@ def components(context: ReportContext) -> Finding | None:
     numbers = {"state": label, "peak": float(peaks[j]), "time": when, "shares": shares}
     if shares:
         text += " Of the error that the distance measures, " + _listed(shares) + "."
-    return Finding("What errs, and when", "attention", text, numbers)
+    return Finding("What errs, and when", "note", text, numbers)
 
 
 def _shares(context: ReportContext, worst: list[Recording]) -> dict[str, float]:
@@ -104,13 +104,13 @@ def flips(context: ReportContext) -> Finding | None:
             f"The controllers of the {len(changes)} pairs of neighbouring tasks are alike: their inputs on M differ by "
             f"at most {percent(size)} of the range of the inputs."
         )
-        return Finding("Controllers flip", "good", text, values)
+        return Finding("Controllers of neighbouring tasks", "good", text, values)
     text = (
         f"{flipped} of {len(changes)} pairs of neighbouring tasks have controllers that differ abruptly, for example "
         f"trials {numbers[i]} and {numbers[j]}: their inputs on M differ by {percent(size)} of the range of the "
         "inputs. A planner that jumps between solutions makes the distance jump, too."
     )
-    return Finding("Controllers flip", "attention", text, values)
+    return Finding("Controllers of neighbouring tasks", "attention", text, values)
 
 
 def unusual_motion(context: ReportContext) -> Finding | None:
@@ -129,8 +129,8 @@ def unusual_motion(context: ReportContext) -> Finding | None:
         text = f"In the worst trials M moves like in the others: at most {number(ratio, 2)} times as far as usual."
         return Finding("Motion of M", "good", text, values)
     text = (
-        f"In trial {trial} M itself moves {number(float(sizes[row, j]))} in {label}, {number(ratio, 2)} times as far as "
-        "in the median trial: the controller asks for an unusual motion, which may explain the distance better than an "
+        f"In trial {trial} M itself moves {number(float(sizes[row, j]))} in {label}, {number(ratio, 2)} times as far "
+        "as in the median trial: the controller asks for an unusual motion, which may explain the distance better than an "
         "error of M."
     )
     return Finding("Motion of M", "attention", text, values)
@@ -148,11 +148,13 @@ def saturation(context: ReportContext) -> Finding | None:
     label = context.signals[1][j]
     values = {"input": label, "share_of_steps": float(share[j]), "limits_known": known}
     if share[j] < _SATURATED:
-        return Finding("Inputs saturate", "good", f"The inputs stay off their limits in {_rest(share[j])}.", values)
+        return Finding(
+            "Inputs and their limits", "good", f"The inputs stay off their limits in {_rest(share[j])}.", values
+        )
     text = f"{label} is at its limit in {percent(float(share[j]))} of all steps" + (
         "." if known else " (the limits are taken from the records, in which the extreme value repeats)."
     )
-    return Finding("Inputs saturate", "attention", text, values)
+    return Finding("Inputs and their limits", "attention", text, values)
 
 
 def _rest(share: float) -> str:
@@ -182,26 +184,26 @@ def converged(context: ReportContext) -> Finding | None:
     values = {"designs": len(told), "not_converged": failed}
     if not failed:
         text = f"The design of the controller converged in all {len(told)} trials that were designed again."
-        return Finding("Designs converge", "good", text, values)
+        return Finding("Design of the controllers", "good", text, values)
     text = (
-        f"The design of the controller did not converge in {len(failed)} of {len(told)} trials: it stopped at its limit "
-        f"of iterations. {len([k for k in list(context.recordings)[:_WORST] if k in failed])} of them are among the "
+        f"The design of the controller did not converge in {len(failed)} of {len(told)} trials: it stopped at its "
+        f"limit of iterations. {len([k for k in list(context.recordings)[:_WORST] if k in failed])} of them are among the "
         f"{_WORST} worst."
     )
-    return Finding("Designs converge", "attention", text, values)
+    return Finding("Design of the controllers", "attention", text, values)
 
 
 def goals(context: ReportContext) -> Finding | None:
     """Whether M itself reaches its goals under the controllers that are designed on it."""
     if context.validation is None:
         text = f"Not known, because the goals need the experiment: {context.missing}"
-        return Finding("M reaches its goals", "unknown", text)
+        return Finding("Goals of M", "unknown", text)
     if not context.replays:
         return None
     weighed = _weighed(context)
     if not len(weighed):
         text = "Not known: the synthesizer does not tell which states it brings to a goal."
-        return Finding("M reaches its goals", "unknown", text)
+        return Finding("Goals of M", "unknown", text)
     spans = _spans(one.model.states for one in context.recordings.values())[weighed]
     numbers = list(context.replays)
     misses = np.array([_miss(context.recordings[k].model, context.replays[k].task.goal)[weighed] for k in numbers])
@@ -212,25 +214,25 @@ def goals(context: ReportContext) -> Finding | None:
     values = {"missed": int(missed.sum()), "trials": len(numbers), "largest_miss": size, "state": label}
     text = (
         f"M ends within {percent(_MISSED)} of the range of each weighted state from its goal in "
-        f"{len(numbers) - int(missed.sum())} of {len(numbers)} trials; it misses most in {label}, by {number(size)}, in "
-        f"trial {numbers[row]}."
+        f"{len(numbers) - int(missed.sum())} of {len(numbers)} trials; it misses most in {label}, by {number(size)}, "
+        f"in trial {numbers[row]}."
     )
     if missed.any():
         text += " A controller that fails on M cannot be expected to work on S."
-    return Finding("M reaches its goals", "attention" if missed.any() else "good", text, values)
+    return Finding("Goals of M", "attention" if missed.any() else "good", text, values)
 
 
 def _miss(trajectory: Trajectory, goal: Array) -> Array:
     return np.abs(trajectory.final_state - goal)
 
 
-def _weighed(context: ReportContext) -> Array:
+def _weighed(context: ReportContext) -> Rows:
     """Return the indices of the states that the controller brings to their goals; none if it does not tell."""
     n = len(context.signals[0])
     cost = None if context.validation is None else getattr(context.validation.synthesizer, "cost", None)
     weights = getattr(cost, "Q_final", getattr(cost, "Q", None))
     if weights is None or np.shape(weights) != (n, n):
-        return np.empty(0, dtype=int)
+        return np.empty(0, dtype=np.intp)
     return np.flatnonzero(np.diag(weights) > 0)
 
 

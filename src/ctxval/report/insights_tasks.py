@@ -84,7 +84,7 @@ def weak_states(context: ReportContext) -> Finding | None:
         f"The {int(weak.sum())} trials {which} lead to {label} from {number(low[weak, j].min())} to "
         f"{number(high[weak, j].max())}; all others stay within {number(inside_low[j])} and {number(inside_high[j])}."
     )
-    return Finding("States visited there", "attention", text, numbers)
+    return Finding("States visited there", "note", text, numbers)
 
 
 def _extent(states: Array, inputs: Array) -> Array:
@@ -94,7 +94,7 @@ def _extent(states: Array, inputs: Array) -> Array:
 
 
 def _is_above(context: ReportContext) -> bool:
-    return context.threshold is not None and _above(context).any() and not _above(context).all()
+    return context.threshold is not None and bool(_above(context).any()) and not bool(_above(context).all())
 
 
 def _above(context: ReportContext) -> Mask:
@@ -131,7 +131,7 @@ def bias(context: ReportContext) -> Finding | None:
             "trials" + (", so the error is systematic." if same > 0.9 else ".")
         )
         numbers |= {"one_sided_share": same}
-    return Finding("Bias across the tasks", "attention" if share > 0.6 else "good", text, numbers)
+    return Finding("Bias across the tasks", "note", text, numbers)
 
 
 def _side(context: ReportContext) -> tuple[str, float] | None:

@@ -24,9 +24,9 @@ _VOID = ("br", "meta", "link", "input")
 
 
 def text(value: object, longest: int = LONGEST) -> Markup:
-    """Return a text that cannot be markup; :class:`Markup` stays as it is."""
-    if isinstance(value, Markup):
-        return value
+    """Return a text that cannot be markup; :class:`Markup` and charts stay as they are."""
+    if hasattr(value, "__html__"):
+        return Markup(value.__html__())
     return escape(shortened(visible(plain(value)), longest))
 
 
@@ -106,9 +106,15 @@ def cell(value: object) -> Markup:
     """Return the content of a cell: numbers with four digits, a dash for None."""
     if value is None:
         return Markup("&ndash;")
-    if isinstance(value, Markup):
-        return value
+    if hasattr(value, "__html__"):
+        return Markup(value.__html__())
     return text(value if isinstance(value, str) else number(value), _CELL)
+
+
+def bar(share: float) -> Markup:
+    """Return a bar as long as a share from 0 to 1, which only repeats a number beside it."""
+    shape = element("rect", width=f"{100 * share:.1f}", height=9, class_="bar")
+    return element("svg", shape, viewBox="0 0 100 9", preserveAspectRatio="none", class_="bars", aria_hidden="true")
 
 
 def number(value: object, digits: int = 4) -> str:

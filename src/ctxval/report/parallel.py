@@ -46,7 +46,7 @@ def parallel_coordinates(context: ReportContext) -> Markup:
     names = paragraph("; ".join(f"{j} = {label}" for j, label in enumerate(labels)), class_="note")
     swatches = legend({f"the {limit} worst tasks": ("weak", "line"), "the other tasks": ("rest", "line")})
     scroll = element("div", drawing, class_="scroll", tabindex="0", role="region", aria_label="Parallel coordinates")
-    return element("figure", scroll, swatches, names, element("figcaption", title))
+    return element("figure", scroll, swatches, names, element("figcaption", title), class_="wide")
 
 
 def _line(at: Array, shares: Array, kind: str) -> Markup:

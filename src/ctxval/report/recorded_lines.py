@@ -52,26 +52,36 @@ def recorded_lines(context: ReportContext, most: int = MOST_CHARACTERS) -> Recor
         context: the trials.
         most: the largest number of characters of all lines.
     """
-    numbers, found = list(context.recordings), {}
-    points, kept = _POINTS[0], []
+    numbers, points = list(context.recordings), _POINTS[0]
+    found: dict[int, dict[str, Any]] = {}
     for points in _POINTS:
-        found, kept, used = {}, [], 0
-        for number in numbers:
-            one = lines_of(context, number, points)
-            used += _size(one)
-            if used > most:
-                break
-            found[str(number)] = one
-            kept.append(number)
-        if len(kept) == len(numbers):
+        found = _fitting(context, points, most)
+        if len(found) == len(numbers):
             break
     longest = max((one.system.horizon + 1 for one in context.recordings.values()), default=0)
     states, inputs = context.signals
     signals = [{"label": _safe(label), "kind": "state"} for label in states]
     signals += [{"label": _safe(label), "kind": "input"} for label in inputs]
     return RecordedLines(
-        {"signals": signals, "trials": found}, tuple(kept), tuple(numbers[len(kept) :]), points, longest > points
+        {"signals": signals, "trials": {str(number): one for number, one in found.items()}},
+        tuple(found),
+        tuple(numbers[len(found) :]),
+        points,
+        longest > points,
     )
+
+
+def _fitting(context: ReportContext, points: int, most: int) -> dict[int, dict[str, Any]]:
+    """Return the lines of the worst trials, as many as fit into a number of characters."""
+    found: dict[int, dict[str, Any]] = {}
+    used = 0
+    for number in context.recordings:
+        lines = lines_of(context, number, points)
+        used += _size(lines)
+        if used > most:
+            break
+        found[number] = lines
+    return found
 
 
 def lines_of(context: ReportContext, number: int, points: int) -> dict[str, Any]:

@@ -141,8 +141,8 @@ def _error(context: ReportContext) -> str:
     return (
         f"Largest distance {quantity(distance_of(worst), units)} (trial {worst.number}), median "
         f"{quantity(float(np.median(values)), units)}, smallest {quantity(float(values.min()), units)}, over "
-        f"{len(values)} executed tasks. The tasks were chosen by a search for large distances, so the median is not that "
-        "of all tasks."
+        f"{len(values)} executed tasks. The tasks were chosen by a search for large distances, so the median is not "
+        "that of all tasks."
     )
 
 
@@ -164,8 +164,8 @@ def _uncertainty(context: ReportContext) -> str:
     bound = with_error(found.upper_bound, found.error)
     said = (
         f"By the certificate {found.kind}, d* is at most {bound} with confidence {number(found.confidence)}"
-        f"{f', except for {at_most(100 * found.volume, 3)} % of the tasks' if found.volume else ''}. The uncertainty of "
-        "the measured trajectories themselves is not part of it."
+        f"{f', except for {at_most(100 * found.volume, 3)} % of the tasks' if found.volume else ''}. The uncertainty "
+        "of the measured trajectories themselves is not part of it."
     )
     return f"{said} The certificate is withdrawn: {found.doubt}." if found.doubt is not None else said
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Mask
 from ctxval.core.trial import Trial
-from ctxval.report.charts import Axis, Chart, Kind, colour_scale
+from ctxval.report.charts import SMALL, Axis, Chart, Kind, colour_scale, small_charts
 from ctxval.report.context import ReportContext
 from ctxval.report.diagnostics import stored_predictions
 from ctxval.report.distance_model import Band, DistanceModel
-from ctxval.report.markup import element, heading, joined, number, paragraph, percent
+from ctxval.report.markup import bar, element, heading, joined, number, paragraph, percent, table
 from ctxval.report.parallel import parallel_coordinates
 from ctxval.report.region import region_map
 
@@ -59,17 +59,17 @@ def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:
     if d == 1:
         return joined([said, element("div", _slice(context, model, 0, samples=True), class_="charts wide")])
     if d == 2:
-        slices = (_slice(context, model, axis) for axis in range(2))
-        return joined([said, element("div", _map(context, model), *slices, class_="charts")])
+        both = (_slice(context, model, axis) for axis in range(2))
+        return joined([said, element("div", _map(context, model), *both, class_="charts")])
     axes = [int(j) for j in np.argsort(-model.sensitivity, kind="stable")[:_SLICES]]
     left_out = d - len(axes)
     more = paragraph(f"{left_out} parameters with less influence have no slice here.") if left_out else None
-    slices = (_slice(context, model, axis) for axis in axes)
+    slices = [_slice(context, model, axis, small=True) for axis in axes]
     return joined(
         [
             said,
             heading("Slices through the worst task"),
-            element("div", *slices, class_="charts small"),
+            small_charts(slices),
             more or Markup(""),
             heading("All tasks at once"),
             parallel_coordinates(context),
@@ -77,7 +77,9 @@ def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:
     )
 
 
-def _slice(context: ReportContext, model: DistanceModel, axis: int, *, samples: bool = False) -> Chart:
+def _slice(
+    context: ReportContext, model: DistanceModel, axis: int, *, samples: bool = False, small: bool = False
+) -> Chart:
     """Return the distance along one parameter, through the worst executed task."""
     space, worst = context.space, context.worst_first[0]
     unit = np.tile(worst.unit_point, (_CURVE, 1))
@@ -85,7 +87,8 @@ def _slice(context: ReportContext, model: DistanceModel, axis: int, *, samples: 
     x, band = space.from_unit(unit)[:, axis], model.predict(unit)
     label = space.labels[axis]
     title = f"Distance over {label}" + ("" if space.dimension == 1 else ", through the worst executed task")
-    chart = Chart(title, Axis(label, float(space.low[axis]), float(space.high[axis])), _distance_axis(context, band))
+    ends = Axis(label, float(space.low[axis]), float(space.high[axis]))
+    chart = Chart(title, ends, _distance_axis(context, band), **(SMALL if small else {}))
     chart.band(x, band.low, band.high, "95 % band").line(x, band.median, "mean", "Gaussian process")
     chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
     if samples:
@@ -117,36 +120,44 @@ def _map(context: ReportContext, model: DistanceModel) -> Markup:
     tau = context.threshold
     if tau is not None and (values > tau).any() and (values <= tau).any():
         _add_contour(chart, space.from_unit(unit), values.ravel() > tau)
-    _add_samples(chart, context, lambda trials: tuple(context.coordinates(trials).T))
+
+    def place(trials: Sequence[Trial]) -> tuple[Array, Array]:
+        at = context.coordinates(trials)
+        return at[:, 0], at[:, 1]
+
+    _add_samples(chart, context, place)
     if context.failed:
-        chart.marks(
-            *context.coordinates(context.failed).T, "failed", "no distance is known", list(map(_named, context.failed))
-        )
-    worst = context.worst_first[0]
-    chart.marks(*context.coordinates([worst]).T, "worst", "worst executed task", [_named(worst)])
+        _mark(chart, place, context.failed, "failed", "no distance is known")
+    _mark(chart, place, context.worst_first[:1], "worst", "worst executed task")
     return chart.render(colour_scale(low, high, context.distance_label))
 
 
-def _add_contour(chart: Chart, points: Array, above: Array) -> None:
-    """Mark the edge of the region above the threshold, between the cells of the map."""
-    inside = above.reshape(_GRID, _GRID)
-    grid = points.reshape(_GRID, _GRID, 2)
+def _add_contour(chart: Chart, points: Array, above: Mask) -> None:
+    """Draw the edge of the region above the threshold, between the cells of the map."""
+    inside, grid = above.reshape(_GRID, _GRID), points.reshape(_GRID, _GRID, 2)
     half = 0.5 * (grid[1, 1] - grid[0, 0])
-    label = "edge of the region above the threshold"
-    for row, column in np.argwhere(inside[:, 1:] != inside[:, :-1]).tolist():
-        x, y = grid[row, column]
-        chart.line([x + half[0]] * 2, [y - half[1], y + half[1]], "threshold", label)
-    for row, column in np.argwhere(inside[1:] != inside[:-1]).tolist():
-        x, y = grid[row, column]
-        chart.line([x - half[0], x + half[0]], [y + half[1]] * 2, "threshold", label)
+    across = grid[:, :-1][inside[:, 1:] != inside[:, :-1]]
+    along = grid[:-1][inside[1:] != inside[:-1]]
+    upright = np.stack([across + half * [1, -1], across + half], axis=1)
+    level = np.stack([along + half * [-1, 1], along + half], axis=1)
+    chart.edges(np.concatenate([upright, level]), "edge of the region above the threshold")
 
 
-def _add_samples(chart: Chart, context: ReportContext, place: object) -> None:
+Place = Callable[[Sequence[Trial]], tuple[Array, Array]]
+"""A function from trials to the positions of their marks in a chart."""
+
+
+def _mark(chart: Chart, place: Place, trials: Sequence[Trial], kind: Kind, label: str) -> None:
+    x, y = place(trials)
+    chart.marks(x, y, kind, label, list(map(_named, trials)))
+
+
+def _add_samples(chart: Chart, context: ReportContext, place: Place) -> None:
     """Add the executed tasks, with a mark for each origin."""
     for kind, label, origins in _ORIGINS:
         trials = [trial for trial in context.completed if trial.origin in origins]
         if trials:
-            chart.marks(*place(trials), kind, label, list(map(_named, trials)))  # type: ignore[operator]
+            _mark(chart, place, trials, kind, label)
 
 
 def _add_failed(chart: Chart, context: ReportContext, axis: int) -> None:
@@ -156,7 +167,7 @@ def _add_failed(chart: Chart, context: ReportContext, axis: int) -> None:
         chart.marks(x, y, "failed", "no distance is known", list(map(_named, context.failed)))
 
 
-def _distances(trials: list[Trial]) -> Array:
+def _distances(trials: Sequence[Trial]) -> Array:
     return np.array([trial.distance for trial in trials], dtype=np.float64)
 
 
@@ -172,13 +183,15 @@ def _second_row(context: ReportContext, model: DistanceModel) -> Iterator[Markup
 
 
 def _sensitivity(context: ReportContext, model: DistanceModel) -> Markup:
+    """Return the shares of the parameters in the variance of the predicted distance, the largest first."""
     labels, shares = context.space.labels, model.sensitivity
-    x, y = Axis("parameter, numbered from 0", -0.6, len(labels) - 0.4), Axis("share of the variance", 0.0, 1.0)
-    chart = Chart("Sensitivity of the distance to each parameter", x, y).bars(shares, labels)
-    largest = np.argsort(-shares, kind="stable")[:4]
-    listed = ", ".join(f"{j} = {labels[j]}: {percent(float(shares[j]))}" for j in largest)
-    note = paragraph(f"Total Sobol indices of the Gaussian process; the largest are {listed}.", class_="note")
-    return chart.render(note)
+    order = np.argsort(-shares, kind="stable").tolist()
+    rows = [(labels[j], percent(float(shares[j])), bar(float(shares[j]))) for j in order]
+    caption = (
+        "Sensitivity of the distance: the share of each parameter in the variance of the predicted distance, alone and "
+        "together with others (total Sobol index)"
+    )
+    return table(caption, ("Parameter", "Share", "Bar"), rows)
 
 
 def _predicted(context: ReportContext, model: DistanceModel) -> Chart:

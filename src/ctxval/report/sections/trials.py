@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from ctxval._util.arrays import Array
 from ctxval.core.trial import Trial
-from ctxval.report.charts import Axis, Chart
+from ctxval.report.charts import SMALL, Axis, Chart, small_charts
 from ctxval.report.context import Recording, ReportContext
 from ctxval.report.markup import cell, details, element, heading, joined, number, paragraph, quantity
 from ctxval.report.recorded_lines import RecordedLines, recorded_lines
@@ -119,8 +119,7 @@ def _worst(context: ReportContext) -> Markup:
     for number_ in numbers:
         trial = by_number[number_]
         head = f"Trial {number_}: {quantity(trial.distance, context.labels.units)} at {_where(context, trial)}"
-        charts = element("div", *_signals(context, number_), class_="charts small")
-        parts.append(details(head, charts, opened=number_ == numbers[0]))
+        parts.append(details(head, small_charts(_signals(context, number_)), opened=number_ == numbers[0]))
     return joined(parts)
 
 
@@ -161,7 +160,7 @@ def _joined(recording: Recording, side: str) -> list[Array]:
 
 def _signal(title: str, label: str, times: Array, lines: list[Array], reference: Array | None) -> Chart:
     every = [*lines, *([] if reference is None else [reference])]
-    chart = Chart(title, Axis("time [s]", float(times[0]), float(times[-1])), Axis.over(label, *every))
+    chart = Chart(title, Axis("time [s]", float(times[0]), float(times[-1])), Axis.over(label, *every), **SMALL)
     if reference is not None:
         _thin(chart, times, reference, "reference", "reference")
     kinds = (("system", "system S"), ("model", "model M"), ("corrected", "corrected model"))

@@ -11,7 +11,7 @@ from ctxval.report.diagnostics import diagnostics, not_tested
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.markup import bullets, details, element, heading, joined, number, paragraph, quantity, table
 
-_SHAPES = {"good": "\u25cf", "attention": "\u25b2", "bad": "\u25a0", "unknown": "\u25cb"}
+_SHAPES = {"good": "\u25cf", "note": "\u25c6", "attention": "\u25b2", "bad": "\u25a0", "unknown": "\u25cb"}
 """A shape for each light, because colours alone tell nothing in grey print."""
 
 

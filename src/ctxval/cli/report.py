@@ -1,0 +1,133 @@
+"""``ctxval report``: write the report of a store, for people and for programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ctxval import report as reports
+from ctxval.certificates import KINDS, CertificateOptions
+from ctxval.certificates.verdict import require_threshold
+from ctxval.cli.base import FALSIFIED, app, command, out
+from ctxval.cli.certify import KindOptions, Volume
+from ctxval.cli.options import AsJson, Confidence, StoreArgument, Threshold, named_values
+from ctxval.cli.trust import Named, Trust, open_store
+from ctxval.config.settings import Settings, planned_settings
+from ctxval.core.labels import Labels, labels_of
+from ctxval.errors import CtxvalError
+from ctxval.report.context import ReportContext, context_of_campaign, context_of_store
+from ctxval.report.twins import write_text
+from ctxval.storage.store import Store
+
+Page = Annotated[
+    Path | None,
+    typer.Option(
+        "-o", "--out", help="HTML file to write (default: a file next to the store that ends in .report.html)."
+    ),
+]
+JUnit = Annotated[
+    Path | None,
+    typer.Option("--junit", metavar="FILE.xml", help="Also write the verdict and the diagnostics as JUnit XML."),
+]
+Markdown = Annotated[
+    Path | None, typer.Option("--markdown", metavar="FILE.md", help="Also write the report without charts as Markdown.")
+]
+
+Kind = Annotated[
+    str | None,
+    typer.Option(
+        help=f"Kind of the certificate: {', '.join(KINDS.built_in)}, or a kind from an installed package (default: the "
+        "kind that the campaign was run with). With region, the report has a map of where the threshold is kept."
+    ),
+]
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What the command line asks of the verdict; None for what the campaign was run with."""
+
+    threshold: float | None
+    confidence: float | None
+    kind: str | None
+    stated: dict[str, Any]
+
+    def limit(self, *planned: float | None) -> float | None:
+        """Return the threshold of the command line, or else the first one that is planned; None if there is none."""
+        return next((require_threshold(one) for one in (self.threshold, *planned) if one is not None), None)
+
+    def options(self, settings: Settings) -> CertificateOptions:
+        """Return the certificate, with the settings of the campaign for what is not asked."""
+        confidence = settings.confidence if self.confidence is None else self.confidence
+        return settings.certificate.options(confidence, kind=self.kind, stated=self.stated)
+
+
+@app.command("report")
+@command
+def write_report(
+    store: StoreArgument,
+    page: Page = None,
+    threshold: Threshold = None,
+    confidence: Confidence = None,
+    kind: Kind = None,
+    volume: Volume = None,
+    option: KindOptions = None,
+    junit: JUnit = None,
+    markdown: Markdown = None,
+    experiment: Named = None,
+    trust: Trust = False,
+    as_json: AsJson = False,
+) -> Any:
+    """Write the report of a store: one HTML page with the verdict, insights, charts and trials.
+
+    The system is not executed. The experiment is loaded if its store names no code, or if you made the store or allow
+    its code. Otherwise the report says what is missing without it.
+
+    Options that are not given have the values that the campaign was run with.
+    """
+    opened = Store.existing(store)
+    asked = _Asked(threshold, confidence, kind, named_values(option, volume=volume))
+    context = _context(opened, store, asked, experiment, trust)
+    target = page_path(store) if page is None else page
+    written = {"report": str(reports.write_page(context, target))}
+    if junit is not None:
+        written["junit"] = str(write_text(junit, reports.junit(context)))
+    if markdown is not None:
+        written["markdown"] = str(write_text(markdown, reports.markdown(context)))
+    verdict = context.verdict
+    if not as_json:
+        out.say(", ".join(written.values()))
+        if context.missing:
+            out.say(f"without the experiment: {context.missing}", wrap=True)
+    result = {**reports.to_json(context), "files": written} if as_json else {}
+    return result, FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
+
+
+def page_path(store: Path) -> Path:
+    """Return the path of the report of a store."""
+    return store.with_suffix(".report.html")
+
+
+def _context(store: Store, path: Path, asked: _Asked, experiment: str | None, trust: bool) -> ReportContext:
+    """Return what the report is made from: with the experiment if it may be loaded, otherwise without."""
+    try:
+        opened = open_store(store, path, experiment, trust)
+    except CtxvalError as error:
+        if experiment is not None or trust:
+            raise
+        return _of_data(store, asked, str(error))
+    limit = asked.limit(opened.settings.threshold, opened.experiment.threshold)
+    budget = opened.experiment.budget if opened.settings.budget is None else opened.settings.budget
+    options = asked.options(opened.settings)
+    return context_of_campaign(opened.campaign, threshold=limit, certificate=options, budget=budget)
+
+
+def _of_data(store: Store, asked: _Asked, missing: str) -> ReportContext:
+    """Return the context of a store whose experiment is not loaded; no code is imported or run."""
+    settings = planned_settings(store, asked.kind)
+    labels = Labels(labels_of(settings.states), labels_of(settings.inputs), settings.units or "")
+    limit, options = asked.limit(settings.threshold), asked.options(settings)
+    context = context_of_store(store, limit, certificate=options, missing=missing, labels=labels)
+    return replace(context, budget=settings.budget)

@@ -1,0 +1,71 @@
+"""Reports of a campaign: one HTML page for people, and JSON, JUnit and Markdown for programs.
+
+A report reads and never executes: neither the system, nor code that a store names.
+
+>>> from ctxval import report  # doctest: +SKIP
+>>> report.write(campaign, "report.html", threshold=0.5)  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ctxval.campaign.campaign import Campaign
+from ctxval.certificates import CertificateOptions, Verdict
+from ctxval.report.charts import Axis, Chart
+from ctxval.report.context import ReportContext, context_of_campaign, context_of_store
+from ctxval.report.findings import Finding
+from ctxval.report.markup import bullets, element, heading, joined, paragraph, table
+from ctxval.report.page import page, write_page
+from ctxval.report.sections import SECTIONS, Section
+from ctxval.report.twins import junit, markdown, to_json
+
+__all__ = [
+    "SECTIONS",
+    "Axis",
+    "Chart",
+    "Finding",
+    "ReportContext",
+    "Section",
+    "bullets",
+    "context_of_campaign",
+    "context_of_store",
+    "element",
+    "heading",
+    "joined",
+    "junit",
+    "markdown",
+    "page",
+    "paragraph",
+    "table",
+    "to_json",
+    "write",
+    "write_page",
+]
+
+
+def write(
+    campaign: Campaign,
+    path: str | Path,
+    *,
+    threshold: float | None = None,
+    verdict: Verdict | None = None,
+    certificate: CertificateOptions | None = None,
+    sections: Sequence[Section] = (),
+) -> Path:
+    """Write the report of a campaign as one HTML file, and return its path.
+
+    Args:
+        campaign: the campaign. Its system is not executed.
+        path: the file to write.
+        threshold: tau, for the verdict; without it and without ``verdict`` there is no verdict.
+        verdict: the verdict, if it was computed before.
+        certificate: the kind and the options of the certificate, as in :meth:`ctxval.Campaign.verdict`.
+        sections: sections of your own, which follow the others.
+
+    Raises:
+        InputError: if the file cannot be written, or a section has no title or no method ``render``.
+    """
+    context = context_of_campaign(campaign, verdict, threshold=threshold, certificate=certificate)
+    return write_page(context, path, sections)

@@ -1,0 +1,105 @@
+"""The page of a report: one file with its style, its script and its data, which opens no connection."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.resources import files
+from pathlib import Path
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from ctxval._util.texts import reason_of, visible
+from ctxval.errors import InputError
+from ctxval.report.context import ReportContext
+from ctxval.report.markup import paragraph, text
+from ctxval.report.sections import SECTIONS, Section, sections_of
+from ctxval.version import VERSION
+
+
+@dataclass(frozen=True, eq=False)
+class _Rendered:
+    """A section with its content."""
+
+    title: str
+    content: Markup
+
+
+def page(context: ReportContext, sections: Sequence[Section] = ()) -> str:
+    """Return a report as one HTML page.
+
+    Args:
+        context: what the report is made from.
+        sections: further sections, which follow those that every report has.
+
+    Raises:
+        InputError: if a section is none.
+    """
+    with np.errstate(all="ignore"):  # a store may have any numbers
+        rendered = [_rendered(section, context) for section in sections_of(SECTIONS, sections)]
+    name = visible(context.name) or "campaign"
+    style, script = _asset("report.css"), _asset("report.js")
+    made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return _template().render(
+        title=text(f"Validation of {name}", 200),
+        subtitle=text(f"Store {context.store.name}; report made {made}.", 600),
+        policy=_policy(style, script),
+        style=Markup(style),
+        script=Markup(script),
+        sections=rendered,
+        version=VERSION,
+    )
+
+
+def write_page(context: ReportContext, path: str | Path, sections: Sequence[Section] = ()) -> Path:
+    """Write a report as one HTML file.
+
+    Raises:
+        InputError: if the file cannot be written, or a section is none.
+    """
+    content = page(context, sections)
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        Path(path).write_text(content, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"the report {path} cannot be written: {error.strerror}.") from error
+    return Path(path)
+
+
+def _rendered(section: Section, context: ReportContext) -> _Rendered:
+    """Return a section with its content; one that fails says why, and the others are shown."""
+    title = text(section.title, 200)
+    try:
+        content = section.render(context)
+    except Exception as error:  # a user's own section, or odd data
+        return _Rendered(title, paragraph(f"This section cannot be shown: {reason_of(error)}."))
+    whole = content.__html__() if hasattr(content, "__html__") else None
+    return _Rendered(title, Markup(whole) if whole is not None else paragraph(str(content)))
+
+
+def _policy(style: str, script: str) -> str:
+    """Return the content security policy: nothing but the style and the script of this page, and data images."""
+    return (
+        f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+def _hash(content: str) -> str:
+    return f"sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}"
+
+
+def _asset(name: str) -> str:
+    return (files("ctxval.report") / "assets" / name).read_text(encoding="utf-8")
+
+
+@functools.cache
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    return environment.from_string(_asset("page.html"))
