@@ -239,7 +239,7 @@ def _draw_limits(axes: Axes, threshold: float | None, bound: float | None) -> No
     if threshold is not None:
         axes.axhline(threshold, color=_ORANGE, linestyle="-.", linewidth=1.4, label=f"threshold {threshold:.4g}")
     if bound is not None:
-        axes.axhline(bound, color=_BLACK, linestyle=":", linewidth=1.6, label=f"bound on d* {bound:.4g}")
+        axes.axhline(bound, color=_BLACK, linestyle=":", linewidth=1.6, label="bound on d*")
 
 
 def _draw_samples(axes: Axes, campaign: Results, place: Callable[[Trial], float]) -> None:

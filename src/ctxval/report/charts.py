@@ -17,6 +17,7 @@ from markupsafe import Markup
 
 from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.representation import record
+from ctxval.certificates.bounds import at_most
 from ctxval.report.markup import element, number
 
 WIDTH, HEIGHT = 480, 280
@@ -169,14 +170,15 @@ class Chart:
         return self
 
     def limit(self, value: float | None, kind: Kind, label: str) -> Chart:
-        """Add a horizontal line across the chart; nothing if the value is None."""
+        """Add a horizontal line across the chart; nothing if the value is None, only its name if it is outside."""
         if value is None or not np.isfinite(value):
             return self
         low, high = self.y.ends
+        name = f"{label} {at_most(value) if kind == 'bound' else number(value)}"
         if not low <= value <= high:
-            self._named(kind, f"{label} {number(value)}, {'above' if value > high else 'below'} this chart", "line")
+            self._named(kind, f"{name}, {'above' if value > high else 'below'} this chart", "line")
             return self
-        return self.line(self.x.ends, [value, value], kind, f"{label} {number(value)}")
+        return self.line(self.x.ends, [value, value], kind, name)
 
     def image(self, values: Array, low: float, high: float) -> Chart:
         """Add a map of values ``(rows, columns)``, the first row at the bottom, in a colour scale from low to high."""

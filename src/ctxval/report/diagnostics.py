@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ctxval._util.arrays import Array
+from ctxval._util.representation import counted
 from ctxval.campaign.dynamics import PREDICTION
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.bounds import at_most, of_tasks
@@ -131,8 +132,9 @@ def _predictions(context: ReportContext) -> Finding | None:
     size = max(float(context.distances.max()), context.bound or 0.0)
     held = sum(abs(distance_of(trial) - one.median) <= ACCURATE * size for trial, one in found)
     text = (
-        f"{held} of {len(found)} executions that were predicted beforehand came out within {percent(ACCURATE)} of "
-        f"{quantity(size, context.labels.units)} of their prediction."
+        f"{held} of {counted(len(found), 'execution')} that were predicted beforehand came out within "
+        f"{quantity(ACCURATE * size, context.labels.units)} of the prediction, which is {percent(ACCURATE)} of the "
+        "largest distance or of the bound."
     )
     light: Light = "good" if held == len(found) else "attention"
     return Finding("Predictions made beforehand", light, text, {"made": len(found), "held": held})
@@ -144,8 +146,8 @@ def _states_covered(context: ReportContext) -> Finding | None:
         return None
     gap, beyond = found.details["coverage_gap"], found.details["beyond_the_records"]
     text = (
-        f"The closed loops of the tasks lead at most {percent(beyond)} of the range of a state or an input beyond what "
-        f"was recorded, and at most {percent(gap)} away from every record."
+        f"The closed loops of the tasks leave the recorded range of a state or an input by {percent(beyond)} of it or "
+        f"less, and are never farther than {percent(gap)} of it from every record."
     )
     light: Light = "good" if found.doubt is None else "attention"
     return Finding("States and inputs covered", light, text, {"beyond": beyond, "gap": gap})

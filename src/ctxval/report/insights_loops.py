@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.representation import counted
 from ctxval.core.controller import Limits
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.trajectory import Trajectory
@@ -47,7 +48,7 @@ def components(context: ReportContext) -> Finding | None:
     end = float(np.mean([one.system.times[-1] for one in worst]))
     label, when = context.signals[0][j], float(np.median(times))
     text = (
-        f"In the {len(worst)} worst trials, S differs from M most in {label}: by {percent(float(peaks[j]))} of its "
+        f"In the {counted(len(worst), 'worst trial')}, S differs from M most in {label}: by {percent(float(peaks[j]))} of its "
         f"range at the peak, which is at {number(when, 3)} s of {number(end, 3)} s."
     )
     shares = _shares(context, worst)
@@ -130,8 +131,8 @@ def unusual_motion(context: ReportContext) -> Finding | None:
         return Finding("Motion of M", "good", text, values)
     text = (
         f"In trial {trial} M itself moves {number(float(sizes[row, j]))} in {label}, {number(ratio, 2)} times as far "
-        "as in the median trial: the controller asks for an unusual motion, which may explain the distance better than an "
-        "error of M."
+        "as in the median trial: the controller asks for an unusual motion, which may explain the distance better "
+        "than an error of M."
     )
     return Finding("Motion of M", "attention", text, values)
 
@@ -181,14 +182,14 @@ def converged(context: ReportContext) -> Finding | None:
     if not told:
         return None
     failed = [k for k, one in told.items() if not one]
+    among = sum(k in failed for k in list(context.recordings)[:_WORST])
     values = {"designs": len(told), "not_converged": failed}
     if not failed:
         text = f"The design of the controller converged in all {len(told)} trials that were designed again."
         return Finding("Design of the controllers", "good", text, values)
     text = (
         f"The design of the controller did not converge in {len(failed)} of {len(told)} trials: it stopped at its "
-        f"limit of iterations. {len([k for k in list(context.recordings)[:_WORST] if k in failed])} of them are among the "
-        f"{_WORST} worst."
+        f"limit of iterations. {among} of them are among the {_WORST} worst."
     )
     return Finding("Design of the controllers", "attention", text, values)
 
@@ -196,8 +197,7 @@ def converged(context: ReportContext) -> Finding | None:
 def goals(context: ReportContext) -> Finding | None:
     """Whether M itself reaches its goals under the controllers that are designed on it."""
     if context.validation is None:
-        text = f"Not known, because the goals need the experiment: {context.missing}"
-        return Finding("Goals of M", "unknown", text)
+        return Finding("Goals of M", "unknown", "Not known: it needs the experiment, which is not loaded.")
     if not context.replays:
         return None
     weighed = _weighed(context)

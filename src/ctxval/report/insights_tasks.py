@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
+from ctxval._util.representation import counted
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.findings import Finding
 from ctxval.report.markup import number, percent, quantity
@@ -78,10 +79,10 @@ def weak_states(context: ReportContext) -> Finding | None:
     which = "above the threshold" if _is_above(context) else "with the largest distances"
     numbers = {"signal": label, "beyond": float(beyond[j])}
     if beyond[j] < 0.05:
-        text = f"The {int(weak.sum())} trials {which} visit the same states and inputs as the others."
+        text = f"{counted(int(weak.sum()), 'trial')} {which}: the states and inputs are the same as in the others."
         return Finding("States visited there", "good", text, numbers)
     text = (
-        f"The {int(weak.sum())} trials {which} lead to {label} from {number(low[weak, j].min())} to "
+        f"{counted(int(weak.sum()), 'trial')} {which}: {label} goes from {number(low[weak, j].min())} to "
         f"{number(high[weak, j].max())}; all others stay within {number(inside_low[j])} and {number(inside_high[j])}."
     )
     return Finding("States visited there", "note", text, numbers)
@@ -147,8 +148,7 @@ def _side(context: ReportContext) -> tuple[str, float] | None:
 def explained(context: ReportContext) -> Finding | None:
     """Whether the corrected model, learned from the other trials, predicts the distance."""
     if context.validation is None:
-        text = f"Not known, because the corrected model needs the experiment: {context.missing}"
-        return Finding("Corrected model", "unknown", text)
+        return Finding("Corrected model", "unknown", "Not known: it needs the experiment, which is not loaded.")
     by_number = {trial.number: distance_of(trial) for trial in context.completed}
     pairs = [(by_number[k], one.distance) for k, one in context.replays.items() if np.isfinite(one.distance)]
     if len(pairs) < 2:

@@ -114,13 +114,14 @@
       const reference = trial.r && signal.kind === "state" ? unpacked(trial.r[j]) : null;
       const values = [], errors = [];
       if (reference) values.push({ kind: "reference", name: "reference", values: reference });
-      values.push({ kind: "system", name: "system S", values: added(model, error) });
-      values.push({ kind: "model", name: "model M", values: model });
-      errors.push({ kind: "system", name: "S − M", values: error });
+      // The corrected model is drawn first, as a wide line, because it often coincides with S.
       if (change) {
         values.push({ kind: "corrected", name: "corrected model", values: added(model, change) });
         errors.push({ kind: "corrected", name: "corrected model − M", values: change });
       }
+      values.push({ kind: "system", name: "system S", values: added(model, error) });
+      values.push({ kind: "model", name: "model M", values: model });
+      errors.push({ kind: "system", name: "S − M", values: error });
       charts.append(chart(`${signal.label} in trial ${number}`, signal.label, times, values));
       charts.append(chart(`Error of ${signal.label} in trial ${number}`, `error of ${signal.label}`, times, errors));
     });

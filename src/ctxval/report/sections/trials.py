@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ctxval._util.arrays import Array
+from ctxval._util.representation import counted
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, small_charts
 from ctxval.report.context import Recording, ReportContext
@@ -70,7 +71,7 @@ def _left_out(context: ReportContext, lines: RecordedLines) -> str:
     if lines.thinned:
         said.append(f"Each line has about {lines.points} of the recorded points; `ctxval export` writes all of them.")
     if not context.replays and context.missing:
-        said.append(f"The corrected model is not drawn, because it needs the experiment: {context.missing}")
+        said.append("The corrected model is not drawn, because the experiment is not loaded.")
     elif context.replays:
         said.append("The corrected model in each trial is learned from the other trials.")
     return " ".join(said)
@@ -115,7 +116,7 @@ def _worst(context: ReportContext) -> Markup:
     if not numbers:
         return paragraph("No trajectories are recorded, so the worst trials cannot be drawn.")
     by_number = {trial.number: trial for trial in context.completed}
-    parts = [heading(f"The {len(numbers)} worst trials")]
+    parts = [heading(f"The {counted(len(numbers), 'worst trial')}")]
     for number_ in numbers:
         trial = by_number[number_]
         head = f"Trial {number_}: {quantity(trial.distance, context.labels.units)} at {_where(context, trial)}"
@@ -143,12 +144,11 @@ def _signals(context: ReportContext, number_: int) -> list[Chart]:
     chosen = sorted(np.argsort(sizes)[::-1][:_SIGNALS].tolist())
     drawn = []
     for j in chosen:
-        lines = [of_system[j], of_model[j]]
+        lines = {"system": of_system[j], "model": of_model[j]}
         if corrected is not None:
-            lines.append(corrected.states[:, j] if j < n else corrected.inputs[:, j - n])
-        reference = (
-            None if replay is None or j >= n or not replay.task.reference[:, j].any() else replay.task.reference[:, j]
-        )
+            lines["corrected"] = corrected.states[:, j] if j < n else corrected.inputs[:, j - n]
+        target = None if replay is None or j >= n else replay.task.reference[:, j]
+        reference = target if target is not None and target.any() else None
         drawn.append(_signal(f"{labels[j]} in trial {number_}", labels[j], recording.system.times, lines, reference))
     return drawn
 
@@ -158,14 +158,16 @@ def _joined(recording: Recording, side: str) -> list[Array]:
     return [*one.states.T, *one.inputs.T]
 
 
-def _signal(title: str, label: str, times: Array, lines: list[Array], reference: Array | None) -> Chart:
-    every = [*lines, *([] if reference is None else [reference])]
+def _signal(title: str, label: str, times: Array, lines: dict[str, Array], reference: Array | None) -> Chart:
+    every = [*lines.values(), *([] if reference is None else [reference])]
     chart = Chart(title, Axis("time [s]", float(times[0]), float(times[-1])), Axis.over(label, *every), **SMALL)
     if reference is not None:
         _thin(chart, times, reference, "reference", "reference")
-    kinds = (("system", "system S"), ("model", "model M"), ("corrected", "corrected model"))
-    for values, (kind, name) in zip(lines, kinds, strict=False):
-        _thin(chart, times, values, kind, name)
+    # The corrected model is drawn first, as a wide line, because it often coincides with S.
+    kinds = (("corrected", "corrected model"), ("system", "system S"), ("model", "model M"))
+    for kind, name in kinds:
+        if kind in lines:
+            _thin(chart, times, lines[kind], kind, name)
     return chart
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from markupsafe import Markup
 
-from ctxval._util.representation import shown
-from ctxval.certificates.bounds import at_most, with_error
+from ctxval.certificates.bounds import as_text, at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
 from ctxval.report.findings import WORDS, Finding
@@ -39,7 +38,7 @@ class VerdictSection:
 
 
 def _answer(context: ReportContext) -> str:
-    return "no verdict." if context.verdict is None else f"{context.verdict.answer.capitalize()}."
+    return "No verdict." if context.verdict is None else f"{context.verdict.answer.capitalize()}."
 
 
 def _sentence(context: ReportContext) -> str:
@@ -49,8 +48,14 @@ def _sentence(context: ReportContext) -> str:
         worst = context.worst_first[0] if context.worst_first else None
         largest = "no distance is known" if worst is None else f"the largest executed distance is {_of(context)}"
         return f"No threshold was given; {largest}."
-    reason = verdict.reason[:1].upper() + verdict.reason[1:]
+    reason = f"{verdict.reason[:1].upper()}{verdict.reason[1:]} {_effort(context)}"
     return reason if verdict.rests_on is None else f"{reason} {verdict.rests_on}"
+
+
+def _effort(context: ReportContext) -> str:
+    without = len(context.failed)
+    lost = "each gave a distance" if not without else f"{without} of the trials have no distance"
+    return f"{context.executions} executions were spent, and {lost}."
 
 
 def _of(context: ReportContext) -> str:
@@ -77,9 +82,10 @@ def _facts(context: ReportContext) -> Markup:
         ]
     if verdict is not None and verdict.expected is not None:
         rows.append(("Forecast", str(verdict.expected)))
-    if context.missing:
-        rows.append(("Experiment not loaded", context.missing))
-    return table("The verdict in numbers", ("Quantity", "Value"), rows, class_="facts")
+    facts = table("The verdict in numbers", ("Quantity", "Value"), rows, class_="facts")
+    if not context.missing:
+        return facts
+    return joined([facts, paragraph(f"The experiment is not loaded: {context.missing}", class_="note")])
 
 
 def _assumptions(context: ReportContext) -> Markup:
@@ -97,9 +103,7 @@ def _assumptions(context: ReportContext) -> Markup:
 
 
 def _numbers(numbers: dict[str, object]) -> Markup:
-    rows = (
-        (name.replace("_", " "), value if isinstance(value, str) else shown(value)) for name, value in numbers.items()
-    )
+    rows = ((name.replace("_", " "), as_text(value)) for name, value in numbers.items())
     return table("Numbers of the certificate", ("Name", "Value"), rows)
 
 
