@@ -31,6 +31,9 @@ _UNUSUAL = 3.0
 _MISSED = 0.1
 """M misses its goal if it ends farther away than this, as a share of the range of a state."""
 
+_SEVERAL = 3
+"""Number of steps of one execution at an extreme value from which this value is taken to be a limit."""
+
 _SATURATED = 0.01
 """Least share of steps at a limit that is worth a note."""
 
@@ -48,8 +51,8 @@ def components(context: ReportContext) -> Finding | None:
     end = float(np.mean([one.system.times[-1] for one in worst]))
     label, when = context.signals[0][j], float(np.median(times))
     text = (
-        f"In the {counted(len(worst), 'worst trial')}, S differs from M most in {label}: by {percent(float(peaks[j]))} of its "
-        f"range at the peak, which is at {number(when, 3)} s of {number(end, 3)} s."
+        f"In the {counted(len(worst), 'worst trial')}, S differs from M most in {label}: by {percent(float(peaks[j]))} "
+        f"of its range at the peak, which is at {number(when, 3)} s of {number(end, 3)} s."
     )
     shares = _shares(context, worst)
     numbers = {"state": label, "peak": float(peaks[j]), "time": when, "shares": shares}
@@ -142,8 +145,7 @@ def saturation(context: ReportContext) -> Finding | None:
     executed = [one.system.inputs for one in context.recordings.values() if one.system.inputs.size]
     if not executed:
         return None
-    together = np.concatenate(executed)
-    at_limit, known = _at_limit(context, together)
+    at_limit, known = _at_limit(context, executed)
     share = at_limit.mean(axis=0)
     j = int(share.argmax())
     label = context.signals[1][j]
@@ -162,18 +164,24 @@ def _rest(share: float) -> str:
     return "all steps" if not share else f"{percent(1 - float(share), 4)} of the steps"
 
 
-def _at_limit(context: ReportContext, inputs: Array) -> tuple[Mask, bool]:
-    """Return which inputs ``(N, m)`` are at a limit, and whether the limits are those of the synthesizer."""
+def _at_limit(context: ReportContext, executed: list[Array]) -> tuple[Mask, bool]:
+    """Return which inputs of all executions ``(N, m)`` are at a limit, and whether the synthesizer states the limits.
+
+    If it states none, the extreme values of all executions are limits in those executions that stay there for several
+    steps.
+    """
+    together = np.concatenate(executed)
+    spans = np.maximum(np.ptp(together, axis=0), 1e-300)
     given = None if context.validation is None else getattr(context.validation.synthesizer, "limits", None)
-    spans = np.maximum(np.ptp(inputs, axis=0), 1e-300)
     if given is not None:
-        limits = Limits.of(given, inputs.shape[-1])
-        near = 1e-6 * spans
-        return (inputs <= limits.low + near) | (inputs >= limits.high - near), True
-    low, high = inputs.min(axis=0), inputs.max(axis=0)
-    at = (inputs <= low + 1e-9 * spans) | (inputs >= high - 1e-9 * spans)
-    # An extreme value that occurs once is no limit.
-    return at & (at.sum(axis=0) > 2 + len(context.recordings)) & (np.ptp(inputs, axis=0) > 0), False
+        limits = Limits.of(given, together.shape[-1])
+        return (together <= limits.low + 1e-6 * spans) | (together >= limits.high - 1e-6 * spans), True
+    low, high = together.min(axis=0) + 1e-9 * spans, together.max(axis=0) - 1e-9 * spans
+    parts = []
+    for inputs in executed:
+        at_ends = inputs <= low, inputs >= high
+        parts.append(np.logical_or(*(at & (at.sum(axis=0) >= _SEVERAL) for at in at_ends)) & (low < high))
+    return np.concatenate(parts), False
 
 
 def converged(context: ReportContext) -> Finding | None:

@@ -1,0 +1,219 @@
+"""Reports in a real browser: no error, no connection, accessible, and the trials can be looked at."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rig_pages import hostile_store, pendulum, plane
+
+from ctxval import Campaign, Store, cases, searches
+from ctxval.certificates import CertificateOptions
+from ctxval.report import ReportContext, context_of_campaign, context_of_store, write_page
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+ARGUMENTS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+LARGEST = 1_500_000
+"""Bytes of a report."""
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: apt-get install chromium"),
+]
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+axe = pytest.importorskip("axe_core_python.sync_playwright", reason="axe-core-python is not installed")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield opened
+        opened.close()
+
+
+def case(name: str, executions: int) -> ReportContext:
+    experiment = cases.by_name(name)
+    campaign = Campaign(experiment.validation, search=searches.Random(), seed=0, name=experiment.name).run(executions)
+    options = CertificateOptions.posterior()
+    return context_of_campaign(campaign, threshold=experiment.threshold, certificate=options)
+
+
+def arm() -> ReportContext:
+    pytest.importorskip("mujoco")
+    return case("arm", 20)
+
+
+def by_hand(tmp_path: Path) -> ReportContext:
+    """Return the context of a store without its experiment, as somebody else gets it."""
+    campaign = pendulum(tmp_path / "hand.sqlite", 3)
+    opened = campaign.ask({"goal": 0.5})
+    campaign.tell(opened, failed="the motor <b>cut</b> out")
+    campaign.tell(campaign.ask({"goal": -0.5}), distance=0.1)
+    campaign.ask({"goal": 1.0})
+    return context_of_store(Store.existing(tmp_path / "hand.sqlite"), 0.5)
+
+
+REPORTS: dict[str, Callable[[Path], ReportContext]] = {
+    "pendulum": lambda folder: case("pendulum", 15),
+    "dubins": lambda folder: case("dubins", 40),
+    "arm": lambda folder: arm(),
+    "by hand": by_hand,
+    "hostile": lambda folder: context_of_store(hostile_store(folder / "hostile.sqlite"), 1.0),
+    "plane": lambda folder: context_of_campaign(plane(), threshold=0.1),
+}
+
+
+class Opened:
+    """A page with what it printed and what it asked for."""
+
+    def __init__(self, browser: Any, path: Path, **options: Any) -> None:
+        self.context = browser.new_context(**options)
+        self.page = self.context.new_page()
+        self.said: list[str] = []
+        self.asked: list[str] = []
+        self.page.on("console", lambda message: self.said.append(message.text))
+        self.page.on("pageerror", lambda error: self.said.append(str(error)))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.goto(path.as_uri())
+
+    def require_quiet(self, path: Path) -> None:
+        """Check that there was no message, and no request but for the page and its own images."""
+        assert self.said == []
+        assert [url for url in self.asked if not url.startswith("data:")] == [path.as_uri()]
+
+    def violations(self) -> list[tuple[str, str]]:
+        """Return what axe-core finds."""
+        self.page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+        found = axe.Axe().run(self.page)["violations"]
+        return [(one["id"], one["nodes"][0]["html"][:200]) for one in found]
+
+
+@pytest.mark.parametrize("name", sorted(REPORTS))
+def test_a_report_is_quiet_small_and_accessible(name: str, browser: Any, tmp_path: Path) -> None:
+    path = write_page(REPORTS[name](tmp_path), tmp_path / "report.html")
+    assert path.stat().st_size < LARGEST
+    for options in ({}, {"color_scheme": "dark"}, {"viewport": {"width": 400, "height": 800}}):
+        opened = Opened(browser, path, **options)
+        if opened.page.locator("button[data-trial]").count():
+            opened.page.locator("button[data-trial]").first.click()
+            assert opened.page.locator("#trial svg.chart").count() > 0
+        if "viewport" not in options and (name == "pendulum" or not options):
+            assert opened.violations() == []
+        opened.require_quiet(path)
+        assert opened.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+        assert opened.page.title().startswith("Validation of")
+        opened.context.close()
+
+
+@pytest.fixture(scope="module")
+def swing(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Opened, ReportContext]]:
+    context = context_of_campaign(pendulum(), threshold=0.2, certificate=CertificateOptions.posterior())
+    path = write_page(context, tmp_path_factory.mktemp("swing") / "report.html")
+    opened = Opened(browser, path)
+    yield opened, context
+    opened.context.close()
+
+
+def test_a_click_on_a_trial_shows_its_trajectories(swing: tuple[Opened, ReportContext]) -> None:
+    opened, context = swing
+    number = context.worst_first[2].number
+    opened.page.click(f"button[data-trial='{number}']")
+    panel = opened.page.locator("#trial")
+    assert panel.locator("h3").inner_text() == f"Trial {number}"
+    titles = panel.locator("figcaption").all_inner_texts()
+    assert f"angle [rad] in trial {number}" in titles
+    assert f"Error of torque [N m] in trial {number}" in titles
+    assert len(titles) == 6  # two states and one input, each with its error
+    names = panel.locator("figure").first.locator(".legend li").all_inner_texts()
+    assert {"system S", "model M", "corrected model"} <= set(names)
+    assert opened.page.locator("tr[aria-current]").count() == 1
+    assert opened.page.evaluate("document.activeElement.textContent") == f"Trial {number}"
+
+
+def test_the_lines_on_the_page_are_those_of_the_store(swing: tuple[Opened, ReportContext]) -> None:
+    opened, context = swing
+    number = context.worst_first[0].number
+    opened.page.click(f"button[data-trial='{number}']")
+    chart = opened.page.locator("#trial figure").first
+    box = chart.locator("svg").first.bounding_box()
+    assert box is not None
+    opened.page.mouse.move(box["x"] + box["width"] * 0.999, box["y"] + box["height"] / 2)
+    said = chart.locator(".readout").inner_text().replace("\u2212", "-")
+    recording = context.recordings[number]
+    end = float(recording.system.states[-1, 0])
+    shown = float(said.split("system S ")[1].split(",")[0])
+    assert shown == pytest.approx(end, rel=1e-3, abs=1e-3)
+
+
+def test_a_trial_is_shown_by_the_keyboard(swing: tuple[Opened, ReportContext]) -> None:
+    opened, context = swing
+    number = context.worst_first[1].number
+    opened.page.locator(f"button[data-trial='{number}']").focus()
+    opened.page.keyboard.press("Enter")
+    assert opened.page.locator("#trial h3").inner_text() == f"Trial {number}"
+
+
+def test_the_table_is_sorted_by_numbers(swing: tuple[Opened, ReportContext]) -> None:
+    opened, context = swing
+    header = opened.page.locator("#trials thead th", has_text="distance")
+    for direction in ("ascending", "descending"):
+        header.locator("button").click()
+        assert header.get_attribute("aria-sort") == direction
+        rows = opened.page.locator("#trials tbody tr td:nth-child(2)")
+        values = [float(one) for one in rows.evaluate_all("cells => cells.map((one) => one.dataset.value)")]
+        assert values == sorted(values, reverse=direction == "descending")
+        assert len(values) == len(context.trials)
+
+
+def test_print_unfolds_and_hides_what_cannot_be_clicked(swing: tuple[Opened, ReportContext], tmp_path: Path) -> None:
+    opened, _ = swing
+    opened.page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert opened.page.locator("details:not([open])").count() == 0
+    opened.page.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert opened.page.locator("details:not([open])").count() > 0
+    opened.page.emulate_media(media="print")
+    assert not opened.page.locator("nav").is_visible()
+    opened.page.emulate_media(media="screen")
+    assert len(opened.page.pdf(path=tmp_path / "report.pdf")) > 10_000
+
+
+def test_a_hostile_store_does_not_script_the_page(browser: Any, tmp_path: Path) -> None:
+    context = context_of_store(hostile_store(tmp_path / "hostile.sqlite"), 1.0)
+    path = write_page(context, tmp_path / "report.html")
+    opened = Opened(browser, path)
+    opened.page.locator("button[data-trial]").last.click()
+    assert opened.page.title().startswith("Validation of </script>")
+    assert opened.page.locator("img").count() == 0
+    assert opened.page.locator("script").count() == 2
+    opened.require_quiet(path)
+    opened.context.close()
+
+
+def test_the_policy_refuses_a_script_that_gets_into_the_page(browser: Any, tmp_path: Path) -> None:
+    class Careless:
+        title = "Careless"
+
+        def render(self, context: ReportContext) -> Any:
+            from markupsafe import Markup
+
+            return Markup("<script>document.title = 'hacked'</script><img src='https://example.org/x.png'>")
+
+    context = replace(context_of_campaign(pendulum(executions=2)), name="guarded")
+    path = write_page(context, tmp_path / "report.html", [Careless()])
+    opened = Opened(browser, path)
+    assert opened.page.title() == "Validation of guarded"
+    assert any("Content Security Policy" in message for message in opened.said)
+    opened.context.close()

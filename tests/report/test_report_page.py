@@ -1,0 +1,305 @@
+"""The page of a report, its twins, and what users add to it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from rig_pages import HOSTILE, hostile_store, pendulum, plane
+
+from ctxval import Campaign, Trial, report
+from ctxval.certificates import CertificateOptions, Region
+from ctxval.errors import InputError
+from ctxval.report import ReportContext, context_of_campaign, context_of_store
+from ctxval.report.recorded_lines import packed, recorded_lines
+from ctxval.report.sections import appendix, base
+from ctxval.report.sections.repeat import command_of, identity, python_snippet
+
+POSTERIOR = CertificateOptions.posterior()
+
+
+@pytest.fixture(scope="module")
+def swing() -> ReportContext:
+    return context_of_campaign(pendulum(), threshold=0.2, certificate=POSTERIOR)
+
+
+@pytest.fixture(scope="module")
+def html(swing: ReportContext) -> str:
+    return report.page(swing)
+
+
+def test_the_page_has_all_sections_in_their_order(html: str) -> None:
+    titles = re.findall(r"<h2 id=\"heading-\d\">([^<]*)</h2>", html)
+    assert titles == [
+        "Verdict", "Insights", "Distance over the tasks", "Trials", "Convergence", "To repeat it", "For the file",
+    ]  # fmt: skip
+    assert "cannot be shown" not in html
+    assert "could not be computed" not in html
+
+
+def test_the_page_opens_no_connection(html: str) -> None:
+    assert not re.findall(r'(?:src|href)="(?!#|data:)[^"]*"', html)
+    assert "http" not in html.replace("http-equiv", "").replace("http://www.w3.org/2000/svg", "")
+
+
+def test_the_policy_allows_exactly_the_script_and_the_style_of_the_page(html: str) -> None:
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', html)
+    assert policy is not None
+    allowed = policy[1].replace("&#39;", "'")
+    assert allowed.startswith("default-src 'none'")
+    for tag in ("script", "style"):
+        content = re.search(rf"<{tag}>(.*?)</{tag}>", html, re.DOTALL)
+        assert content is not None
+        digest = base64.b64encode(hashlib.sha256(content[1].encode()).digest()).decode()
+        assert f"{tag}-src 'sha256-{digest}'" in allowed
+    assert not re.search(r"\son\w+=|style=", html)
+
+
+def test_names_units_threshold_and_verdict_are_on_the_page(html: str) -> None:
+    for words in ("angle [rad]", "rate [rad/s]", "torque [N m]", "goal [rad]", "distance [rad]", "threshold 0.2"):
+        assert words in html
+    assert "Falsified." in html
+
+
+@pytest.mark.parametrize(
+    ("dimension", "holds"),
+    [(2, "Map of the distance"), (3, "Parallel coordinates"), (5, "Slices through the worst task")],
+)
+def test_the_charts_suit_the_number_of_parameters(dimension: int, holds: str) -> None:
+    found = report.page(context_of_campaign(plane(dimension)))
+    assert holds in found
+    assert "Sensitivity" in found
+    assert "no distance is known" in found
+    assert "cannot be shown" not in found
+
+
+def test_a_report_of_nothing_says_so() -> None:
+    empty = Campaign(pendulum(executions=1).validation, name="empty")
+    found = report.page(context_of_campaign(empty, threshold=0.5))
+    assert "There are no trials" in found
+    assert "cannot be shown" not in found
+
+
+@pytest.mark.parametrize("executions", [1, 2])
+def test_a_report_of_few_trials_is_whole(executions: int) -> None:
+    found = report.page(context_of_campaign(pendulum(executions=executions)))
+    assert "cannot be shown" not in found
+    assert "could not be computed" not in found
+
+
+def test_all_executions_may_have_failed() -> None:
+    campaign = plane(2, 3, {0: "raise", 1: "raise", 2: "raise"})
+    found = report.page(context_of_campaign(campaign, threshold=0.5))
+    assert "cannot be shown" not in found
+    assert "3 of 3 trials have no distance" in found
+
+
+# Hostile stores
+
+
+@pytest.fixture
+def hostile(tmp_path: Path) -> ReportContext:
+    return context_of_store(hostile_store(tmp_path / "hostile.sqlite"), 1.0, missing=HOSTILE)
+
+
+def test_a_hostile_store_cannot_script_the_page(hostile: ReportContext) -> None:
+    found = report.page(hostile)
+    assert found.count("<script") == 2  # the data and the script of the page
+    assert "<img" not in found
+    assert "onerror=alert(1)>" not in found
+    assert "cannot be shown" not in found
+    data = re.search(r'<script type="application/json" id="trial-data">(.*?)</script>', found, re.DOTALL)
+    assert data is not None
+    assert set(json.loads(data[1])) == {"signals", "trials"}
+    assert "<" not in data[1]
+
+
+def test_a_hostile_store_has_harmless_twins(hostile: ReportContext) -> None:
+    ElementTree.fromstring(report.junit(hostile))
+    words = report.markdown(hostile)
+    assert "<script" not in words.replace("\\<", "")
+    assert json.dumps(report.to_json(hostile), allow_nan=False)
+
+
+def test_a_snippet_of_a_hostile_store_runs_nothing_of_it(hostile: ReportContext) -> None:
+    import ast
+
+    for trial in hostile.worst_first:
+        tree = ast.parse(python_snippet(hostile, trial))
+        called = {
+            node.func.id for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        }
+        assert called <= {"print", "trusted_settings"}
+    assert command_of(hostile).startswith("ctxval run '")
+
+
+def test_a_store_without_a_task_space_is_refused(tmp_path: Path) -> None:
+    from ctxval import Store
+
+    store = Store(tmp_path / "nothing.sqlite")
+    store.describe_first({"name": "nothing"})
+    with pytest.raises(InputError, match="no readable task space"):
+        context_of_store(store)
+
+
+# Data of the page
+
+
+def test_lines_are_as_exact_as_a_picture_needs() -> None:
+    values = np.linspace(-3.0, 5.0, 50) ** 3
+    line = packed(values)
+    raw = np.frombuffer(base64.b64decode(line["data"]), dtype="<u2")
+    np.testing.assert_allclose(line["low"] + line["step"] * raw, values, atol=np.ptp(values) / 60_000)
+    assert packed(np.full(4, 2.5)) == {"low": 2.5, "step": 0.0, "n": 4}
+
+
+def test_too_many_lines_are_left_out_and_the_page_says_so(swing: ReportContext) -> None:
+    few = recorded_lines(swing, most=3_000)
+    assert 0 < len(few.kept) < len(swing.recordings)
+    assert few.kept == tuple(swing.recordings)[: len(few.kept)]  # the worst first
+    assert len(few.kept) + len(few.left_out) == len(swing.recordings)
+    assert recorded_lines(swing).left_out == ()
+
+
+def test_every_recorded_trial_has_a_button_and_data(html: str, swing: ReportContext) -> None:
+    buttons = set(map(int, re.findall(r'data-trial="(\d+)"', html)))
+    assert buttons == set(swing.recordings)
+
+
+# Sections of users
+
+
+class Weather:
+    """A section of a user."""
+
+    title = "Weather <b>"
+
+    def __init__(self, content: Any) -> None:
+        self.content = content
+
+    def render(self, context: ReportContext) -> Any:
+        return self.content(context)
+
+
+def test_a_user_adds_a_section(swing: ReportContext) -> None:
+    chart = report.Chart("Wind", report.Axis("t [s]", 0, 1), report.Axis("wind [m/s]", 0, 3)).line(
+        [0, 1], [1, 2], "mean"
+    )
+    found = report.page(swing, [Weather(lambda context: chart)])
+    assert "Weather &lt;b&gt;" in found
+    assert "wind [m/s]" in found
+
+
+def test_a_plain_text_of_a_section_is_escaped(swing: ReportContext) -> None:
+    assert "<p>&lt;script&gt;" in report.page(swing, [Weather(lambda context: "<script>")])
+
+
+def test_a_section_that_fails_says_why_and_the_others_are_shown(swing: ReportContext) -> None:
+    def fail(context: ReportContext) -> str:
+        raise ValueError("no <wind>")
+
+    found = report.page(swing, [Weather(fail)])
+    assert "This section cannot be shown: ValueError: no &lt;wind&gt;." in found
+    assert "For the file" in found
+
+
+def test_what_is_no_section_is_refused(swing: ReportContext) -> None:
+    with pytest.raises(InputError, match="must have a title and a method render"):
+        report.page(swing, [object()])  # type: ignore[list-item]
+
+
+def test_installed_packages_add_sections(swing: ReportContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    point = EntryPoint("weather", "test_report_page:Sunny", base.GROUP)
+    monkeypatch.setattr(base, "entry_points", lambda group: [point])
+    assert "sunshine" in report.page(swing)
+    broken = EntryPoint("broken", "no_such_module:Nothing", base.GROUP)
+    monkeypatch.setattr(base, "entry_points", lambda group: [broken])
+    with pytest.raises(InputError, match="the section 'broken' cannot be loaded"):
+        report.page(swing)
+
+
+class Sunny:
+    title = "Weather"
+
+    def render(self, context: ReportContext) -> str:
+        return "sunshine"
+
+
+# Twins
+
+
+def test_the_json_has_everything_that_decides(swing: ReportContext) -> None:
+    found = report.to_json(swing)
+    assert (found["verdict"], found["threshold"], found["executions"]) == ("falsified", 0.2, 9)
+    assert found["worst"][0]["distance"] == pytest.approx(float(swing.distances.max()))
+    assert {entry["term"] for entry in found["appendix"]} >= {"Intended use", "Referent data", "Assumptions"}
+    assert found["diagnostics"]
+    assert found["insights"]
+
+
+@pytest.mark.parametrize(("threshold", "tag"), [(0.2, "failure"), (None, "skipped")])
+def test_junit_fails_if_m_is_falsified(threshold: float | None, tag: str) -> None:
+    context = context_of_campaign(pendulum(), threshold=threshold, certificate=POSTERIOR)
+    suite = ElementTree.fromstring(report.junit(context))
+    verdict = suite.find("testcase[@name='verdict']")
+    assert verdict is not None
+    assert verdict.find(tag) is not None
+    assert int(suite.attrib["tests"]) == len(suite)
+    assert int(suite.attrib["failures"]) == len(suite.findall("testcase/failure"))
+
+
+def test_markdown_names_the_verdict_and_the_worst_tasks(swing: ReportContext) -> None:
+    words = report.markdown(swing)
+    assert words.startswith("# Validation of pendulum")
+    assert "**falsified: trial" in words
+    assert "| trial | distance | goal" in words
+
+
+def test_the_appendix_covers_the_vocabulary_of_both_standards(swing: ReportContext) -> None:
+    entries = appendix.appendix(swing)
+    assert all(entry.content.strip() for entry in entries)
+    for standard in ("NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"):
+        assert any(standard in entry.standard for entry in entries)
+
+
+def test_the_identity_has_digests_of_the_parts(swing: ReportContext) -> None:
+    found = identity(swing)
+    assert len(found["digest of the system"]) == 64
+    assert found["seed"] == "1"
+
+
+def test_a_report_is_written_in_python(tmp_path: Path) -> None:
+    campaign = pendulum(executions=3)
+    path = report.write(campaign, tmp_path / "new" / "report.html", threshold=9.0, certificate=POSTERIOR)
+    assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    with pytest.raises(InputError, match="cannot be written"):
+        report.write(campaign, tmp_path)
+
+
+def test_the_snippet_executes_the_task_again(tmp_path: Path) -> None:
+    campaign = pendulum(tmp_path / "swing.sqlite", 3)
+    context = context_of_campaign(campaign)
+    trial: Trial = context.worst_first[0]
+    code = python_snippet(context, trial).replace("validation = ...", "pass")
+    names: dict[str, Any] = {"validation": campaign.validation}
+    exec(code, names)
+    assert names["outcome"].distance == pytest.approx(trial.distance)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [1, 2, 3])
+def test_the_map_of_the_region_certificate_is_drawn(dimension: int) -> None:
+    campaign = pendulum(executions=6) if dimension == 1 else plane(dimension, 6, {})
+    campaign.audit(20)
+    options = CertificateOptions(Region(), volume=0.4)
+    found = report.page(context_of_campaign(campaign, threshold=9.0, certificate=options))
+    assert "Where the threshold is kept" in found
+    assert "cannot be shown" not in found
