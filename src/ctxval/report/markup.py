@@ -53,9 +53,9 @@ def _attribute(key: str, value: object) -> Markup:
     return Markup(' {}="{}"').format(name, text(value, 1_000_000))
 
 
-def joined(parts: Iterable[Markup]) -> Markup:
-    """Return elements one after the other."""
-    return Markup("").join(parts)
+def joined(parts: Iterable[object]) -> Markup:
+    """Return elements and charts one after the other; other texts are escaped."""
+    return Markup("").join(text(part) for part in parts)
 
 
 def paragraph(*children: object, class_: str | None = None) -> Markup:

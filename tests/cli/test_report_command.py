@@ -1,0 +1,152 @@
+"""``ctxval report``, and the report that ``ctxval run`` writes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from conftest import STATE
+from ctxval import Store
+from ctxval.cli import app
+
+RIG = """
+from conftest import make_validation
+from ctxval import Experiment, Labels
+
+def experiment(seed=0):
+    open("imported", "a").close()
+    return Experiment(
+        "short", make_validation(), budget=4, threshold=9.0, units="rad",
+        states=("angle [rad]", "rate [rad/s]"), inputs=("torque [N m]",),
+    )
+"""
+
+pytestmark = [pytest.mark.usefixtures("few_draws"), pytest.mark.slow]
+
+
+@pytest.fixture
+def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
+    (tmp_path / "short_rig.py").write_text(RIG)
+    sys.modules.pop("short_rig", None)
+
+    def run(*arguments: str) -> Result:
+        return CliRunner().invoke(app, list(arguments))
+
+    return run
+
+
+@pytest.fixture
+def store(invoke: Any) -> Path:
+    done = invoke(
+        "run", "short_rig:experiment", "--search", "gp-ucb", "--resolution", "1", "--store", "a.sqlite", "--no-report"
+    )
+    assert done.exit_code == 0, done.output
+    assert not Path("a.report.html").exists()
+    return Path("a.sqlite")
+
+
+def test_run_writes_a_report_next_to_the_store(invoke: Any) -> None:
+    done = invoke("run", "short_rig:experiment", "--search", "gp-ucb", "--resolution", "1", "--json")
+    report = json.loads(done.stdout)
+    assert report["report"] == "runs/short-gp-ucb-seed0.report.html"
+    page = Path(report["report"]).read_text(encoding="utf-8")
+    assert "Validated." in page
+    assert "angle [rad]" in page
+
+
+def test_a_report_that_cannot_be_written_does_not_hide_the_verdict(invoke: Any) -> None:
+    Path("b.report.html").mkdir()
+    done = invoke(
+        "run", "short_rig:experiment", "--search", "random", "--resolution", "1", "--store", "b.sqlite", "--json"
+    )
+    assert done.exit_code == 0
+    assert json.loads(done.stdout)["report"] is None
+    assert "no report" in done.stderr
+
+
+def test_a_store_that_you_made_has_a_report_with_its_experiment(invoke: Any, store: Path) -> None:
+    done = invoke("report", str(store), "--junit", "a.xml", "--markdown", "a.md")
+    assert done.exit_code == 0, done.output
+    page = Path("a.report.html").read_text(encoding="utf-8")
+    assert "corrected model" in page
+    assert "The experiment is not loaded" not in page
+    assert "4 of 4" in page
+    verdict = ElementTree.parse("a.xml").getroot().find("testcase[@name='verdict']")
+    assert verdict is not None
+    assert list(verdict) == []
+    assert Path("a.md").read_text(encoding="utf-8").startswith("# Validation of short")
+
+
+def test_a_store_of_somebody_else_runs_no_code(
+    invoke: Any, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("imported").unlink()
+    monkeypatch.setenv(STATE, str(tmp_path / "another user"))
+    done = invoke("report", str(store), "--threshold", "9", "-o", "other.html")
+    assert done.exit_code == 0, done.output
+    assert not Path("imported").exists()
+    assert "without the experiment" in done.output
+    page = Path("other.html").read_text(encoding="utf-8")
+    assert "The experiment is not loaded" in page
+    assert "would import or run code" in page
+    done = invoke("report", str(store), "--experiment", "short_rig:experiment", "-o", "named.html")
+    assert done.exit_code == 0, done.output
+    assert "angle [rad]" in Path("named.html").read_text(encoding="utf-8")
+
+
+def test_an_experiment_that_is_gone_leaves_the_report_of_the_data(invoke: Any, store: Path) -> None:
+    Path("short_rig.py").unlink()
+    sys.modules.pop("short_rig", None)
+    done = invoke("report", str(store))
+    assert done.exit_code == 0, done.output
+    assert "The experiment is not loaded" in Path("a.report.html").read_text(encoding="utf-8")
+
+
+def test_the_json_is_one_object_and_a_falsified_model_exits_with_1(invoke: Any, store: Path) -> None:
+    done = invoke("report", str(store), "--threshold", "0.001", "--json")
+    assert done.exit_code == 1
+    found = json.loads(done.stdout)
+    assert found["verdict"] == "falsified"
+    assert found["files"] == {"report": "a.report.html"}
+    assert found["insights"]
+
+
+def test_a_kind_and_a_confidence_of_ones_own(invoke: Any, store: Path) -> None:
+    asked = ("--kind", "posterior", "--confidence", "0.8", "--option", "resolution=0.9", "--json")
+    found = json.loads(invoke("report", str(store), *asked).stdout)
+    assert (found["certificate"]["kind"], found["certificate"]["confidence"]) == ("posterior", 0.8)
+    assert invoke("report", str(store), "--kind", "posterior", "--volume", "0.1").exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("nothing.sqlite",), "there is no store"),
+        (("short_rig.py",), "not a database"),
+        (("a.sqlite", "-o", "."), "cannot be written"),
+        (("a.sqlite", "--threshold", "-1"), "must be a positive number"),
+        (("a.sqlite", "--trust", "--experiment", "pendulum"), "cannot be given together"),
+        (("a.sqlite", "--junit", "no/such/folder.xml"), "cannot be written"),
+    ],
+)
+def test_nonsense_is_one_sentence(invoke: Any, store: Path, arguments: tuple[str, ...], says: str) -> None:
+    done = invoke("report", *arguments)
+    assert done.exit_code == 2
+    assert says in " ".join(done.stderr.split())
+    assert "Traceback" not in done.output
+
+
+def test_a_report_leaves_the_store_as_it_is(invoke: Any, store: Path) -> None:
+    kept = shutil.copy(store, "copy.sqlite")
+    before = [repr(trial) for trial in Store.existing(kept).trials()]
+    assert invoke("report", "copy.sqlite").exit_code == 0
+    assert [repr(trial) for trial in Store.existing(kept).trials()] == before

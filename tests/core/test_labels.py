@@ -1,0 +1,44 @@
+"""Names and units: those that are stated, else those of the system, else numbered ones."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from conftest import make_validation
+from ctxval import Experiment, Labels
+from ctxval.core.labels import labels_of
+from ctxval.errors import InputError
+
+
+def test_stated_labels_come_first_then_those_of_the_system() -> None:
+    system = SimpleNamespace(states={"q": "rad", "w": "rad/s"}, inputs=["torque"])
+    assert Labels().names(system, 2, 1) == ({"q": "rad", "w": "rad/s"}, {"torque": ""})
+    assert Labels(("a [m]", "b"), ()).names(system, 2, 1) == ({"a": "m", "b": ""}, {"torque": ""})
+    assert Labels(("a [m]",), ()).names(None, 2, 1) == ({"x0": "", "x1": ""}, {"u0": ""})
+    assert labels_of({"a": "m", "b": ""}) == ("a [m]", "b")
+
+
+def test_an_experiment_gives_its_labels_to_its_validation_and_takes_those_it_has() -> None:
+    validation = make_validation()
+    named = Experiment("a", validation, units="rad", states=("angle [rad]", "rate [rad/s]"))
+    assert named.validation.labels == Labels(("angle [rad]", "rate [rad/s]"), (), "rad")
+    assert named.names(2, 1) == ({"angle": "rad", "rate": "rad/s"}, {"u0": ""})
+    again = Experiment("b", named.validation, inputs=("torque [N m]",))
+    assert (again.units, again.states, again.inputs) == ("rad", named.states, ("torque [N m]",))
+    assert validation.labels == Labels()
+
+
+def test_labels_do_not_identify_an_experiment() -> None:
+    validation = make_validation()
+    assert validation.with_labels(Labels(units="m")).describe() == validation.describe()
+
+
+def test_other_parts_keep_the_labels() -> None:
+    labels = Labels(units="m")
+    validation = make_validation().with_labels(labels)
+    assert validation.with_space(validation.space).labels is labels
+    assert validation.with_distance(validation.distance).labels is labels
+    with pytest.raises(InputError, match="labels must be Labels"):
+        validation.with_labels("m")  # type: ignore[arg-type]
