@@ -12,6 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call
 from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.dynamics import NEAR
 from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.space import TaskSpace
@@ -101,6 +102,25 @@ class ReportContext:
     def worst_first(self) -> tuple[Trial, ...]:
         """The trials with a distance, the largest first."""
         return tuple(sorted(self.completed, key=lambda trial: -distance_of(trial)))
+
+    def worst_tasks(self, count: int = 5, *, recorded: bool = False) -> list[Trial]:
+        """Return the trials with the largest distances at different tasks, the largest first.
+
+        A search executes its worst task several times, almost unchanged; of such trials only the first is returned.
+
+        Args:
+            count: largest number of trials.
+            recorded: whether only trials with recordings are returned.
+        """
+        found: list[Trial] = []
+        for trial in self.worst_first:
+            if recorded and trial.number not in self.recordings:
+                continue
+            if all(np.abs(trial.unit_point - one.unit_point).max() > NEAR for one in found):
+                found.append(trial)
+            if len(found) == count:
+                break
+        return found
 
     @functools.cached_property
     def points(self) -> Array:

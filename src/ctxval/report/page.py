@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
@@ -21,6 +21,9 @@ from ctxval.report.context import ReportContext
 from ctxval.report.markup import paragraph, text
 from ctxval.report.sections import SECTIONS, Section, sections_of
 from ctxval.version import VERSION
+
+if TYPE_CHECKING:
+    import jinja2
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,5 +104,7 @@ def _asset(name: str) -> str:
 
 @functools.cache
 def _template() -> jinja2.Template:
+    import jinja2  # imported here, because no other command needs it
+
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     return environment.from_string(_asset("page.html"))

@@ -47,7 +47,7 @@ def to_json(context: ReportContext) -> dict[str, Any]:
                     "python": python_snippet(context, trial),
                     "command": command_snippet(context, trial),
                 }
-                for trial in context.worst_first[:_WORST]
+                for trial in context.worst_tasks(_WORST)
             ],
             "command": command_of(context) or None,
             "identity": identity(context),
@@ -148,7 +148,7 @@ def _item(finding: Finding) -> str:
 
 
 def _worst_rows(context: ReportContext, units: str) -> list[str]:
-    trials = context.worst_first[:_WORST]
+    trials = context.worst_tasks(_WORST)
     return [
         f"| {trial.number} | {plain(quantity(distance_of(trial), units))} | {' | '.join(map(number, point))} |"
         for trial, point in zip(trials, context.coordinates(trials).tolist(), strict=True)

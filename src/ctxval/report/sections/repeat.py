@@ -20,6 +20,9 @@ from ctxval.version import VERSION
 
 _WORST = 5
 _PACKAGES = ("numpy", "scipy")
+_FILE = (
+    "The experiment is described in a file. The store keeps its content, but not its name, so its name is assumed here."
+)
 
 
 class RepeatSection:
@@ -35,6 +38,7 @@ class RepeatSection:
             if command
             else paragraph("No command made this store, so there is none that repeats it."),
             code(command, "Command that repeats the campaign") if command else Markup(""),
+            paragraph(_FILE) if command and not context.settings.get("experiment") else Markup(""),
             table("What identifies this campaign", ("Name", "Value"), identity(context).items(), class_="facts"),
             heading("The worst tasks"),
             paragraph(
@@ -42,7 +46,7 @@ class RepeatSection:
                 "again as a new trial, and writes its controller to files."
             ),
         ]
-        for trial in context.worst_first[:_WORST]:
+        for trial in context.worst_tasks(_WORST):
             parts += _snippets(context, trial)
         return joined(parts)
 

@@ -112,15 +112,14 @@ def _cell(value: object) -> Markup:
 
 def _worst(context: ReportContext) -> Markup:
     """Return the trajectories of the worst trials, drawn without a script."""
-    numbers = list(context.recordings)[:_WORST]
-    if not numbers:
-        return paragraph("No trajectories are recorded, so the worst trials cannot be drawn.")
-    by_number = {trial.number: trial for trial in context.completed}
-    parts = [heading(f"The {counted(len(numbers), 'worst trial')}")]
-    for number_ in numbers:
-        trial = by_number[number_]
-        head = f"Trial {number_}: {quantity(trial.distance, context.labels.units)} at {_where(context, trial)}"
-        parts.append(details(head, small_charts(_signals(context, number_)), opened=number_ == numbers[0]))
+    worst = context.worst_tasks(_WORST, recorded=True)
+    if not worst:
+        return paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")
+    parts = [heading(f"The {counted(len(worst), 'worst task')}")]
+    for trial in worst:
+        head = f"Trial {trial.number}: {quantity(trial.distance, context.labels.units)} at {_where(context, trial)}"
+        charts = small_charts(_signals(context, trial.number))
+        parts.append(details(head, charts, opened=trial is worst[0]))
     return joined(parts)
 
 
