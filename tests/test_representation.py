@@ -60,6 +60,7 @@ PACKAGES = (
     ".learning",
     ".certificates",
     ".testing",
+    ".report",
 )
 
 DATA = Transitions(np.linspace(-1, 1, 80).reshape(40, 2) ** 3, np.linspace(-5, 5, 40)[:, None] ** 2, np.zeros((40, 2)))

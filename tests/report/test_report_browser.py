@@ -58,7 +58,7 @@ def case(name: str, executions: int) -> ReportContext:
 
 def arm() -> ReportContext:
     pytest.importorskip("mujoco")
-    return case("arm", 20)
+    return case("arm", 8)
 
 
 def by_hand(tmp_path: Path) -> ReportContext:
@@ -73,7 +73,7 @@ def by_hand(tmp_path: Path) -> ReportContext:
 
 REPORTS: dict[str, Callable[[Path], ReportContext]] = {
     "pendulum": lambda folder: case("pendulum", 15),
-    "dubins": lambda folder: case("dubins", 40),
+    "dubins": lambda folder: case("dubins", 12),
     "arm": lambda folder: arm(),
     "by hand": by_hand,
     "hostile": lambda folder: context_of_store(hostile_store(folder / "hostile.sqlite"), 1.0),

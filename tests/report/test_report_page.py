@@ -303,3 +303,27 @@ def test_the_map_of_the_region_certificate_is_drawn(dimension: int) -> None:
     found = report.page(context_of_campaign(campaign, threshold=9.0, certificate=options))
     assert "Where the threshold is kept" in found
     assert "cannot be shown" not in found
+
+
+@pytest.mark.slow
+def test_the_report_of_very_many_trials_stays_small(tmp_path: Path) -> None:
+    from ctxval import Store
+    from ctxval.core.trajectory import Trajectory
+
+    store = Store(tmp_path / "many.sqlite")
+    space = {"type": "TaskSpace", "a": [0.0, 1.0], "b": [0.0, 1.0]}
+    store.describe_first({"name": "many", "validation": {"space": space}})
+    rng = np.random.default_rng(0)
+    model = Trajectory(np.arange(201.0), np.zeros((201, 3)), np.zeros((200, 2)))
+    with store._database.transaction():  # one transaction, because each waits for the disk
+        for number, point in enumerate(rng.random((3000, 2))):
+            named = {"a": float(point[0]), "b": float(point[1])}
+            trial = Trial(number, "iid", "completed", point, named, 1, True, float(point.sum()))
+            store._insert(trial)
+            if number % 5 == 0:
+                store._write_trajectory(number, "model", model)
+                store._write_trajectory(number, "system", Trajectory(model.times, rng.random((201, 3)), model.inputs))
+    path = report.write_page(context_of_store(store, 1.9, certificate=POSTERIOR), tmp_path / "many.html")
+    assert path.stat().st_size < 1_500_000
+    assert "cannot be shown" not in path.read_text(encoding="utf-8")
+    assert "left out" in path.read_text(encoding="utf-8")

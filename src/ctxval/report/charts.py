@@ -28,6 +28,8 @@ SMALL = {"width": 340, "height": 220}
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 12, 46
 _TICKS = 5
+_MOST_MARKS = 600
+"""More marks than this are drawn as dots, which have no names."""
 
 Kind = Literal[
     "mean", "model", "system", "corrected", "reference", "best", "threshold", "bound", "sample", "initial", "covering",
@@ -153,6 +155,12 @@ class Chart:
         """Add marks; their names appear if the pointer rests on them."""
         xs, ys = np.ravel(self.across(x)), np.ravel(self.up(y))
         self._named(kind, label, "mark")
+        if len(xs) > _MOST_MARKS:
+            dots = "".join(
+                f"M{left:.0f},{top:.0f}h0" for left, top in zip(xs, ys, strict=True) if np.isfinite(left + top)
+            )
+            self._parts.append(element("path", d=dots, class_=f"dots {kind}"))
+            return self
         for k, (left, top) in enumerate(zip(xs.tolist(), ys.tolist(), strict=True)):
             if np.isfinite(left + top):
                 name = None if names is None else element("title", names[k])

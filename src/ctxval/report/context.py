@@ -27,6 +27,9 @@ from ctxval.storage.store import Store
 MOST_REPLAYS = 120
 """Largest number of trials that are replayed on the corrected model: those with the largest distances."""
 
+MOST_RECORDINGS = 400
+"""Largest number of trials whose trajectories are read: those with the largest distances."""
+
 _SLOW_REPLAYS = 40
 """The same, if the synthesizer designs one controller at a time."""
 
@@ -156,10 +159,10 @@ class ReportContext:
 
     @functools.cached_property
     def recordings(self) -> dict[int, Recording]:
-        """The trajectories of the trials that have both, by number; those of another size are left out."""
+        """The trajectories of the worst trials that have both, by number; those of another size are left out."""
         found: dict[int, Recording] = {}
         sizes: tuple[int, int] | None = None
-        for trial in self.worst_first:
+        for trial in self.worst_first[:MOST_RECORDINGS]:
             one = self._recording(trial)
             if one is None:
                 continue

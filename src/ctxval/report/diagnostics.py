@@ -24,6 +24,9 @@ _IMPROVED = 0.01
 _QUIET = 1 / 3
 """Share of the executions without an improvement after which a search is taken to have converged."""
 
+_LISTED = 10
+"""Largest number of failed trials that are listed one by one."""
+
 _CALIBRATED, _ROUGH = (0.5, 1.5), 2.5
 """Range of the root mean square of standardised errors that is as expected, and the value above which it is not."""
 
@@ -173,12 +176,14 @@ def not_tested(context: ReportContext) -> list[str]:
         said.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
     if len(context.points):
         said += _regions(context)
-    for trial in context.failed:
+    for trial in context.failed[:_LISTED]:
         where = ", ".join(
             f"{label} = {number(value)}"
             for label, value in zip(context.space.labels, context.coordinates([trial])[0], strict=True)
         )
         said.append(f"The distance at the task of trial {trial.number} ({where}), because it {_ended(trial)}.")
+    if len(context.failed) > _LISTED:
+        said.append(f"The distances of {len(context.failed) - _LISTED} more trials that failed or were not measured.")
     said.append(
         "Tasks outside the task space, other controllers, and conditions that the recorded state does not hold, such "
         "as wear, temperature or payload."

@@ -24,6 +24,10 @@ _SOBOL = 256
 """Number of base points of the sensitivity indices, a power of two; d + 2 times as many tasks are predicted."""
 
 
+_MOST = 500
+"""Largest number of distances that the Gaussian process is conditioned on: half of them are the largest ones."""
+
+
 @dataclass(frozen=True, eq=False)
 class Band:
     """Predicted distances of several tasks.
@@ -60,7 +64,7 @@ class DistanceModel:
     @classmethod
     def of(cls, trials: Sequence[Trial]) -> DistanceModel | None:
         """Return the model of completed trials; None if fewer than two distances are known, or none can be fitted."""
-        known = [trial for trial in trials if trial.distance is not None]
+        known = _some([trial for trial in trials if trial.distance is not None])
         points = np.array([trial.unit_point for trial in known])
         values = np.array([trial.distance for trial in known], dtype=np.float64)
         if len(known) < 2:
@@ -122,3 +126,13 @@ class DistanceModel:
 
     def __repr__(self) -> str:
         return call(self, trials=len(self.values), dimension=self.points.shape[1])
+
+
+def _some(trials: Sequence[Trial]) -> Sequence[Trial]:
+    """Return at most ``_MOST`` trials: those with the largest distances, and others evenly spread over their order."""
+    if len(trials) <= _MOST:
+        return trials
+    order = sorted(range(len(trials)), key=lambda k: -(trials[k].distance or 0.0))
+    rest = sorted(order[_MOST // 2 :])
+    evenly = np.linspace(0, len(rest) - 1, _MOST - _MOST // 2).astype(int)
+    return [trials[k] for k in sorted({*order[: _MOST // 2], *(rest[j] for j in evenly.tolist())})]

@@ -50,7 +50,7 @@ def _attribute(key: str, value: object) -> Markup:
     name = Markup(key.rstrip("_").replace("_", "-"))
     if value is True:
         return Markup(" {}").format(name)
-    return Markup(' {}="{}"').format(name, text(value, 1_000_000))
+    return Markup(' {}="{}"').format(name, text(value, 4_000_000))
 
 
 def joined(parts: Iterable[object]) -> Markup:

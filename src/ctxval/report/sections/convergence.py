@@ -36,7 +36,8 @@ def _distances(context: ReportContext) -> Chart:
         x,
         Axis.over(context.distance_label, context.distances, limits, zero=True),
     )
-    steps = np.repeat(numbers, 2)[1:], np.repeat(so_far, 2)[:-1]
+    risen = np.flatnonzero(np.diff(so_far, prepend=-1.0) > 0)  # the line is the same without all other points
+    steps = np.repeat(numbers[risen], 2)[1:], np.repeat(so_far[risen], 2)[:-1]
     chart.line(np.append(steps[0], last), np.append(steps[1], so_far[-1]), "best", "largest so far")
     chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
     names = [f"trial {trial.number}: {number(trial.distance)}" for trial in context.completed]
