@@ -102,6 +102,12 @@ def test_all_executions_may_have_failed() -> None:
     assert "3 of 3 trials have no distance" in found
 
 
+def test_other_campaigns_of_the_experiment_are_named(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        context = context_of_campaign(pendulum(tmp_path / f"{name}.sqlite", 2))
+    assert "The folder contains 1 other store of this experiment: one.sqlite." in report.page(context)
+
+
 # Hostile stores
 
 

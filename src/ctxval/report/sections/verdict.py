@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from markupsafe import Markup
 
+from ctxval._util.representation import counted
 from ctxval.certificates.bounds import as_text, at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.markup import bullets, details, element, heading, joined, number, paragraph, quantity, table
+from ctxval.storage.other_stores import other_stores
 
 _SHAPES = {"good": "\u25cf", "note": "\u25c6", "attention": "\u25b2", "bad": "\u25a0", "unknown": "\u25cb"}
 """A shape for each light, because colours alone tell nothing in grey print."""
+
+
+_STORES = 5
+"""Largest number of other stores that are named."""
 
 
 class VerdictSection:
@@ -25,6 +31,7 @@ class VerdictSection:
             [
                 paragraph(element("strong", _answer(context)), " ", _sentence(context), class_="verdict"),
                 _facts(context),
+                _other_stores(context),
                 heading("Diagnostics"),
                 lights(diagnostics(context)),
                 heading("What was not tested"),
@@ -86,6 +93,18 @@ def _facts(context: ReportContext) -> Markup:
     if not context.missing:
         return facts
     return joined([facts, paragraph(f"The experiment is not loaded: {context.missing}", class_="note")])
+
+
+def _other_stores(context: ReportContext) -> Markup:
+    """Return a warning if the folder has other campaigns of the same experiment."""
+    others = [] if context.store.path is None else other_stores(context.store.path)
+    if not others:
+        return Markup("")
+    count = counted(len(others), "other store")
+    return paragraph(
+        f"The folder contains {count} of this experiment: {', '.join(other.name for other in others[:_STORES])}. The "
+        "best result of several campaigns is wrong more often than its confidence states."
+    )
 
 
 def _assumptions(context: ReportContext) -> Markup:
