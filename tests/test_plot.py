@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from conftest import make_validation
 from ctxval import (
     Campaign,
+    Labels,
     Task,
     TaskSpace,
     Validation,
@@ -136,3 +137,38 @@ def test_new_axes_are_those_of_pyplot(campaign: Campaign, monkeypatch: pytest.Mo
     assert pyplot.get_fignums()
     assert axes is pyplot.gca()
     pyplot.close(axes.figure)
+
+
+def test_threshold_and_bound_are_drawn_and_no_band_is_below_zero(campaign: Campaign, ax: Axes) -> None:
+    plot.surrogate_slice(campaign, threshold=0.5, bound=0.7, ax=ax)
+    lines = {line.get_label(): line for line in ax.lines}
+    assert set(lines["threshold 0.5"].get_ydata()) == {0.5}
+    assert set(lines["bound on d*"].get_ydata()) == {0.7}
+    assert lines["threshold 0.5"].get_linestyle() != lines["bound on d*"].get_linestyle()
+    (band,) = ax.collections
+    assert band.get_paths()[0].vertices[:, 1].min() >= 0
+    other = Figure().add_subplot()
+    campaign.plot(ax=other, threshold=0.5, bound=0.7)
+    assert {"threshold 0.5", "bound on d*"} <= {line.get_label() for line in other.lines}
+
+
+def test_labels_are_those_of_the_validation() -> None:
+    labels = Labels(("angle [rad]", "rate [rad/s]"), ("torque [N m]",), "rad")
+    named = Campaign(make_validation().with_labels(labels), search=searches.Random()).run(2)
+    figure = plot.worst_trajectories(named)
+    assert [axes.get_ylabel() for axes in figure.axes] == ["angle [rad]", "rate [rad/s]", "torque [N m]"]
+    axes = plot.convergence(named, ax=Figure().add_subplot())
+    assert axes.get_ylabel() == "distance [rad]"
+
+
+def test_one_signal_is_drawn_into_given_axes(campaign: Campaign, ax: Axes) -> None:
+    assert campaign.worst is not None
+    model, system = campaign.trajectories(campaign.worst)
+    assert model is not None
+    assert system is not None
+    assert plot.signal(model, system, 2, label="torque [N m]", ax=ax) is ax
+    drawn = {line.get_label(): line.get_ydata() for line in ax.lines}
+    np.testing.assert_array_equal(drawn["system S"], system.inputs[:, 0])
+    assert ax.get_ylabel() == "torque [N m]"
+    with pytest.raises(InputError, match="component must be from 0 to 2, the 2 states and 1 inputs, got 3"):
+        plot.signal(model, system, 3, ax=ax)

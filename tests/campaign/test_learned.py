@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from conftest import make_validation
-from ctxval import Campaign, searches
+from ctxval import Campaign, Labels, searches
 from ctxval.campaign.history import predict_from
 from ctxval.certificates import LearnedDistance, Sample, require_learned
 from ctxval.errors import CertificateError
@@ -56,3 +56,22 @@ def test_a_sample_keeps_the_predictions_and_a_kind_asks_for_them() -> None:
     assert require_learned(sample.only("iid").rows([0, 1]), "region") is learned
     with pytest.raises(CertificateError, match="the region certificate uses what the experiment's model predicts"):
         require_learned(Sample.of(campaign.trials), "region")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("labels", "coordinates"),
+    [
+        (Labels(("angle [rad]", "rate [rad/s]"), ("torque [N m]",)), ["angle [rad]", "rate [rad/s]", "torque [N m]"]),
+        (Labels(), ["x[0]", "x[1]", "u[0]"]),
+        (Labels(("a", "b"), ("a",)), ["x[0]", "x[1]", "u[0]"]),
+    ],
+)
+def test_evidence_names_states_and_inputs_as_the_experiment_does(labels: Labels, coordinates: list[str]) -> None:
+    campaign = Campaign(make_validation().with_labels(labels), search=searches.Random(), seed=1).run(3)
+    learned = campaign.provenance.learned
+    assert learned is not None
+    evidence = learned.dynamics(0.5)
+    assert evidence is not None
+    assert list(evidence.coverage.resolution) == coordinates
+    assert set(evidence.coverage.marginal.coordinates) <= set(coordinates)

@@ -132,10 +132,13 @@ class CampaignDynamics:
         inputs = learned.posterior.data.inputs
         states = len(learned.coverage.resolution) - inputs
         named = self._study.validation.names(states, inputs)
+        numbered = [*(f"x[{i}]" for i in range(states)), *(f"u[{i}]" for i in range(inputs))]
+        labels = [label for names in named for label in labels_of(names)]
+        if len(set(labels)) < len(labels):  # a state and an input of the same name
+            return tuple(numbered)
+        unnamed = [*(f"x{i}" for i in range(states)), *(f"u{i}" for i in range(inputs))]
         return tuple(
-            f"{letter}[{i}]" if label == f"{letter}{i}" else label
-            for letter, labels in zip("xu", map(labels_of, named), strict=True)
-            for i, label in enumerate(labels)
+            number if label == none else label for number, none, label in zip(numbered, unnamed, labels, strict=True)
         )
 
     def _learn(self, executed: Sequence[tuple[Trial, Trajectory]]) -> LearnedDynamics | None:
