@@ -412,9 +412,10 @@ Nothing was chosen by those in [dynamics_misleading.py](../benchmarks/dynamics_m
 These mechanisms were tried, most of them on systems of the first table, and left out, because they found no more:
 
 - the search for rare maxima that the certificates use ([global_search.py](../src/ctxval/gp/global_search.py)), with
-  half of the predictions if a region is the whole task space. On seeds 0 to 9, the executions to 1 % of d* changed from 5.5
-  to 4 on the Dubins car's variant `basin`, from 7 to 6 on the Dubins car and from 11 to 11.5 on the linear system in
-  20-D (medians); those to 5 % from 4 to 3, from 3 to 5 and from 5 to 5.5. A suggestion took 1.4 to 2.7 times as long;
+  half of the predictions if a region is the whole task space. On seeds 0 to 9, the executions to 1 % of d* changed from
+  5.5 to 4 on the Dubins car's variant `basin`, from 7 to 6 on the Dubins car and from 11 to 11.5 on the linear system
+  in 20-D (medians); those to 5 % from 4 to 3, from 3 to 5 and from 5 to 5.5. A suggestion took 1.4 to 2.7 times as
+  long;
 - draws of the dynamics: the spread of the distance over draws instead of the uncertainty along the predicted closed
   loop, or the larger of the two; an upper quantile, the expected improvement or the mean over draws;
 - an optimism that is estimated from the errors of predictions;

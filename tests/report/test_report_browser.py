@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,20 +10,11 @@ from typing import Any
 import pytest
 from rig_pages import hostile_store, pendulum, plane
 
+from browser import accessibility_findings
 from ctxval import Campaign, Store, cases, searches
 from ctxval.certificates import CertificateOptions
 from ctxval.report import ReportContext, context_of_campaign, context_of_store, write_page
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-ARGUMENTS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 LARGEST = 1_500_000
 """Bytes of a report."""
 
@@ -33,20 +23,7 @@ POINT_AT_THE_END = """(chart) => {
   chart.dispatchEvent(new PointerEvent("pointermove", { clientX: box.right - 1, clientY: box.top + 1 }));
 }"""
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: apt-get install chromium"),
-]
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-axe = pytest.importorskip("axe_core_python.sync_playwright", reason="axe-core-python is not installed")
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        yield opened
-        opened.close()
+pytestmark = pytest.mark.slow
 
 
 def case(name: str, executions: int) -> ReportContext:
@@ -99,12 +76,11 @@ class Opened:
         assert self.said == []
         assert [url for url in self.asked if not url.startswith("data:")] == [path.as_uri()]
 
-    def violations(self, unfold: bool) -> list[tuple[str, str]]:
+    def violations(self, unfold: bool) -> list[str]:
         """Return what axe-core finds, also in what is folded if ``unfold`` is True."""
         if unfold:
             self.page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
-        found = axe.Axe().run(self.page)["violations"]
-        return [(one["id"], one["nodes"][0]["html"][:200]) for one in found]
+        return accessibility_findings(self.page)
 
 
 @pytest.mark.parametrize("name", sorted(REPORTS))

@@ -11,7 +11,7 @@ from typing import Any
 from ctxval._util.representation import record
 from ctxval.campaign.by_hand import read_recording
 from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.trials import OpenTrial
+from ctxval.campaign.choices import OpenTrial
 from ctxval.core.experiment import Experiment
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError

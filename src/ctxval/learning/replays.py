@@ -15,11 +15,13 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
+from ctxval.core.model import Model
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.dynamics import CorrectedModel, learn_corrected
+from ctxval.learning.dynamics import Residual, ResidualsWithout, learn_covariance, learn_residual
+from ctxval.learning.error_vectors import Executed
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 
 _CENTRES = (100, 300)
@@ -48,9 +50,7 @@ class Replay:
         return call(self, self.task, distance=self.distance, converged=self.converged)
 
 
-def replay_executed(
-    validation: Validation, executed: Sequence[tuple[Array, Trajectory]], wanted: Sequence[Array]
-) -> list[Replay | None]:
+def replay_executed(validation: Validation, executed: Executed, wanted: Sequence[Array]) -> list[Replay | None]:
     """Return the replays of tasks; None for a task that cannot be planned.
 
     Args:
@@ -61,26 +61,53 @@ def replay_executed(
     """
     with single_threaded():
         corrected = _corrected(validation, executed)
-        return [_replayed(validation, corrected, [one for one, _ in executed], point) for point in wanted]
+        if corrected is None:
+            return [_replayed(validation, None, point) for point in wanted]
+        without = corrected[1].without([_there(executed, point) for point in wanted])
+        rows = np.arange(len(wanted))
+        models = [_OneCorrected(corrected[0], without[rows[k : k + 1]]) for k in range(len(wanted))]
+        return [_replayed(validation, model, point) for model, point in zip(models, wanted, strict=True)]
 
 
-def _corrected(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> CorrectedModel | None:
+def _there(executed: Executed, point: Array) -> list[int]:
+    """Return the executions of a point."""
+    return [source for source, (other, _) in enumerate(executed) if np.array_equal(other, point)]
+
+
+def _corrected(validation: Validation, executed: Executed) -> tuple[Model, Residual] | None:
     """Return the corrected model from all executions; None if nothing can be learned."""
     try:
         loops = closed_loops_on_model(validation)
         if loops is None:
             return None
         recorded = recorded_transitions(validation.model, [trajectory for _, trajectory in executed], loops)
-        if recorded is None:
+        learned = None if recorded is None else learn_covariance(validation.model, *recorded)
+        if recorded is None or learned is None:
             return None
-        return learn_corrected(validation.model, *recorded, int(np.clip(_WORK // loops.horizon, *_CENTRES)))
+        residual = learn_residual(learned, *recorded, int(np.clip(_WORK // loops.horizon, *_CENTRES)))
+        return None if residual is None else (learned.model, residual)
     except Exception:  # the user's own parts, at states that no execution has reached
         return None
 
 
-def _replayed(
-    validation: Validation, corrected: CorrectedModel | None, executed: Sequence[Array], point: Array
-) -> Replay | None:
+@dataclass(frozen=True)
+class _OneCorrected:
+    """The corrected model of one task.
+
+    Attributes:
+        model: the model to which the residual is added.
+        residual: the residual that does not know the executions of this task, as a batch of one.
+    """
+
+    model: Model
+    residual: ResidualsWithout
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(n,), (m,) -> (n,)``."""
+        return np.asarray(self.model.step(x, u) + self.residual(x[None], u[None])[0])
+
+
+def _replayed(validation: Validation, model: _OneCorrected | None, point: Array) -> Replay | None:
     space = validation.space
     try:
         task = validation.task(space.parameters(space.from_unit(point)))
@@ -88,10 +115,8 @@ def _replayed(
     except Exception:  # the user's own parts
         return None
     nothing = Replay(task, None, np.nan, converged)
-    if corrected is None:
+    if model is None:
         return nothing
-    there = [source for source, other in enumerate(executed) if np.array_equal(other, point)]
-    model = CorrectedModel(corrected.model, corrected.residual.without(there))
     try:
         promised = rollout(validation.model.step, controller, task)
         predicted = rollout(model.step, controller, task)

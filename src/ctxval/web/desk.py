@@ -14,7 +14,7 @@ import numpy as np
 from ctxval._util.representation import call
 from ctxval._util.texts import reason_of
 from ctxval.campaign.telling import Report, tell_report
-from ctxval.core.experiment import labels_of
+from ctxval.core.labels import labels_of
 from ctxval.core.space import TaskSpace
 from ctxval.core.task import Task
 from ctxval.core.trial import Trial

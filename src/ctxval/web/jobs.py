@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 from ctxval._util.representation import record
 from ctxval._util.texts import reason_of
 from ctxval.campaign.by_hand import write_files
+from ctxval.campaign.choices import OpenTrial
 from ctxval.campaign.telling import parameters_of_trial
-from ctxval.campaign.trials import OpenTrial
 from ctxval.certificates import Certificate, Verdict
 from ctxval.certificates import judge as judge_trials
 from ctxval.certificates.bounds import with_error
-from ctxval.core.experiment import labels_of
+from ctxval.core.labels import labels_of
 from ctxval.errors import InputError, StoreAccessError
 from ctxval.plot import overview, worst_trajectories
 from ctxval.web.background import Stage, TellStage
