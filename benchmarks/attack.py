@@ -67,6 +67,7 @@ Q = [10.0, 1.0]
 R = [0.1]
 [distance]
 type = "FinalState"
+weights = [1, 1]
 [search]
 name = "random"
 """

@@ -49,7 +49,7 @@ def campaign(folder: Path, store: Store | Path | None = None, seconds: float = 0
         system=systems.Subprocess(command, timeout=60),
         model=models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.05]]),
         synthesizer=controllers.LQR([10.0, 1.0], [0.1]),
-        distance=distances.FinalState(),
+        distance=distances.FinalState(weights=(1, 1)),
     )
     return Campaign(validation, search=searches.Random(), store=store, seed=7)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -31,8 +32,13 @@ from ctxval.certificates import (
 )
 from ctxval.config.settings import Settings
 from ctxval.core.trial import Origin, State
+from ctxval.data import Break, LogMapping, MemoryTable, recordings_of
+from ctxval.fitting import FittedParameter, fit
 from ctxval.learning import ExecutionPrediction
+from ctxval.models import Linear
+from ctxval.replay import PredictedTask, PredictedTasks, Suggestion, replay
 from ctxval.testing import check_search
+from rig_logs import run
 
 ROOT = Path(__file__).parents[1]
 
@@ -113,6 +119,24 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
     used |= {*get_args(Origin), *get_args(State), *KINDS, "validated", "falsified", "undecided"}
     explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
     assert used <= set(explained)
+
+
+def test_the_glossary_explains_what_replay_and_fit_say() -> None:
+    runs = [run(40, seed) for seed in range(3)]
+    logs = [MemoryTable(str(k), {"t": one.times, "x": one.states, "u": one.inputs}) for k, one in enumerate(runs)]
+    recordings = recordings_of(logs, LogMapping.from_table({"states": ["x"], "inputs": ["u"]}))
+    report = replay(Linear([[1, 0.05], [0, 1]], [[0], [0.05]]), recordings)
+    task = PredictedTask({}, 0.5, 0.4, 0.6, 0.9)
+    tasks = PredictedTasks((task,), 0.5, 0.6, (task,), 64, 0.0, 0.1, 0)
+    suggestion, gap = Suggestion("delay", 0.1, 0.5, 1.0, "later"), Break("a.csv", 0.5, 0.1, "x0", "has no value")
+    report = replace(report, tasks=tasks, suggestions=(suggestion,), data=replace(report.data, breaks=(gap,)))
+    learned = fit(recordings, ["linear"])
+    parameter = FittedParameter("mass", 1.0, 0.9, 1.1)
+    learned = replace(learned, fitted=(replace(learned.fitted[0], parameters=(parameter,)),))
+    used = keys(report.to_json()) | keys(learned.to_json())
+    names = {*recordings.states, *recordings.inputs}
+    explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    assert used - names <= set(explained)
 
 
 def test_the_glossary_is_in_alphabetical_order() -> None:

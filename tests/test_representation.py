@@ -34,10 +34,13 @@ from ctxval import (
     Verdict,
     certificates,
     controllers,
+    data,
     distances,
+    fitting,
     learning,
     models,
     plot,
+    replay,
     report,
     searches,
     systems,
@@ -59,6 +62,9 @@ PACKAGES = (
     ".distances",
     ".learning",
     ".certificates",
+    ".data",
+    ".fitting",
+    ".replay",
     ".testing",
     ".report",
 )
@@ -211,6 +217,28 @@ GAP = certificates.StateInputGap(0.1, ("u[0]",), {"x[0]": 1.0, "u[0]": 3.0})
 COVERED = certificates.StateInputCoverage(GAP, GAP, None, {"x[0]": 0.1, "u[0]": 0.2}, np.zeros(2), 1024)
 BY_POSTERIOR = certificates.CertificateOptions.posterior()
 
+LOG = data.MemoryTable(
+    "run.csv", {"t": 0.1 * np.arange(41), "x": np.sin(np.arange(82)).reshape(41, 2), "u": np.ones(40)}
+)
+MAPPING = data.LogMapping({"x": data.Field("x", unit="m")}, {"force": data.Field("u")}, dt=0.1, delay=0.2)
+
+
+def recordings() -> data.Recordings:
+    return data.recordings_of([LOG])
+
+
+@functools.cache
+def replayed() -> replay.ReplayReport:
+    return replay.replay(LINEAR, recordings(), steps=[1])
+
+
+@functools.cache
+def fitted() -> fitting.FitReport:
+    rng = np.random.default_rng(0)
+    columns = {"t": 0.1 * np.arange(41), "x": rng.normal(size=(41, 2)), "u": rng.normal(size=40)}
+    return fitting.fit(data.recordings_of([data.MemoryTable("run.csv", columns)]), ["linear"], steps=[1])
+
+
 EXAMPLES: dict[str, Callable[[], object]] = {
     "Campaign": campaign,
     "Experiment": lambda: Experiment("pendulum", make_validation(), threshold=0.5, units="rad"),
@@ -254,6 +282,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "models.IncrementScaling": lambda: models.IncrementScaling.of(DATA),
     "models.Linear": lambda: LINEAR,
     "models.Onnx": lambda: models.Onnx(network()),
+    "models.Parametric": lambda: models.Parametric(lambda x, u, theta: x, {"mass": 1.2, "friction": 0.3}),
     "models.ScikitLearn": scikit_learn,
     "models.SquaredExponential": lambda: models.SquaredExponential(2.0, np.arange(1.0, 9.0)),
     "controllers.AffineFeedback": lambda: controllers.LQR([1, 1], [1], limits=2.0).design(TASK, LINEAR),
@@ -270,9 +299,15 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "controllers.Policy": lambda: controllers.Policy(policy, limits=2.0),
     "controllers.RecedingHorizon": lambda: mpc().design(TASK, LINEAR),
     "controllers.StationaryLQR": lambda: controllers.StationaryLQR([[2, 1], [1, 2]], [1]),
+    "distances.AtCrossing": lambda: distances.AtCrossing(state=1, level=0.5, scales=[0.1, 2.0]),
+    "distances.AtTimes": lambda: distances.AtTimes(times=[0.1, 0.2]),
+    "distances.CrossingTime": distances.CrossingTime,
     "distances.FinalState": distances.FinalState,
     "distances.GoalError": distances.GoalError,
+    "distances.MaximumDeviation": distances.MaximumDeviation,
     "distances.MeanDeviation": distances.MeanDeviation,
+    "distances.RelativeDeviation": lambda: distances.RelativeDeviation(least=[0.1, 1.0]),
+    "distances.StateNorm": lambda: distances.StateNorm(2, weights=[1.0, 2.0], angles=[0]),
     "distances.WholeTrajectory": distances.WholeTrajectory,
     "learning.DistancePredictor": lambda: learning.DistancePredictor(learned().study.validation),
     "learning.LearnedCovariance": covariance,
@@ -323,6 +358,30 @@ EXAMPLES: dict[str, Callable[[], object]] = {
         campaign().trials, 0.01, certificates.CertificateOptions.posterior()
     ),
     "certificates.TheoremConstants": lambda: certificates.TheoremConstants(1.0, 0.01, 1.0, 1.0, 1.0),
+    "data.Break": lambda: data.Break("run.csv", 0.5, 0.2, "angle", "has no value in row 7"),
+    "data.Channel": lambda: data.Channel("angle", "rad", False, np.arange(9.0), np.arange(9.0)),
+    "data.Clock": data.Clock,
+    "data.Field": lambda: data.Field("/joints.position[0]", unit="rad", recorded="deg"),
+    "data.LogMapping": lambda: MAPPING,
+    "data.MemoryTable": lambda: LOG,
+    "data.Message": lambda: data.Message("/joints", 10**18, 10**18, {"position": [0.5]}),
+    "data.Recording": lambda: recordings().runs[0],
+    "data.Recordings": recordings,
+    "data.Signal": lambda: data.Signal(np.arange(9.0), np.zeros((9, 2))),
+    "fitting.Excitation": lambda: fitting.Excitation(make_validation(), "chirp", 0.5, 5.0),
+    "fitting.Excited": lambda: fitting.Excited(policy, np.ones((9, 1)), controllers.Limits([-1.0], [1.0])),
+    "fitting.FailedFit": lambda: fitting.FailedFit("linear", "too few steps"),
+    "fitting.FitReport": fitted,
+    "fitting.FittedModel": lambda: fitted().fitted[0],
+    "fitting.FittedParameter": lambda: fitting.FittedParameter("mass", 1.2, 1.1, 1.3, "at its upper bound"),
+    "replay.PredictedTask": lambda: replay.PredictedTask({"goal": 1.5}, 0.4, 0.3, 0.6, 0.9),
+    "replay.PredictedTasks": lambda: replay.PredictedTasks((), 0.4, 0.6, (), 64, 0.0, 0.1, 1),
+    "replay.RecordedData": lambda: replayed().data,
+    "replay.Region": lambda: replayed().regions[0],
+    "replay.ReplayReport": lambda: replayed(),
+    "replay.ResidualShare": lambda: replayed().residuals[0],
+    "replay.StepError": lambda: replayed().errors[0],
+    "replay.Suggestion": lambda: replay.Suggestion("delay", 0.04, 0.5, 1.0, "the inputs act later"),
     "testing.FaultyRig": lambda: testing.FaultyRig(systems.Simulated(LINEAR), {3: "raise"}),
 }
 
@@ -429,7 +488,7 @@ def test_a_validation_shows_its_parts() -> None:
         "  system: Simulated(Function(rk4.<locals>.step, vectorized=True))",
         "  model: Linear(states=2, inputs=1, transitions=400)",
         "  synthesizer: LQR(Q=diag(1, 0.1), R=diag(0.01), Q_final=diag(10, 1))",
-        "  distance: FinalState(norm=1, components=None), task: make_validation.<locals>.<lambda>",
+        "  distance: FinalState(norm=1), task: make_validation.<locals>.<lambda>",
     ]
 
 

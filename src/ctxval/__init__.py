@@ -31,11 +31,14 @@ if TYPE_CHECKING:
     from ctxval import cases as cases
     from ctxval import certificates as certificates
     from ctxval import controllers as controllers
+    from ctxval import data as data
     from ctxval import distances as distances
     from ctxval import errors as errors
+    from ctxval import fitting as fitting
     from ctxval import gp as gp
     from ctxval import models as models
     from ctxval import plot as plot
+    from ctxval import replay as replay
     from ctxval import report as report
     from ctxval import reproduce as reproduce
     from ctxval import searches as searches
@@ -74,11 +77,14 @@ _SUBMODULES = (
     "cases",
     "certificates",
     "controllers",
+    "data",
     "distances",
     "errors",
+    "fitting",
     "gp",
     "models",
     "plot",
+    "replay",
     "report",
     "reproduce",
     "searches",

@@ -37,7 +37,7 @@ def experiment(seed):
         system=rig,
         model=models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]]),
         synthesizer=controllers.LQR([10, 1], [0.1], limits=3.0),
-        distance=distances.FinalState(),
+        distance=distances.FinalState(weights=(1, 1)),
     )
     return Experiment("rig", validation, threshold=2.0, units="m")
 
@@ -384,7 +384,9 @@ def test_a_start_that_is_elsewhere_can_be_allowed(invoke: Any) -> None:
 
 def test_a_start_is_held_to_the_tolerance_of_the_experiment(invoke: Any) -> None:
     Path("my_rig.py").write_text(
-        MODULE.replace("distances.FinalState(),", "distances.FinalState(), start_tolerance=1,")
+        MODULE.replace(
+            "distances.FinalState(weights=(1, 1)),", "distances.FinalState(weights=(1, 1)), start_tolerance=1,"
+        )
     )
     record(new(invoke)["folder"])
     edit(with_cell(2, 1, "0.3"))
@@ -605,3 +607,59 @@ def test_an_execution_that_ended_early_is_no_whole_recording(validation: Any) ->
     with pytest.raises(ExecutionError, match="the operator stopped it"):
         campaign.tell(opened, Trajectory(whole.times, whole.states, whole.inputs, "the operator stopped it"))
     assert campaign.tell(opened, distance=2).distance == 2.0
+
+
+# Logs of other programs
+
+
+def log_of_trial(path: Path, trial: dict[str, Any], speed: float = 1.0) -> None:
+    """Write the model's trajectory of a trial to MCAP, as a rig would log it."""
+    from rig_logs import write_mcap_json
+
+    model = Trajectory.from_csv(Path(trial["folder"]) / "model.csv", states=["position", "speed"], inputs=["force"])
+    states = model.states * [1.0, speed]
+    write_mcap_json(path, Trajectory(model.times, states, model.inputs))
+
+
+FIELDS = """
+[recordings]
+states = { position = "/state.cart.position", speed = "/state.cart.speed" }
+inputs = { force = "/command.force" }
+"""
+
+
+def mapped_experiment() -> None:
+    Path("my_rig.py").write_text(MODULE)
+    Path("rig.toml").write_text(f'experiment = "my_rig:experiment"\n{FIELDS}')
+
+
+def test_a_log_of_another_program_is_told_with_the_mapping_of_the_experiment(invoke: Any) -> None:
+    mapped_experiment()
+    trial = asked(invoke, "rig.toml", "--store", "a.sqlite")
+    log_of_trial(Path("run.mcap"), trial)
+    result = invoke("tell", "a.sqlite", "0", "--trajectory", "run.mcap", "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["distance"] == pytest.approx(0, abs=1e-12)
+
+
+def test_a_log_with_a_gap_is_no_execution(invoke: Any) -> None:
+    from rig_logs import run, write_mcap_json
+
+    mapped_experiment()
+    asked(invoke, "rig.toml", "--store", "a.sqlite")
+    write_mcap_json(Path("run.mcap"), run(20, dt=0.1), lost=(7,))
+    result = invoke("tell", "a.sqlite", "0", "--trajectory", "run.mcap")
+    assert result.exit_code == 2
+    assert "must be one recording without gaps, and has 2; it was split: run.mcap, 0.6 s: position" in " ".join(
+        result.stderr.split()
+    )
+
+
+def test_logs_of_earlier_runs_are_imported(invoke: Any) -> None:
+    mapped_experiment()
+    trial = asked(invoke, "rig.toml", "--store", "a.sqlite", "--set", "goal=1.5")
+    log_of_trial(Path("run.mcap"), trial)
+    Path("runs.csv").write_text("goal,trajectory\n1.5,run.mcap\n")
+    result = invoke("import", "a.sqlite", "runs.csv", "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["imported"][0]["distance"] == pytest.approx(0, abs=1e-12)

@@ -43,6 +43,7 @@ limits = 3.0
 [distance]
 type = "FinalState"
 norm = 2
+weights = [1, 1]
 """
 
 
@@ -79,7 +80,7 @@ def test_a_distance_changed_after_ten_executions_is_decided_without_an_eleventh(
     for goal in np.linspace(0.5, 2.0, 10):
         execute_by_hand(invoke, goal)
     before = [trial.distance for trial in Store("a.sqlite").trials()]
-    Path("rig.toml").write_text(RIG.replace("norm = 2", "norm = 1\ncomponents = [0]"))
+    Path("rig.toml").write_text(RIG.replace("norm = 2\nweights = [1, 1]", "norm = 1\ncomponents = [0]"))
     refused = invoke("ask", "rig.toml", "--store", "a.sqlite")
     assert refused.exit_code == 2
     assert "ctxval remeasure STORE --experiment" in refused.stderr

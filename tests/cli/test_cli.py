@@ -3,6 +3,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -616,3 +617,6 @@ def test_every_help_text_is_a_sentence() -> None:
             assert text, name
             assert text[0].isupper(), text
             assert text.endswith("."), text
+            assert not re.search(r"\[[a-z#/@]", text.replace("position[", "")), (
+                f"rich would take this for markup: {text}"
+            )

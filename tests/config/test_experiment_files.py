@@ -22,6 +22,7 @@ from ctxval.cli import app
 from ctxval.config.check import check_experiment
 from ctxval.config.parts import TaskTable, part, recorded
 from ctxval.config.settings import Settings, read_settings
+from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import CtxvalError, InputError
 from ctxval.testing import FaultyRig
 
@@ -334,6 +335,14 @@ def test_dimensions_names_and_units_are_held_against_each_other() -> None:
     assert findings(make_validation())["names"][0] == "noted"
 
 
+def test_a_check_notes_a_distance_that_adds_different_units_and_how_to_weight_them() -> None:
+    with pytest.warns(UnitsWarning, match=r"adds states in rad and rad/s without weights or scales"):
+        experiment = Experiment("x", make_validation(), states=("angle [rad]", "rate [rad/s]"))
+    found = [finding for finding in check_experiment(experiment) if finding.check == "distance"]
+    assert found[0].state == "noted"
+    assert "scales=[...], the size of an error of each state that counts as 1" in found[0].text
+
+
 def test_a_controller_that_fails_on_the_model_itself_is_noted() -> None:
     state, text = findings(make_validation(horizon=3))["controller on the model"]
     assert state == "noted"
@@ -380,3 +389,18 @@ def test_recorded_data_is_read_with_bounds(tmp_path: Path) -> None:
         archive.writestr("x.npy", huge.getvalue())
     with pytest.raises(InputError, match=r"steps\.npz cannot be read as recorded data: its array x .* is too large"):
         recorded(str(path))
+
+
+def test_a_model_is_learned_from_logs_with_a_mapping(tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    from rig_logs import DT, run, write_mcap_json
+
+    write_mcap_json(tmp_path / "run.mcap", run())
+    mapping = {"states": ["/state.cart.position", "/state.cart.speed"], "inputs": ["/command.force"]}
+    model = part("model", {"type": "Linear", "data": {"logs": "run.mcap", **mapping}}, tmp_path)
+    np.testing.assert_allclose(model.A, [[1, DT], [0, 1 - 0.3 * DT]], atol=1e-9)
+    assert len(model.data) == 60
+    with pytest.raises(InputError, match="data must be a file of recorded trajectories"):
+        part("model", {"type": "Linear", "data": mapping}, tmp_path)
+    with pytest.raises(InputError, match=r"has no states under a usual name"):
+        part("model", {"type": "Linear", "data": "run.mcap"}, tmp_path)

@@ -33,6 +33,7 @@ PLAIN: dict[str, Any] = {
     "system": {"type": "Manual", "states": {"position": "m", "speed": "m/s"}, "inputs": {"force": "N"}, "dt": 0.1},
     "model": {"type": "Linear", "A": [[1.0, 0.1], [0.0, 1.0]], "B": [[0.0], [0.1]]},
     "synthesizer": {"type": "LQR", "Q": [10.0, 1.0], "R": [0.1]},
+    "distance": {"type": "FinalState", "scales": [0.1, 0.5]},
 }
 """An experiment without code."""
 
@@ -48,7 +49,7 @@ def experiment(seed):
         system=systems.Manual(states={{"position": "m", "speed": "m/s"}}, inputs={{"force": "N"}}, dt=0.1),
         model=models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]]),
         synthesizer=controllers.LQR([10, 1], [0.1]),
-        distance=distances.FinalState(),
+        distance=distances.FinalState(weights=(1, 1)),
     )
     return Experiment("rig", validation)
 """
@@ -450,7 +451,7 @@ def test_a_store_that_says_nothing_can_be_named(folder: Path) -> None:
     assert "--experiment FILE.toml" in refusal("ask", "a.sqlite")
     lines = [
         'name = "cart"',
-        *(f"{key} = {_toml(PLAIN[key])}" for key in ("space", "task", "system", "model", "synthesizer")),
+        *(f"{key} = {_toml(PLAIN[key])}" for key in ("space", "task", "system", "model", "synthesizer", "distance")),
     ]
     Path("cart.toml").write_text("\n".join(lines))
     done("ask", "a.sqlite", "--experiment", "cart.toml")

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from conftest import make_validation
-from ctxval import Experiment, Labels
+from ctxval import Experiment, Labels, distances
 from ctxval.core.labels import labels_of
 from ctxval.errors import InputError
 
@@ -21,7 +21,7 @@ def test_stated_labels_come_first_then_those_of_the_system() -> None:
 
 
 def test_an_experiment_gives_its_labels_to_its_validation_and_takes_those_it_has() -> None:
-    validation = make_validation()
+    validation = make_validation().with_distance(distances.FinalState(weights=[1, 1]))
     named = Experiment("a", validation, units="rad", states=("angle [rad]", "rate [rad/s]"))
     assert named.validation.labels == Labels(("angle [rad]", "rate [rad/s]"), (), "rad")
     assert named.names(2, 1) == ({"angle": "rad", "rate": "rad/s"}, {"u0": ""})

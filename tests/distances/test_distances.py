@@ -9,19 +9,45 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ctxval import Task, Trajectory
-from ctxval.distances import ComposedDistance, Distance, FinalState, GoalError, MeanDeviation, WholeTrajectory
-from ctxval.errors import InputError
+from ctxval._util.describe import describe
+from ctxval.distances import (
+    AtCrossing,
+    AtTimes,
+    ComposedDistance,
+    CrossingTime,
+    Distance,
+    FinalState,
+    GoalError,
+    MaximumDeviation,
+    MeanDeviation,
+    RelativeDeviation,
+    StateNorm,
+    WholeTrajectory,
+)
+from ctxval.errors import InputError, ShapeError, UnknownNameError
 
 HORIZON, N = 4, 3
 NORMS = [1, 2, np.inf]
 METRICS = [
     *(
         cls(norm, components)
-        for cls in (FinalState, WholeTrajectory, MeanDeviation)
+        for cls in (FinalState, WholeTrajectory, MeanDeviation, MaximumDeviation)
         for norm in NORMS
         for components in (None, (0, 2))
     ),
     WholeTrajectory(2, per_step=True),
+    FinalState(2, weights=[1, 0, 3], scales=[0.1, 2, 5]),
+    WholeTrajectory(1, (0, 2), scales=[0.1, 2]),
+    FinalState(2, angles=[0, 2], weights=[1, 2, 3]),
+    MeanDeviation(1, angles=[1]),
+    MaximumDeviation(np.inf, (1, 0), angles=[0], scales=[3, 1]),
+    AtTimes(2, times=[0.0, 0.21, 0.4]),
+    AtTimes(np.inf, (1,), times=[0.3]),
+    AtCrossing(2, state=1, level=0.1),
+    AtCrossing(1, (0, 2), state=0, direction="up", crossings=2, scales=[1, 2]),
+    AtCrossing(2, state=2, angles=[2], crossings=2),
+    CrossingTime(1, 0.1, "down"),
+    CrossingTime(1, 0.1, angle=True),
 ]
 STATES = arrays(np.float64, (HORIZON + 1, N), elements=st.floats(-1e3, 1e3))
 
@@ -48,6 +74,7 @@ FORMULAS: list[tuple[Callable[..., Distance], Formula]] = [
     (FinalState, lambda M, S, p: norm(S[-1] - M[-1], p)),
     (WholeTrajectory, lambda M, S, p: norm((S - M).ravel(), p)),
     (MeanDeviation, lambda M, S, p: sum(norm(S[t] - M[t], p) for t in range(1, HORIZON + 1)) / HORIZON),
+    (MaximumDeviation, lambda M, S, p: max(norm(S[t] - M[t], p) for t in range(HORIZON + 1))),
     (GoalError, lambda M, S, p: norm(S[-1] - np.array([1.0, -2.0, 0.5]), p)),
 ]
 
@@ -62,7 +89,7 @@ def test_a_distance_is_its_formula(make: Callable[..., Distance], formula: Formu
 
 
 @pytest.mark.parametrize("order", NORMS)
-@pytest.mark.parametrize(("make", "formula"), FORMULAS[:3])
+@pytest.mark.parametrize(("make", "formula"), FORMULAS[:4])
 def test_only_the_chosen_components_count(make: Callable[..., Distance], formula: Formula, order: float) -> None:
     M, S = pair()
     d = make(norm=order, components=[2, 0])(trajectory(M), trajectory(S), task())
@@ -126,7 +153,8 @@ def test_a_distance_of_trajectories_is_a_metric(
     assert d(a, b) >= 0
     assert d(a, a) == 0
     assert d(a, b) == d(b, a)
-    assert d(a, c) <= (d(a, b) + d(b, c)) * (1 + 1e-12)
+    rounding = 1e-12 if getattr(distance, "angles", ()) or isinstance(distance, AtCrossing) else 0
+    assert d(a, c) <= (d(a, b) + d(b, c)) * (1 + 1e-12) + rounding * (1 + np.abs([a, b, c]).max())
 
 
 def test_the_goal_error_depends_on_the_system_alone() -> None:
@@ -138,13 +166,208 @@ def test_the_goal_error_depends_on_the_system_alone() -> None:
     assert GoalError()(trajectory(M), trajectory(reached), task()) == 0
 
 
-@pytest.mark.parametrize("cls", [FinalState, WholeTrajectory, MeanDeviation, GoalError])
+@pytest.mark.parametrize("cls", [FinalState, WholeTrajectory, MeanDeviation, MaximumDeviation, GoalError])
 @pytest.mark.parametrize("order", [0, 3, np.nan])
 def test_another_norm_is_refused_by_value(cls: type, order: float) -> None:
     with pytest.raises(InputError, match=rf"norm must be 1, 2 or inf, got {order}"):
         cls(norm=order)
 
 
-@pytest.mark.parametrize("distance", METRICS)
+@pytest.mark.parametrize("distance", [*METRICS, RelativeDeviation(least=[1, 1, 1])])
 def test_the_ready_made_distances_are_distances(distance: object) -> None:
     assert isinstance(distance, Distance)
+
+
+WEIGHTED: list[Callable[..., StateNorm]] = [
+    FinalState,
+    GoalError,
+    WholeTrajectory,
+    MeanDeviation,
+    MaximumDeviation,
+    lambda *args, **options: AtTimes(*args, times=[0.1, 0.3], **options),
+    lambda *args, **options: AtCrossing(*args, state=0, level=0.2, **options),
+    lambda *args, **options: RelativeDeviation(*args, least=[0.1, 0.1, 0.1], **options),
+]
+
+
+@pytest.mark.parametrize("make", WEIGHTED)
+@settings(max_examples=20, deadline=None)
+@given(
+    STATES,
+    STATES,
+    st.sampled_from(NORMS),
+    arrays(np.float64, N, elements=st.floats(1e-3, 1e3)),
+    st.floats(1e-3, 1e3),
+)
+def test_scales_are_reciprocal_weights_and_the_distance_is_homogeneous_in_them(
+    make: Callable[..., Distance], a: np.ndarray, b: np.ndarray, order: float, weights: np.ndarray, factor: float
+) -> None:
+    M, S = trajectory(a), trajectory(b)
+    d = make(order, weights=weights)(M, S, task())
+    assert make(order, scales=1 / weights)(M, S, task()) == pytest.approx(d, rel=1e-12)
+    assert make(order, weights=factor * weights)(M, S, task()) == pytest.approx(factor * d, rel=1e-12)
+    assert make(order, weights=weights, scales=np.full(N, factor))(M, S, task()) == pytest.approx(d / factor, rel=1e-12)
+
+
+@pytest.mark.parametrize("make", WEIGHTED[:6])
+@settings(max_examples=20, deadline=None)
+@given(STATES, STATES, st.sampled_from(NORMS), arrays(np.float64, N, elements=st.floats(1e-3, 1e3)))
+def test_with_scales_the_distance_does_not_depend_on_the_units_of_the_states(
+    make: Callable[..., Distance], a: np.ndarray, b: np.ndarray, order: float, factors: np.ndarray
+) -> None:
+    goal = np.array([1.0, -2.0, 0.5])
+    d = make(order, scales=[0.1, 2.0, 5.0])(trajectory(a), trajectory(b), task(goal))
+    converted = make(order, scales=factors * [0.1, 2.0, 5.0])
+    assert converted(trajectory(a * factors), trajectory(b * factors), task(goal * factors)) == pytest.approx(
+        d, rel=1e-9, abs=1e-9
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(STATES, STATES, arrays(np.int64, N, elements=st.integers(-3, 3)), st.sampled_from(NORMS))
+def test_an_angle_is_the_same_after_any_number_of_turns(
+    a: np.ndarray, b: np.ndarray, turns: np.ndarray, order: float
+) -> None:
+    a, b = a / 100, b / 100
+    for make in (FinalState, WholeTrajectory, MeanDeviation, MaximumDeviation, GoalError):
+        distance = make(order, angles=[0, 1, 2])
+        d = distance(trajectory(a), trajectory(b), task())
+        assert distance(trajectory(a), trajectory(b + 2 * np.pi * turns), task()) == pytest.approx(d, abs=1e-12)
+        assert d <= make(order)(trajectory(a), trajectory(b), task()) * (1 + 1e-12)
+
+
+def test_a_difference_of_angles_is_the_angle_between_two_directions() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(-20, 20, (2, 50, HORIZON + 1, N))
+    d = FinalState(angles=[1], components=[1])(trajectory(a), trajectory(b), task())
+    cosines = np.cos(a[:, -1, 1]) * np.cos(b[:, -1, 1]) + np.sin(a[:, -1, 1]) * np.sin(b[:, -1, 1])
+    np.testing.assert_allclose(d, np.arccos(np.clip(cosines, -1, 1)), atol=1e-7)
+    start, end = trajectory(np.full((HORIZON + 1, N), np.pi - 0.1)), trajectory(np.full((HORIZON + 1, N), -np.pi + 0.1))
+    assert FinalState(components=[0], angles=[0])(start, end, task()) == pytest.approx(0.2, rel=1e-12)
+
+
+def test_the_distance_at_times_takes_the_nearest_steps() -> None:
+    M, S = pair()
+    d = AtTimes(2, times=[0.1, 0.29])(trajectory(M), trajectory(S), task())
+    assert d == pytest.approx(max(norm(S[t] - M[t], 2) for t in (1, 3)), rel=1e-14)
+    with pytest.raises(InputError, match=r"times must not be after the end of the task at 0.4 s, got 0.5 s"):
+        AtTimes(times=[0.1, 0.5])(trajectory(M), trajectory(S), task())
+
+
+def ramp(speed: float, start: float = 0.0) -> Trajectory:
+    """Return a state that moves at constant speed, the other states being its square root and a constant."""
+    position = start + speed * np.arange(HORIZON + 1)
+    return trajectory(np.stack([position, 10 * position, np.full(HORIZON + 1, 2.0)], axis=-1))
+
+
+def test_a_crossing_is_interpolated_between_the_samples() -> None:
+    M, S = ramp(0.4), ramp(0.5)
+    assert CrossingTime(0, 0.9)(M, S, task()) == pytest.approx(0.1 * (0.9 / 0.4 - 0.9 / 0.5), rel=1e-12)
+    # At the level, both have the same states, although at different times.
+    assert AtCrossing(2, state=0, level=0.9)(M, S, task()) == pytest.approx(0, abs=1e-12)
+    assert AtCrossing(2, (1,), state=0, level=0.9)(M, ramp(0.5, -3.0), task()) == pytest.approx(9.0 + 10, rel=1e-12)
+
+
+def test_a_trajectory_that_does_not_cross_is_compared_at_its_end() -> None:
+    M, S = ramp(0.4), ramp(0.1)
+    assert CrossingTime(0, 1.0)(M, S, task()) == pytest.approx(0.1 * (4 - 2.5), rel=1e-12)
+    assert AtCrossing(1, (0,), state=0, level=1.0)(M, S, task()) == pytest.approx(1.0 - 0.4, rel=1e-12)
+    assert CrossingTime(0, 1.0, "down")(M, S, task()) == 0
+
+
+def test_only_crossings_in_the_direction_count() -> None:
+    states = np.zeros((HORIZON + 1, N))
+    states[:, 0] = [-1, 1, -1, 1, -1]
+    M, S = trajectory(np.zeros_like(states)), trajectory(states)
+    assert CrossingTime(0, 0.0, "up")(M, S, task()) == pytest.approx(0.4 - 0.05, rel=1e-12)
+    assert CrossingTime(0, 0.0, "down")(M, S, task()) == pytest.approx(0.4 - 0.15, rel=1e-12)
+    third = AtCrossing(1, (0,), state=0, level=0.5, direction="up", crossings=3)
+    assert third(M, S, task()) == pytest.approx(1.0, rel=1e-12)  # the third one is missing: the final state
+
+
+def test_an_angle_crosses_a_level_on_the_circle_and_not_its_opposite_point() -> None:
+    turning = np.zeros((HORIZON + 1, N))
+    turning[:, 0] = [2.9, 3.1, -3.05, -2.8, -2.5]  # it passes pi between the steps 1 and 2
+    still = np.full((HORIZON + 1, N), 2.9)
+    M, S = trajectory(still), trajectory(turning)
+    assert CrossingTime(0, 0.0, angle=True)(M, S, task()) == 0
+    assert CrossingTime(0, np.pi, "up", angle=True)(M, S, task()) == pytest.approx(
+        0.1 * (4 - 1 - (np.pi - 3.1) / (2 * np.pi - 6.15)), rel=1e-12
+    )
+
+
+def test_the_relative_deviation_divides_by_the_motion_of_the_model() -> None:
+    M, S = pair()
+    gap = np.abs(S - M) / np.maximum(np.ptp(M, axis=0), [0.1, 0.1, 50])
+    d = RelativeDeviation(least=[0.1, 0.1, 50])(trajectory(M), trajectory(S), task())
+    assert d == pytest.approx(gap.max(), rel=1e-14)
+    assert RelativeDeviation(least=[1e-9] * 3)(trajectory(1e3 * M), trajectory(1e3 * S), task()) == pytest.approx(
+        RelativeDeviation(least=[1e-9] * 3)(trajectory(M), trajectory(S), task()), rel=1e-12
+    )
+    resting = trajectory(np.zeros((HORIZON + 1, N)))
+    moving = trajectory(np.full((HORIZON + 1, N), 0.2))
+    assert RelativeDeviation(least=[0.1] * 3)(resting, moving, task()) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: FinalState(weights=[1, -1]), InputError, r"weights must be numbers >= 0, not all of them 0, got"),
+        (lambda: FinalState(weights=[0, 0]), InputError, r"weights must be numbers >= 0"),
+        (lambda: FinalState(scales=[1, 0]), InputError, r"scales must be positive numbers, got \[1, 0\]"),
+        (lambda: FinalState(scales=[np.nan]), InputError, "scales must be finite"),
+        (lambda: FinalState(scales=2.0), ShapeError, "scales must be a list with one number for each state, got 2.0"),
+        (lambda: FinalState(2, (0, 1), weights=[1]), ShapeError, "one number for each of 2 states"),
+        (lambda: FinalState(angles=[0.5]), InputError, r"angles must be indices of states, got \[0.5\]"),
+        (lambda: AtTimes(), ShapeError, "times must be a list"),
+        (lambda: RelativeDeviation(), ShapeError, "least must be a list"),
+        (lambda: AtCrossing(crossings=0), InputError, "crossings must be an integer >= 1, got 0"),
+        (lambda: AtCrossing(level=np.inf), InputError, "level must be finite"),
+        (lambda: CrossingTime(direction="upp"), UnknownNameError, "did you mean 'up'"),
+    ],
+)
+def test_arguments_that_cannot_be_used_are_refused(
+    make: Callable[[], object], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("distance", "message"),
+    [
+        (FinalState(weights=[1, 2]), "there must be a weight or a scale for each of 3 states, got 2"),
+        (FinalState(angles=[3]), "angles must be indices of 3 states, from 0 to 2, got 3"),
+        (FinalState(components=[-4]), "components must be indices of 3 states, from 0 to 2, got -4"),
+        (CrossingTime(state=5), "state must be indices of 3 states"),
+    ],
+)
+def test_indices_and_numbers_that_do_not_fit_the_states_are_refused(distance: Distance, message: str) -> None:
+    M, S = (trajectory(states) for states in pair())
+    with pytest.raises(ShapeError, match=message):
+        distance(M, S, task())
+
+
+def test_a_description_names_only_what_changes_the_distance() -> None:
+    plain = describe(FinalState(norm=1))
+    assert plain == {"type": "FinalState", "norm": 1, "components": None}
+    assert describe(FinalState(norm=1, weights=(1, 1), scales=(1.0, 1.0))) == plain
+    assert describe(FinalState(norm=1, weights=[1, 2])) == plain | {"factors": [1.0, 2.0]}
+    assert describe(FinalState(norm=1, scales=[1, 0.5])) == plain | {"factors": [1.0, 2.0]}
+    assert describe(FinalState(norm=1, angles=[0])) == plain | {"angles": [0]}
+
+
+@pytest.mark.parametrize(
+    ("distance", "mixed"),
+    [
+        (FinalState(), ("m", "rad")),
+        (MaximumDeviation(np.inf), ("m", "rad")),
+        (FinalState(components=(0, 2)), ()),
+        (FinalState(components=(0, -2)), ("m", "rad")),
+        (FinalState(weights=[1, 1, 1]), ()),
+        (FinalState(scales=[1, 1, 1]), ()),
+        (RelativeDeviation(least=[1, 1, 1]), ()),
+    ],
+)
+def test_a_distance_knows_which_units_it_mixes(distance: StateNorm, mixed: tuple[str, ...]) -> None:
+    assert distance.mixed_units(["m", "rad", ""]) == mixed

@@ -160,3 +160,28 @@ def test_a_task_without_a_controller_is_passed_over() -> None:
     assert found is not None
     assert found.states[0, 0] == low
     assert closed_loops_on_model(make_validation(Refusing(2.5))) is None
+
+
+def test_logs_are_known_transitions_whose_numbers_follow_those_of_executions() -> None:
+    rng = np.random.default_rng(0)
+
+    def walk(steps: int) -> Trajectory:
+        return Trajectory(np.arange(steps + 1.0), rng.normal(size=(steps + 1, 2)), rng.normal(size=(steps, 1)))
+
+    executed, logged, loops = walk(5), [walk(4), walk(3)], walk(6)
+    found = recorded_transitions(models.Linear(np.eye(2), np.zeros((2, 1))), [executed], loops, logged)
+    assert found is not None
+    assert found[1].tolist() == [0] * 5 + [1] * 4 + [2] * 3
+    np.testing.assert_array_equal(found[0].x[5:9], logged[0].states[:-1])
+
+
+def test_of_long_logs_the_steps_near_the_tasks_are_kept() -> None:
+    rng = np.random.default_rng(0)
+    states = np.cumsum(rng.normal(size=(5001, 1)), axis=0)
+    log = Trajectory(np.arange(5001.0), states, np.zeros((5000, 1)))
+    loops = Trajectory(np.arange(3.0), np.full((3, 1), states[100, 0]), np.zeros((2, 1)))
+    found = recorded_transitions(models.Linear(np.eye(1), np.zeros((1, 1))), [], loops, [log])
+    assert found is not None
+    gaps = np.abs(states[:-1, 0] - states[100, 0])
+    np.testing.assert_array_equal(np.sort(np.abs(found[0].x[:, 0] - states[100, 0])), np.sort(gaps)[: len(found[0])])
+    assert len(found[0]) == 1500

@@ -23,6 +23,7 @@ from ctxval.core.plan import Plan
 from ctxval.core.space import TaskSpace
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
+from ctxval.data import LogMapping, is_log, read_recordings
 from ctxval.errors import InputError
 
 _RESULTS = ("trajectory", "distance", "failed")
@@ -76,9 +77,15 @@ def _names(experiment: Experiment, plan: Plan) -> tuple[dict[str, str], dict[str
 
 
 def read_recording(
-    path: Path, experiment: Experiment, plan: Plan, *, npz: bool | None = None, resample: bool = False
+    path: Path,
+    experiment: Experiment,
+    plan: Plan,
+    *,
+    npz: bool | None = None,
+    resample: bool = False,
+    mapping: LogMapping | None = None,
 ) -> Trajectory:
-    """Read a recorded trajectory from a CSV file with named columns, or from an NPZ file.
+    """Read a recorded trajectory from a CSV file with named columns, from an NPZ file, or from a log of another kind.
 
     Args:
         path: the file.
@@ -86,10 +93,14 @@ def read_recording(
         plan: the plan of the trial.
         npz: whether it is an NPZ file; by default, the suffix decides.
         resample: interpolate the recording to the times of the task.
+        mapping: which fields of a log are states and inputs; None if the file has the names of the experiment.
 
     Raises:
         InputError: if the file cannot be read or resampled; the message says what is missing.
     """
+    if is_log(path) or (mapping is not None and npz is not True and path.is_file()):
+        logged = _logged(path, plan, mapping)
+        return logged.resampled(plan.task.times) if resample else logged
     _require_file(path)
     if path.suffix == ".npz" if npz is None else npz:
         recording = Trajectory.from_npz(path)
@@ -99,6 +110,15 @@ def read_recording(
         if inputs and not recording.inputs.shape[-1]:
             raise InputError(f"{path} must have the columns of the inputs, {', '.join(inputs)}.")
     return recording.resampled(plan.task.times) if resample else recording
+
+
+def _logged(path: Path, plan: Plan, mapping: LogMapping | None) -> Trajectory:
+    """Return the only recording in a log, at the time step of the task."""
+    found = read_recordings([path], mapping, dt=plan.task.dt)
+    if len(found.runs) > 1 or found.breaks:
+        why = f"; it was split: {found.breaks[0]}" if found.breaks else ""
+        raise InputError(f"{path} must be one recording without gaps, and has {len(found.runs)}{why}.")
+    return found.runs[0].trajectory
 
 
 def _require_file(path: Path) -> None:
@@ -132,7 +152,12 @@ class KnownRun:
     failed: str | None = None
 
     def checked(
-        self, validation: Validation, experiment: Experiment, resample: bool, tolerance: float | None
+        self,
+        validation: Validation,
+        experiment: Experiment,
+        resample: bool,
+        tolerance: float | None,
+        mapping: LogMapping | None = None,
     ) -> KnownExecution:
         """Return the execution with its recording, if it has one, after all checks; nothing is stored.
 
@@ -141,6 +166,7 @@ class KnownRun:
             experiment: gives the names of the columns.
             resample: interpolate the recording to the times of the task.
             tolerance: the start tolerance; None for that of the validation.
+            mapping: which fields of a log are states and inputs; None if files have the names of the experiment.
 
         Raises:
             ExecutionError, InputError: if it is not an execution of this task.
@@ -148,7 +174,8 @@ class KnownRun:
         point = validation.space.point(self.parameters)
         recording = None
         if self.trajectory is not None:
-            recording = read_recording(self.trajectory, experiment, validation.plan(point), resample=resample)
+            plan = validation.plan(point)
+            recording = read_recording(self.trajectory, experiment, plan, resample=resample, mapping=mapping)
         return check_known(validation, point, TrialResult(recording, self.distance, self.failed), tolerance)
 
 

@@ -14,6 +14,7 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import OpenTrial
 from ctxval.core.experiment import Experiment
 from ctxval.core.trial import Trial
+from ctxval.data import LogMapping
 from ctxval.errors import InputError
 
 
@@ -22,12 +23,13 @@ class Report:
     """The result of an open trial, before it is checked. Exactly one of recording, distance and failed is given.
 
     Attributes:
-        recording: the file of the recorded trajectory, CSV or NPZ.
+        recording: the file of the recorded trajectory: CSV, NPZ or a log of another kind.
         distance: the distance, if there is no recording.
         failed: the reason why there is no result.
         npz: whether the recording is an NPZ file; None if the suffix decides.
         resample: interpolate the recording to the times of the task.
         start_tolerance: replaces the start tolerance of the validation.
+        mapping: which fields of a log are states and inputs; None if the file has the names of the experiment.
     """
 
     recording: Path | None = None
@@ -36,6 +38,7 @@ class Report:
     npz: bool | None = None
     resample: bool = False
     start_tolerance: float | None = None
+    mapping: LogMapping | None = None
 
     def __repr__(self) -> str:
         return record(self)
@@ -70,8 +73,12 @@ def tell_report(campaign: Campaign, experiment: Experiment, trial: OpenTrial | i
     recording = None
     if report.recording is not None:
         trial = trial if isinstance(trial, OpenTrial) else campaign.reopen(trial)
-        path, npz = report.recording, report.npz
-        recording = read_recording(path, experiment, trial.plan, npz=npz, resample=report.resample)
+        recording = read_recording(
+            *(report.recording, experiment, trial.plan),
+            npz=report.npz,
+            resample=report.resample,
+            mapping=report.mapping,
+        )
     return campaign.tell(
         trial, recording, distance=report.distance, failed=report.failed, start_tolerance=report.start_tolerance
     )

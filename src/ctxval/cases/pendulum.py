@@ -101,7 +101,7 @@ def experiment(seed: int = 0, pendulum: Pendulum | None = None, settings: Settin
         system=systems.Simulated(systems.rk4(pendulum.derivative, settings.dt), vectorized=True),
         model=models.Linear.fit(record(pendulum, settings, seed)),
         synthesizer=controllers.ILQR(weights, [settings.torque_weight], settings.final_factor * weights),
-        distance=distances.FinalState(norm=1),
+        distance=distances.FinalState(norm=1, weights=(1, 1)),  # the paper adds rad and rad/s
     )
     return Experiment(
         "pendulum",

@@ -1,10 +1,25 @@
 """The command line: a thin skin over the public interface."""
 
-from ctxval.cli import certify, files, hand, paper, remeasure, report, run, serve, stores
+from ctxval.cli import certify, collect, files, fit, hand, paper, remeasure, replay, report, run, serve, stores
 from ctxval.cli.base import app
 from ctxval.cli.screen import print_anything
 
-__all__ = ["app", "certify", "files", "hand", "main", "paper", "remeasure", "report", "run", "serve", "stores"]
+__all__ = [
+    "app",
+    "certify",
+    "collect",
+    "files",
+    "fit",
+    "hand",
+    "main",
+    "paper",
+    "remeasure",
+    "replay",
+    "report",
+    "run",
+    "serve",
+    "stores",
+]
 
 
 def main() -> None:

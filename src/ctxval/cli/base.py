@@ -23,6 +23,7 @@ from ctxval._util.texts import reason_of, shortened
 from ctxval.certificates.bounds import as_text
 from ctxval.certificates.verdict import Verdict
 from ctxval.cli.screen import Commands, Screen, line
+from ctxval.core.experiment import UnitsWarning
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
 from ctxval.storage.disks import StoreWarning
@@ -131,7 +132,7 @@ def worker_options(workers: int | None, dask: str | None, timeout: float | None)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: Any, **_: Any) -> None:
-    if issubclass(category, StoreWarning):
+    if issubclass(category, StoreWarning | UnitsWarning):
         err.say(("warning:", "bold yellow"), f" {message}")
     else:
         err.say(warnings.formatwarning(message, category, *place[:2]).rstrip("\n"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import warnings
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,6 +14,7 @@ from ctxval.cli.base import BAD_INPUT, app, command, out
 from ctxval.cli.options import TARGET, AsJson, PartOptions, named_values
 from ctxval.config.check import Finding, check_experiment
 from ctxval.config.settings import read_settings
+from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import InputError
 
 _EXPERIMENT = """\
@@ -68,10 +70,11 @@ Q = [10.0, 1.0]
 R = [0.1]
 limits = 4.0
 
-[distance]              # FinalState, WholeTrajectory, MeanDeviation, GoalError; or my_module:my_distance
+[distance]              # FinalState, MaximumDeviation, MeanDeviation, GoalError, ...; or my_module:my_distance
 type = "FinalState"
 norm = 2
 components = [0]        # only the position
+# States of different units need scales, the error of each state that counts as 1: scales = [0.1, 0.5]
 
 [search]                # `ctxval run --help` lists the search methods
 name = "auto"
@@ -146,7 +149,9 @@ def check(
 ) -> Any:
     """Check that the parts of an experiment fit together. The system is executed only if --execute is given."""
     settings = read_settings(target, {"options": named_values(option)})
-    experiment = settings.load()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnitsWarning)  # it is one of the findings
+        experiment = settings.load()
     _ = settings.certificate_options  # which refuses a kind or an option that does not exist
     settings.search.build(settings.folder)
     findings = check_experiment(experiment, execute=execute, seed=settings.seed)

@@ -126,7 +126,10 @@ def tell(
     store: StoreArgument,
     trial: Annotated[int, typer.Argument(metavar="TRIAL", help="Number of the trial, as printed by `ctxval ask`.")],
     trajectory: Annotated[
-        Path | None, typer.Option(help="CSV file of the recorded trajectory, with named columns.")
+        Path | None,
+        typer.Option(
+            help="CSV file of the recorded trajectory, with named columns, or another log that `ctxval replay` reads."
+        ),
     ] = None,
     npz: Annotated[
         Path | None, typer.Option(help="NPZ file of the recorded trajectory, with the arrays times, states and inputs.")
@@ -152,7 +155,8 @@ def tell(
         raise InputError("--resample and --start-tolerance need a recording: give --trajectory or --npz.")
     require_tolerance(start_tolerance, "--start-tolerance")
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
-    told = Report(trajectory or npz, distance, failed, npz is not None, resample, start_tolerance)
+    mapping = opened.settings.log_mapping
+    told = Report(trajectory or npz, distance, failed, npz is not None, resample, start_tolerance, mapping)
     ended = tell_report(opened.campaign, opened.experiment, trial, told)
     report = _ended(ended, opened)
     if not as_json:
@@ -206,7 +210,8 @@ def import_runs(
 def _checked(run: KnownRun, opened: Opened, resample: bool, start_tolerance: float | None) -> KnownExecution:
     """Return an earlier run after all checks; an error names the file and the line."""
     try:
-        return run.checked(opened.campaign.validation, opened.experiment, resample, start_tolerance)
+        mapping = opened.settings.log_mapping
+        return run.checked(opened.campaign.validation, opened.experiment, resample, start_tolerance, mapping)
     except InputError as error:
         raise InputError(f"{run.where}: {error}") from error
 

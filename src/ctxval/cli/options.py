@@ -64,11 +64,12 @@ PartOptions = Annotated[
 ]
 
 
-def named_values(given: Sequence[str] | None, **named: Any) -> dict[str, Any]:
+def named_values(given: Sequence[str] | None, flag: str = "--option", /, **named: Any) -> dict[str, Any]:
     """Return the options that a command line states, by name.
 
     Args:
         given: texts ``name=value``; a value is a number, a Boolean, a list or a quoted text of TOML, or plain text.
+        flag: the command line option, for messages.
         named: options that have a command line option of their own; None if it was not given.
 
     Raises:
@@ -79,7 +80,7 @@ def named_values(given: Sequence[str] | None, **named: Any) -> dict[str, Any]:
         name, equals, value = text.partition("=")
         name = name.strip()
         if not (equals and name):
-            raise InputError(f"--option must be NAME=VALUE, such as --option dim=4, got {text!r}.")
+            raise InputError(f"{flag} must be NAME=VALUE, such as {flag} dim=4, got {text!r}.")
         if name in found:
             raise InputError(f"the option {name} is given twice: as {found[name]!r} and as {value!r}.")
         found[name] = parsed(value.strip())

@@ -18,6 +18,7 @@ _INDENT = "\n  "
 
 PANELS = {
     "Run": ("init", "check", "run", "remeasure"),
+    "Recordings": ("replay", "fit", "collect"),
     "By hand": ("ask", "tell", "import", "serve"),
     "Inspect": ("status", "certify", "report", "export"),
     "Paper": ("cases", "reproduce"),

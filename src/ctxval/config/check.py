@@ -12,7 +12,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.costs import ThinkingCosts
-from ctxval.core.experiment import Experiment
+from ctxval.core.experiment import Experiment, mixed_units_sentence
 from ctxval.core.labels import labels_of
 from ctxval.core.plan import Plan
 from ctxval.core.task import Task
@@ -163,6 +163,8 @@ def _names(experiment: Experiment, plan: Plan) -> Iterator[Finding]:
         text = ", ".join(labels_of(named))
         missing = f"; no unit for {', '.join(bare)}" if bare else ""
         yield Finding("names", "noted" if bare else "ok", f"{kind}: {text}{missing}")
+    if experiment.mixed_units:
+        yield Finding("distance", "noted", mixed_units_sentence(experiment.mixed_units).removesuffix("."))
     if not experiment.units:
         yield Finding("names", "noted", "the distance has no units")
 

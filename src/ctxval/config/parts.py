@@ -25,6 +25,7 @@ from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.task import Task
 from ctxval.core.task_distribution import Normal
 from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.data import LogMapping, is_log, read_recordings
 from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
 
 REGISTRIES: dict[str, Registry[Any]] = {
@@ -90,8 +91,9 @@ def _is_part(kind: str, found: Any) -> bool:
 
 
 def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
-    if kind == "model" and "data" in arguments and hasattr(build, "fit"):
-        build, arguments = build.fit, {**arguments, "data": recorded(arguments["data"], folder)}
+    if kind == "model" and "data" in arguments and (hasattr(build, "fit") or declaration_of(build) is not None):
+        # A part that cannot be learned here, such as a network, keeps the data, so that searches begin with them.
+        build, arguments = getattr(build, "fit", build), {**arguments, "data": recorded(arguments["data"], folder)}
     return construct(what, build, arguments)
 
 
@@ -130,22 +132,32 @@ def _referred(text: str, folder: Path | None) -> Any:
 
 
 def recorded(files: Any, folder: Path | None = None) -> Transitions:
-    """Return the transitions in recorded trajectories, CSV or NPZ, or in an NPZ file with x, u and x_next.
+    """Return the transitions in recorded trajectories, in logs, or in an NPZ file with x, u and x_next.
 
     Args:
-        files: one path or a list of paths.
+        files: one path or a list of paths; or a mapping of logs (see :class:`ctxval.data.LogMapping`) with such paths
+            as ``logs``.
         folder: the folder of the files; the current folder by default.
 
     Raises:
         InputError: if a file cannot be read.
     """
+    mapping = None
+    if isinstance(files, Mapping):
+        mapping = LogMapping.from_table({key: value for key, value in files.items() if key != "logs"})
+        files = files.get("logs")
     paths = [files] if isinstance(files, str) else files
     if not isinstance(paths, list) or not paths or not all(isinstance(path, str) for path in paths):
         raise InputError(f"data must be a file of recorded trajectories or a list of files, got {files!r}.")
-    return Transitions.joined([_transitions(Path(folder or "", path)) for path in paths])
+    found = [Path(folder or "", path) for path in paths]
+    if mapping is not None:
+        return read_recordings(found, mapping).transitions()[0]
+    return Transitions.joined([_transitions(path) for path in found])
 
 
 def _transitions(path: Path) -> Transitions:
+    if is_log(path):
+        return read_recordings([path]).transitions()[0]
     if path.suffix != ".npz":
         return Trajectory.from_csv(path).transitions()
     try:

@@ -20,6 +20,7 @@ from ctxval.config.signatures import code_named, signed, unsigned, verifies
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
 from ctxval.core.validation import Validation
+from ctxval.data import LogMapping
 from ctxval.errors import InputError, UnknownNameError
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH
 from ctxval.searches import REGISTRY as SEARCHES
@@ -84,6 +85,7 @@ class Settings(BaseModel):
         confidence: the confidence level of the certificate.
         certificate: the certificate for the verdict.
         search: the search, and its options.
+        recordings: the mapping of logs to states and inputs, as :class:`ctxval.data.LogMapping` takes it.
         folder: the folder of modules and files, which is the folder of the experiment file. None means the current
             folder.
     """
@@ -110,6 +112,7 @@ class Settings(BaseModel):
     seed: int = Field(default=0, ge=0)
     store: Path | None = None
     search: SearchTable = Field(default_factory=SearchTable)
+    recordings: dict[str, Any] | None = None
     folder: Path | None = None
 
     def load(self) -> Experiment:
@@ -222,6 +225,15 @@ class Settings(BaseModel):
     def certificate_options(self) -> CertificateOptions:
         """The kind, the options and the confidence of the certificate for the verdict."""
         return self.certificate.options(self.confidence)
+
+    @property
+    def log_mapping(self) -> LogMapping | None:
+        """The mapping of logs; None if there is none.
+
+        Raises:
+            InputError: if it cannot be used.
+        """
+        return None if self.recordings is None else LogMapping.from_table(self.recordings)
 
     def store_path(self, name: str) -> Path:
         """Return the path of the store: the given one, or a file in ``runs/`` with the names of experiment and search.

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from ctxval._util.representation import call, lines
-from ctxval.core.labels import Labels
+from ctxval.core.labels import Labels, parted
 from ctxval.core.truth import Truth
 from ctxval.core.validation import Validation
+
+
+class UnitsWarning(UserWarning):
+    """A distance adds states of different units without weights or scales."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +30,9 @@ class Experiment:
         states, inputs: names of the states and inputs with their units, for files, pictures and reports.
 
     The validation gets these names and units as its labels. What is not given here is taken from its labels.
+
+    Warns:
+        UnitsWarning: if the distance adds states of different units, and has neither weights nor scales.
     """
 
     name: str
@@ -43,6 +51,21 @@ class Experiment:
             object.__setattr__(self, name, getattr(labels, name))
         if labels != own:
             object.__setattr__(self, "validation", self.validation.with_labels(labels))
+        if self.mixed_units:
+            warnings.warn(mixed_units_sentence(self.mixed_units), UnitsWarning, stacklevel=3)
+
+    @property
+    def mixed_units(self) -> tuple[str, ...]:
+        """The units that the distance adds although they differ; none if it has weights or scales, or if none is known.
+
+        A distance states them by its method ``mixed_units(units) -> units``, as the ready-made ones do.
+        """
+        ask = getattr(self.validation.distance, "mixed_units", None)
+        own = getattr(self.validation.system, "states", None)
+        units = [parted(label)[1] for label in self.states]
+        if not units and isinstance(own, Mapping):
+            units = [str(unit) for unit in own.values()]
+        return tuple(ask(units)) if callable(ask) and units else ()
 
     def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
         """Return the names of n states and m inputs with their units, for files.
@@ -55,3 +78,12 @@ class Experiment:
         known = {"threshold": self.threshold, "units": self.units or None, "truth": self.truth}
         head = call(self, self.name, self.validation.space, budget=self.budget, **known)
         return lines(head, *(part.strip() for part in repr(self.validation).splitlines()[1:]))
+
+
+def mixed_units_sentence(units: tuple[str, ...]) -> str:
+    """Return the sentence that a distance adds these units."""
+    return (
+        f"the distance adds states in {' and '.join(units)} without weights or scales, so it depends on the choice of "
+        "units: give scales=[...], the size of an error of each state that counts as 1, or weights=[1, ...] if the "
+        "plain sum is meant."
+    )

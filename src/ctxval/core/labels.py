@@ -45,8 +45,8 @@ def labels_of(named: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def _named(labels: tuple[str, ...], own: object, letter: str, count: int) -> dict[str, str]:
-    if len(labels) == count and len({_parted(label)[0] for label in labels}) == count:
-        return dict(_parted(label) for label in labels)
+    if len(labels) == count and len({parted(label)[0] for label in labels}) == count:
+        return dict(parted(label) for label in labels)
     if isinstance(own, Mapping) and len(own) == count:
         return {str(name): str(unit) for name, unit in own.items()}
     if isinstance(own, list | tuple) and len(set(map(str, own))) == count:
@@ -54,7 +54,7 @@ def _named(labels: tuple[str, ...], own: object, letter: str, count: int) -> dic
     return {f"{letter}{i}": "" for i in range(count)}
 
 
-def _parted(label: str) -> tuple[str, str]:
+def parted(label: str) -> tuple[str, str]:
     """Return the name and the unit of ``name [unit]``."""
     name, _, unit = label.partition("[")
     return name.strip(), unit.strip().removesuffix("]")

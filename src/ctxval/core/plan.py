@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ctxval._util.arrays import Mask
 from ctxval._util.representation import call, lines, shown
 from ctxval.core.controller import Controller
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory, require_times
+from ctxval.core.trajectory import COMPLETE, Trajectory, require_times
 from ctxval.errors import InputError, ShapeError
 
 
@@ -112,3 +113,11 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
             f"{start_tolerance * scale[i]:.3g}, got {trajectory.states[0, i]:g}. "
             "Check that it belongs to this trial."
         )
+
+
+def executed_in(expected: Trajectory, batch: Trajectory) -> Mask:
+    """Return which tasks of a batch have a complete and finite trajectory, shape ``(N,)``."""
+    same = batch.states.shape == expected.states.shape and batch.inputs.shape == expected.inputs.shape
+    # If the batch ended early but all its values are finite, it is not known which task ended early.
+    unknown = batch.ended != COMPLETE and bool(batch.finite.all())
+    return batch.finite if same and not unknown else np.zeros(expected.finite.shape, dtype=bool)

@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats, require_shape
+from ctxval._util.arrays import Array, ArrayLike, as_floats, require_shape
 from ctxval._util.describe import describe
 from ctxval._util.interrupts import raised_by_signal
 from ctxval._util.progress import advance
@@ -17,7 +17,7 @@ from ctxval.core.controller import Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels
 from ctxval.core.model import Model, Step, as_model
-from ctxval.core.plan import Measurement, Outcome, Plan, require_execution
+from ctxval.core.plan import Measurement, Outcome, Plan, executed_in, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.system import System
@@ -83,7 +83,9 @@ class Validation:
             "distance", distance, callable(distance), "a function (model_trajectory, system_trajectory, task) -> d"
         )
         _require("labels", labels, labels is None or isinstance(labels, Labels), "Labels(states, inputs, units)")
-        _require("start_tolerance", start_tolerance, _is_share(start_tolerance), "a finite number >= 0")
+        is_number = isinstance(start_tolerance, int | float) and not isinstance(start_tolerance, bool)
+        is_share = is_number and 0 <= start_tolerance < float("inf")
+        _require("start_tolerance", start_tolerance, is_share, "a finite number >= 0")
         self.space = space
         self.task = task
         self.system = system
@@ -109,6 +111,14 @@ class Validation:
         """
         return self._with(distance=distance)
 
+    def with_model(self, model: Model | Step) -> Validation:
+        """Return this validation with another model.
+
+        Raises:
+            InputError: if it is neither a model nor a function.
+        """
+        return self._with(model=model)
+
     def with_space(self, space: TaskSpace) -> Validation:
         """Return this validation with another task space of the same parameters, for example with a distribution.
 
@@ -126,14 +136,10 @@ class Validation:
         return self._with(labels=labels)
 
     def _with(self, **changed: Any) -> Validation:
-        parts = ("space", "task", "system", "model", "synthesizer", "distance", "start_tolerance", "labels")
-        return Validation(**{**{part: getattr(self, part) for part in parts}, **changed})
+        return Validation(**{**vars(self), **changed})
 
     def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
-        """Return the names of n states and m inputs with their units: those of the labels, else of the system.
-
-        If neither has names, they are ``x0, x1, ...`` and ``u0, u1, ...``.
-        """
+        """Return the names of n states and m inputs with their units (:meth:`Labels.names`)."""
         return self.labels.names(self.system, states, inputs)
 
     # One task, step by step
@@ -330,7 +336,7 @@ class Validation:
         values = self._distance(plan.task, plan.model_trajectory, trajectory)
         if values.shape != (len(points),):
             raise DistanceError(f"the distance must have shape ({len(points)},) over the batch, got {values.shape}.")
-        executed = _executed(plan.model_trajectory, trajectory)
+        executed = executed_in(plan.model_trajectory, trajectory)
         wrong = executed & ~(np.isfinite(values) & (values >= 0))
         if wrong.any():
             self._refuse_distance(values[np.argmax(wrong)], points[np.argmax(wrong)])
@@ -386,18 +392,6 @@ class Validation:
             f"synthesizer: {shown(self.synthesizer)}",
             f"distance: {shown(self.distance)}, task: {shown(self.task)}",
         )
-
-
-def _executed(expected: Trajectory, batch: Trajectory) -> Mask:
-    """Return which tasks of a batch have a complete and finite trajectory, shape ``(N,)``."""
-    same = batch.states.shape == expected.states.shape and batch.inputs.shape == expected.inputs.shape
-    # If the batch ended early but all its values are finite, it is not known which task ended early.
-    unknown = batch.ended != COMPLETE and bool(batch.finite.all())
-    return batch.finite if same and not unknown else np.zeros(expected.finite.shape, dtype=bool)
-
-
-def _is_share(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < float("inf")
 
 
 def _require(name: str, value: object, valid: bool, wanted: str) -> None:

@@ -1,38 +1,122 @@
-"""The base class and a helper of the ready-made distances: a norm, and a selection of states."""
+"""What the ready-made distances share: a norm, a selection of states, and what makes different states comparable."""
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
+from typing import Any
 
-from ctxval._util.arrays import Array, as_norm_order, vector_norm
+import numpy as np
+
+from ctxval._util.arrays import Array, ArrayLike, as_finite, as_norm_order, vector_norm
+from ctxval._util.representation import call
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
+from ctxval.errors import InputError, ShapeError
+
+_COMPARABLE = ("weights", "scales", "angles")
 
 
-def selected(states: Array, components: Sequence[int] | None) -> Array:
-    """Return the selected states ``(..., k)``; all states if ``components`` is None."""
-    return states if components is None else states[..., list(components)]
+@dataclass(frozen=True, repr=False)
+class StateNorm:
+    """A norm of differences between states.
 
-
-@dataclass(frozen=True)
-class ErrorNorm(ABC):
-    """Norm of an error vector of the trajectories of one task.
+    Each difference is multiplied by its weight, divided by its scale, and then enters the norm. With a scale in the
+    unit of its state, such as 0.1 m and 0.05 rad, differences of one scale count the same.
 
     Attributes:
         norm: order of the norm: 1, 2 or infinity.
         components: indices of the states that are compared; all states by default.
+        weights: one number >= 0 for each compared state; 1 by default.
+        scales: the unit of comparison of each compared state, a positive number; 1 by default.
+        angles: indices of the states that are angles in radians: the difference is taken on the circle, so it is at
+            most pi.
 
     Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity.
+        InputError: if the order of the norm is not 1, 2 or infinity, or a weight or a scale cannot be used.
+        ShapeError: if the number of weights or scales is not that of the compared states.
     """
 
     norm: float = 1
     components: Sequence[int] | None = None
+    _: KW_ONLY
+    weights: Sequence[float] | None = None
+    scales: Sequence[float] | None = None
+    angles: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         as_norm_order(self.norm)
+        require_numbers("weights", self.weights, self.components, zero=True)
+        require_numbers("scales", self.scales, self.components, zero=False)
+        if not all(isinstance(index, int | np.integer) and not isinstance(index, bool) for index in self.angles):
+            raise InputError(f"angles must be indices of states, got {self.angles!r}.")
+
+    @property
+    def factors(self) -> Array | None:
+        """The factor of the difference of each compared state, shape ``(k,)``; None if all are 1."""
+        weights, scales = (np.asarray(1.0 if given is None else given) for given in (self.weights, self.scales))
+        factors = np.asarray(weights / scales, dtype=np.float64)
+        return None if (factors == 1).all() else factors
+
+    def difference(self, states: Array, others: Array) -> Array:
+        """Return the weighted differences ``states - others`` of the compared states.
+
+        Args:
+            states, others: states, shape ``(..., n)``; each axis before the last must match or be 1.
+
+        Raises:
+            ShapeError: if there is no state of an index, or the number of weights or scales is another one.
+        """
+        gap = selected(self.unwrapped(states - others), self.components)
+        factors = self.factors
+        if factors is None:
+            return gap
+        if gap.shape[-1] != len(factors):
+            raise ShapeError(
+                f"there must be a weight or a scale for each of {gap.shape[-1]} states, got {len(factors)}."
+            )
+        return gap * factors
+
+    def unwrapped(self, gap: Array) -> Array:
+        """Return differences of states ``(..., n)``; those of angles are moved to at most pi in magnitude."""
+        if not len(self.angles):
+            return gap
+        require_indices("angles", self.angles, gap.shape[-1])
+        moved = np.array(gap)
+        moved[..., list(self.angles)] = turned(gap[..., list(self.angles)])
+        return moved
+
+    def mixed_units(self, units: Sequence[str]) -> tuple[str, ...]:
+        """Return the units that the norm adds although they differ; none if weights or scales are given.
+
+        Args:
+            units: the unit of each state; empty if it is unknown.
+        """
+        if self.weights is not None or self.scales is not None:
+            return ()
+        compared = range(len(units)) if self.components is None else self.components
+        found = dict.fromkeys(units[i] for i in compared if -len(units) <= i < len(units) and units[i])
+        return tuple(found) if len(found) > 1 else ()
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies the distance in a store. Weights and scales that change nothing are left out."""
+        found = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        kept = {name: value for name, value in found.items() if name not in _COMPARABLE}
+        factors = self.factors
+        return (
+            kept | ({} if factors is None else {"factors": factors}) | ({"angles": self.angles} if self.angles else {})
+        )
+
+    def __repr__(self) -> str:
+        found = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return call(self, **{name: value for name, value in found.items() if value is not None and value != ()})
+
+
+@dataclass(frozen=True, repr=False)
+class ErrorNorm(StateNorm, ABC):
+    """Norm of an error vector of the trajectories of one task; see :class:`StateNorm` for the attributes."""
 
     @abstractmethod
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
@@ -45,3 +129,57 @@ class ErrorNorm(ABC):
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         """Return the distance, shape ``(...)``."""
         return self.compose(self.error(model_trajectory, system_trajectory, task))
+
+
+def selected(states: Array, components: Sequence[int] | None) -> Array:
+    """Return the selected states ``(..., k)``; all states if ``components`` is None.
+
+    Raises:
+        ShapeError: if there is no state of an index.
+    """
+    if components is None:
+        return states
+    require_indices("components", components, states.shape[-1])
+    return states[..., list(components)]
+
+
+def turned(angles: Array) -> Array:
+    """Return angles in radians, moved by whole turns to at most pi in magnitude; smaller ones are unchanged."""
+    return np.asarray(angles - 2 * np.pi * np.round(angles / (2 * np.pi)))
+
+
+def require_indices(name: str, indices: Sequence[int], count: int) -> None:
+    """Check that indices are those of ``count`` states; negative ones count from the end.
+
+    Raises:
+        ShapeError: if there is no state of an index.
+    """
+    wrong = [index for index in indices if not -count <= index < count]
+    if wrong:
+        raise ShapeError(f"{name} must be indices of {count} states, from 0 to {count - 1}, got {wrong[0]!r}.")
+
+
+def require_numbers(name: str, given: ArrayLike | None, components: Sequence[int] | None, *, zero: bool) -> None:
+    """Check that an option is None or a list of finite numbers, one for each component if these are known.
+
+    Args:
+        name: the name of the option.
+        given: the value.
+        components: the compared states, if they are known.
+        zero: whether 0 is allowed, though not for all of them.
+
+    Raises:
+        InputError: if a number is not allowed.
+        ShapeError: if it is no list, or its length is another one.
+    """
+    if given is None:
+        return
+    array = as_finite(name, given)
+    if array.ndim != 1 or not array.size or (components is not None and len(array) != len(components)):
+        wanted = "state" if components is None else f"of {len(components)} states"
+        raise ShapeError(f"{name} must be a list with one number for each {wanted}, got {given!r}.")
+    valid = (array >= 0).all() and array.any() if zero else (array > 0).all()
+    if not valid:
+        raise InputError(
+            f"{name} must be {'numbers >= 0, not all of them 0' if zero else 'positive numbers'}, got {given!r}."
+        )

@@ -2,38 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import Array, as_norm_order, vector_norm
+from ctxval._util.arrays import Array, vector_norm
 from ctxval._util.registry import part
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.distances.base import selected
+from ctxval.distances.base import StateNorm
 
 
 @part()
-@dataclass(frozen=True)
-class MeanDeviation:
+@dataclass(frozen=True, repr=False)
+class MeanDeviation(StateNorm):
     """Mean over the times 1..H of the norm of the difference between the states, such as an average in metres.
 
     Attributes:
         norm: order of the norm over the states at one time: 1, 2 or infinity.
         components: indices of the states that are compared; all states by default.
+        weights, scales, angles: as in :class:`StateNorm`.
 
     Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity.
+        InputError: if the order of the norm is not 1, 2 or infinity, or another argument cannot be used.
     """
 
     norm: float = 2
-    components: Sequence[int] | None = None
-
-    def __post_init__(self) -> None:
-        as_norm_order(self.norm)
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         """Return the distance, shape ``(...)``."""
-        gap = selected(system_trajectory.states - model_trajectory.states, self.components)
+        gap = self.difference(system_trajectory.states, model_trajectory.states)
         return np.asarray(vector_norm(gap[..., 1:, :], self.norm).mean(axis=-1))

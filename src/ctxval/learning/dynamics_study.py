@@ -73,17 +73,21 @@ class DynamicsStudy:
                     effects[j] = max(effects[j], float(np.nanmax(np.abs(high - low) / size)))
         return tuple(np.flatnonzero(effects < _WEAK).tolist())
 
-    def learn(self, executed: Sequence[tuple[Array, Trajectory]]) -> LearnedDynamics | None:
-        """Return what executions teach.
+    def learn(
+        self, executed: Sequence[tuple[Array, Trajectory]], logged: Sequence[Trajectory] = ()
+    ) -> LearnedDynamics | None:
+        """Return what executions teach, and other recordings of the system.
 
         Returns None if there are no recorded transitions, if M explains them, or if no task can be planned.
 
         Args:
             executed: points of the unit cube ``(d,)`` with the system's trajectories there.
+            logged: recordings with the same time step that belong to no task.
         """
         if self._loops is None:
             return None
-        recorded = recorded_transitions(self.validation.model, [trajectory for _, trajectory in executed], self._loops)
+        trajectories = [trajectory for _, trajectory in executed]
+        recorded = recorded_transitions(self.validation.model, trajectories, self._loops, logged)
         if recorded is None:
             return None
         rng = np.random.default_rng([self.seed, len(executed), 0])

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from ctxval._util.arrays import Rows
+from ctxval._util.arrays import Array, Rows
 from ctxval.core.model import Model
 from ctxval.core.rollout import rollout
 from ctxval.core.trajectory import Trajectory, Transitions
@@ -18,6 +19,8 @@ _POOL = 3000
 """Largest number of transitions that these are chosen from."""
 _DATA = 600
 """Largest number of transitions of the model's own data in this pool: those nearest to the tasks."""
+_LOGGED = 1500
+"""Largest number of transitions of logs in this pool: those nearest to the tasks."""
 _LOOPS = 64
 """Number of closed loops on M that show which transitions the tasks need."""
 _SLOW_LOOPS = 3
@@ -25,7 +28,7 @@ _SLOW_LOOPS = 3
 
 
 def recorded_transitions(
-    model: Model, executed: Sequence[Trajectory], loops: Trajectory
+    model: Model, executed: Sequence[Trajectory], loops: Trajectory, logged: Sequence[Trajectory] = ()
 ) -> tuple[Transitions, Rows] | None:
     """Return the known transitions of the system and the execution of each; -1 for data that the model was made from.
 
@@ -34,10 +37,18 @@ def recorded_transitions(
     Args:
         model: the model M, which may have data.
         executed: the system's trajectories.
-        loops: closed loops on M, which show which of the model's data the tasks need.
+        loops: closed loops on M, which show which of the other data the tasks need.
+        logged: recordings that belong to no task; their numbers follow those of the executions.
     """
     parts = [trajectory.transitions() for trajectory in executed]
     sources = [np.full(len(part), k) for k, part in enumerate(parts)]
+    if logged:
+        others = [trajectory.transitions() for trajectory in logged]
+        of = np.repeat(len(executed) + np.arange(len(others)), [len(part) for part in others])
+        together = Transitions.joined(others)
+        rows = _nearest_logged(together, loops)
+        parts.append(Transitions(together.x[rows], together.u[rows], together.x_next[rows]))
+        sources.append(of[rows])
     data = getattr(model, "data", None)
     if isinstance(data, Transitions) and len(data):
         parts.append(_nearest(data, loops))
@@ -74,12 +85,29 @@ def _nearest(data: Transitions, loops: Trajectory) -> Transitions:
     """Return the transitions that are nearest to the closed loops of the tasks."""
     if len(data) <= _DATA:
         return data
+    here, there = _compared(data, loops)
+    if not len(there):
+        return data
+    kept = np.sort(np.argsort(cdist(here, there).min(axis=1), kind="stable")[:_DATA])
+    return Transitions(data.x[kept], data.u[kept], data.x_next[kept])
+
+
+def _nearest_logged(data: Transitions, loops: Trajectory) -> Rows:
+    """Return the rows of the logged transitions that are nearest to the closed loops of the tasks."""
+    if len(data) <= _LOGGED:
+        return np.arange(len(data))
+    here, there = _compared(data, loops)
+    if not len(there):
+        return np.arange(len(data))
+    gaps = cKDTree(there).query(here)[0]  # a tree, because logs are long
+    return np.sort(np.argsort(gaps, kind="stable")[:_LOGGED])
+
+
+def _compared(data: Transitions, loops: Trajectory) -> tuple[Array, Array]:
+    """Return the pairs of transitions, and those of closed loops, in standard deviations of the former."""
     needed = loops.transitions()
     there = np.concatenate([needed.x, needed.u], axis=1)
     there = there[np.isfinite(there).all(axis=1)][:: max(1, len(there) // _POOL)]
     here = np.concatenate([data.x, data.u], axis=1)
-    if not len(there):
-        return data
     scale = standard_deviations(here)
-    kept = np.sort(np.argsort(cdist(here / scale, there / scale).min(axis=1), kind="stable")[:_DATA])
-    return Transitions(data.x[kept], data.u[kept], data.x_next[kept])
+    return here / scale, there / scale

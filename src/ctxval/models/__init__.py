@@ -8,6 +8,8 @@ from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponent
 from ctxval.models.linear import Linear
 from ctxval.models.neural_network import FeedforwardReLU
 from ctxval.models.onnx import Onnx
+from ctxval.models.parametric import Parametric
+from ctxval.models.saved import read_model, write_model, write_transitions
 from ctxval.models.scaling import IncrementScaling
 from ctxval.models.scikit_learn import ScikitLearn
 from ctxval.models.state_space import state_space
@@ -21,11 +23,15 @@ __all__ = [
     "Linear",
     "Model",
     "Onnx",
+    "Parametric",
     "ScikitLearn",
     "SquaredExponential",
     "by_name",
     "linearize",
+    "read_model",
     "state_space",
+    "write_model",
+    "write_transitions",
 ]
 
 REGISTRY: Registry[Model] = Registry("model", __name__, method="step")

@@ -11,6 +11,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
 from ctxval._util.registry import part
 from ctxval._util.representation import call
+from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
 
@@ -27,13 +28,17 @@ class Onnx:
     Args:
         source: the file, or its bytes.
         increments: whether the network returns ``x_next - x`` instead of ``x_next``.
+        data: the transitions that the network was learned from, if they are known.
 
     Raises:
         InputError: if onnxruntime is not installed, or the file is not a network with one or two inputs.
     """
 
-    def __init__(self, source: str | Path | bytes, *, increments: bool = False) -> None:
+    def __init__(
+        self, source: str | Path | bytes, *, increments: bool = False, data: Transitions | None = None
+    ) -> None:
         self.network = OnnxNetwork(source)
+        self.data = data
         self.increments = increments
         if len(self.network.widths) not in (1, 2):
             raise InputError(

@@ -186,12 +186,16 @@ class _Norm:
     def of(distance: FinalState | WholeTrajectory, task: Task) -> _Norm:
         if not isinstance(distance, FinalState | WholeTrajectory):
             raise InputError(f"open-loop validation needs a FinalState or WholeTrajectory distance, got {distance!r}.")
+        if len(distance.angles):
+            raise InputError("open-loop validation needs a distance without angles, which are no linear function.")
         factors = np.zeros((task.horizon + 1, task.initial_state.shape[-1]))
         components = slice(None) if distance.components is None else list(distance.components)
         if isinstance(distance, FinalState):
             factors[-1, components] = 1.0
         else:
             factors[:, components] = 1 / task.horizon if distance.per_step else 1.0
+        if distance.factors is not None:
+            factors[:, components] *= distance.factors
         return _Norm(distance.norm, factors)
 
     def value(self, gap: Array, rows: Rows) -> Array:

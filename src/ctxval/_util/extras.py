@@ -1,0 +1,26 @@
+"""Libraries that only some users need: each is in an extra of the package, and is imported when it is used."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from ctxval.errors import InputError
+
+
+def require_extra(module: str, extra: str, purpose: str) -> Any:
+    """Return a module of an extra.
+
+    Args:
+        module: the module to import.
+        extra: the extra of this package that installs it.
+        purpose: what needs it, for the message.
+
+    Raises:
+        InputError: if it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        name = module.partition(".")[0]
+        raise InputError(f"{purpose} need {name}: pip install 'ctxval[{extra}]'.") from error

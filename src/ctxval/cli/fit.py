@@ -1,0 +1,185 @@
+"""``ctxval fit``: learn models from recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from ctxval._util.texts import shortened
+from ctxval.cli.base import CANNOT_GO_ON, app, command, err, out
+from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingFile, States, TimeField, print_breaks
+from ctxval.cli.options import AsJson, named_values
+from ctxval.cli.replay import numbers, print_titled
+from ctxval.cli.screen import line
+from ctxval.config.references import reference, require_function
+from ctxval.errors import InputError
+from ctxval.fitting import FitReport, FittedModel, fit
+from ctxval.fitting.fit import HOLD_OUT, KINDS, STEPS
+from ctxval.fitting.onnx_file import write_onnx
+from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear, Parametric, write_model, write_transitions
+
+Kinds = Annotated[
+    str | None,
+    typer.Option(
+        "--kind",
+        help=f"Kinds of models with commas between them: {', '.join(KINDS)} (default: the first three, or parameters "
+        "if --step is given).",
+    ),
+]
+StepFunction = Annotated[
+    str | None,
+    typer.Option(
+        "--step", metavar="MODULE:ATTR", help="Your function (x, u, theta) -> x_next, whose parameters are estimated."
+    ),
+]
+Parameters = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--parameter",
+        metavar="NAME=[LOW, HIGH]",
+        help="Bounds of a parameter of --step, such as mass=[0.5, 2.0]. Repeat --parameter in the order of theta.",
+    ),
+]
+Vectorized = Annotated[bool, typer.Option("--vectorized", help="State that --step takes whole batches of x and u.")]
+HoldOut = Annotated[
+    float, typer.Option(help="Share of the recordings that is held out, from which no model is learned.")
+]
+Steps = Annotated[
+    str | None,
+    typer.Option(help=f"Numbers of steps after which errors are computed (default: {','.join(map(str, STEPS))})."),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        help="File for the most accurate model that it can hold: .npz, with the recorded steps that the model was "
+        "learned from, or .onnx for a network or a linear model, with these steps in a file .data.npz beside it. For "
+        "the parameters of --step: .toml, the table model of an experiment file.",
+    ),
+]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
+
+
+@app.command("fit")
+@command
+def fit_models(
+    logs: Logs,
+    kind: Kinds = None,
+    step: StepFunction = None,
+    parameter: Parameters = None,
+    vectorized: Vectorized = False,
+    mapping: MappingFile = None,
+    state: States = None,
+    input_: Inputs = None,
+    time: TimeField = None,
+    dt: Dt = None,
+    delay: Delay = None,
+    hold_out: HoldOut = HOLD_OUT,
+    steps: Steps = None,
+    out_file: Out = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> Any:
+    """Learn models from recordings, and compare their errors on recordings that were held out.
+
+    The most accurate model is that with the smallest error after the largest number of steps. Its file contains the
+    recorded steps that it was learned from, so that the search `auto` begins with them.
+    """
+    kinds: Any = kind.split(",") if kind else (["parameters"] if step is not None else list(KINDS[:3]))
+    if (step is None) != (not parameter):
+        raise InputError("--step and --parameter must be given together.")
+    bounds = named_values(parameter, "--parameter")
+    if out_file is not None and out_file.suffix not in _SUFFIXES:
+        raise InputError(f"the file of a model must end in {', '.join(_SUFFIXES)}, got {str(out_file)!r}.")
+    found = LogOptions(mapping, state, input_, time, dt, delay).read(logs)
+    function = None if step is None else require_function(f"--step {step}", reference(step), "(x, u, theta) -> x_next")
+    report = fit(
+        found,
+        [name.strip() for name in kinds],
+        step=function,
+        bounds=bounds,
+        vectorized=vectorized,
+        hold_out=hold_out,
+        steps=STEPS if steps is None else numbers(steps),
+        seed=seed,
+    )
+    if not as_json:
+        print_breaks(found)
+        _print(report)
+    written: list[str] = []
+    if report.fitted and out_file is not None:
+        chosen = _most_accurate(report, out_file)
+        written = _written(out_file, chosen, step)
+        if not as_json:
+            out.say(f"the {chosen.kind} model is in {' and '.join(written)}")
+    result = {**report.to_json(), "files": written}
+    return result if report.fitted else (result, CANNOT_GO_ON)
+
+
+def _written(path: Path, chosen: FittedModel, step: str | None) -> list[str]:
+    """Write a model to a file, and the data of an ONNX file to another one; return their paths."""
+    if isinstance(chosen.model, Parametric):
+        values = ", ".join(f"{name} = {value!r}" for name, value in chosen.model.theta.items())
+        text = f'[model]\ntype = "Parametric"\nstep = {{ ref = "{step}" }}\ntheta = {{ {values} }}\n'
+        if chosen.model.vectorized:
+            text += "vectorized = true\n"
+        try:
+            path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+    elif path.suffix == ".onnx":
+        write_onnx(path, chosen.model)
+        beside = path.with_suffix(".data.npz")
+        write_transitions(beside, getattr(chosen.model, "data", None))
+        return [str(path), str(beside)]
+    else:
+        write_model(path, chosen.model)  # type: ignore[arg-type]
+    return [str(path)]
+
+
+_SUFFIXES: dict[str, tuple[type, ...]] = {
+    ".npz": (Linear, FeedforwardReLU, GaussianProcessModel),
+    ".onnx": (Linear, FeedforwardReLU),
+    ".toml": (Parametric,),
+}
+"""The models that a file of each suffix can hold."""
+
+
+def _most_accurate(report: FitReport, path: Path) -> FittedModel:
+    """Return the most accurate of the models that a file can hold."""
+    for one in report.fitted:
+        if isinstance(one.model, _SUFFIXES[path.suffix]):
+            return one
+    kinds = ", ".join(one.kind for one in report.fitted)
+    raise InputError(f"no model that was learned ({kinds}) can be written to a file that ends in {path.suffix}.")
+
+
+def _print(report: FitReport) -> None:
+    held, own = report.held_out, report.learned_from
+    out.say(
+        f"learned from {own.steps} steps of {len(own.runs)} recordings; errors on {held.steps} steps of "
+        f"{len(held.runs)} others"
+    )
+    table = Table(box=None, pad_edge=False)
+    for name in ("model", "state"):
+        table.add_column(name)
+    for name in ("steps", "rms error", "of the change"):
+        table.add_column(name, justify="right")
+    for one in report.fitted:
+        for error in sorted(one.errors, key=lambda error: list(held.states).index(error.state)):
+            rms = f"{error.rms:.3g} {error.unit}".rstrip()
+            cells = (one.kind, error.state, str(error.steps), rms, f"{100 * error.relative:.3g} %")
+            table.add_row(*map(line, cells))
+    print_titled("error on held-out recordings", table)
+    for one in report.fitted:
+        for parameter in one.parameters:
+            note = f"; {parameter.note}" if parameter.note else ""
+            between = f"between {parameter.low:.6g} and {parameter.high:.6g} with confidence 0.95{note}"
+            out.say((parameter.name, "bold"), f" = {parameter.value:.6g}, {between}")
+        for note in one.notes:
+            out.say((f"{one.kind}: ", "bold"), note, wrap=True)
+    for failure in report.failed:
+        err.say((f"{failure.kind}: ", "yellow"), shortened(failure.reason))

@@ -1,0 +1,47 @@
+"""A model from what a command line names: a file, an experiment, ``module:attr`` or a name of the registry."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ctxval.config.parts import part
+from ctxval.config.settings import read_settings
+from ctxval.core.model import Model, as_model
+from ctxval.errors import InputError
+from ctxval.models import REGISTRY, read_model
+
+
+def named_model(text: str, options: Mapping[str, Any]) -> Model:
+    """Return a model.
+
+    Args:
+        text: an ONNX file; an NPZ file that ``ctxval fit`` wrote, or one with the matrices ``A`` and ``B`` of a
+            linear model; an experiment file, whose model is meant; ``module:attr`` of a model, or of a class or
+            function that makes one, whose code is run; or a name of the registry, such as ``Linear``.
+        options: the arguments of the model.
+
+    Raises:
+        InputError: if there is no such model, or it cannot be made.
+    """
+    path = Path(text)
+    if path.suffix == ".toml":
+        _require_no(options, f"the model of {text}")
+        return read_settings(text, {}).load().validation.model
+    if path.suffix == ".onnx":
+        return as_model(part("model", {"type": "Onnx", "source": text, **options}))
+    if path.suffix == ".npz":
+        _require_no(options, f"the model in {text}")
+        return read_model(path)
+    if ":" not in text and text not in REGISTRY.built_in and text not in REGISTRY.installed:
+        raise InputError(
+            f"a model must be a file that ends in .onnx, .npz or .toml, module:attr, or one of "
+            f"{', '.join(REGISTRY.built_in)}, got {text!r}."
+        )
+    return as_model(part("model", {"type": text, **options}))
+
+
+def _require_no(options: Mapping[str, Any], what: str) -> None:
+    if options:
+        raise InputError(f"{what} takes no options, got {', '.join(options)}.")

@@ -1,0 +1,73 @@
+"""The reader of each kind of log, by the suffix of a file or the content of a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ctxval.data.log import Log
+from ctxval.data.matlab import read_mat
+from ctxval.data.messages import read_bag, read_mcap
+from ctxval.data.parquet import read_lerobot, read_parquet
+from ctxval.data.tables import read_csv, read_npz
+from ctxval.errors import InputError
+
+READERS: dict[str, Callable[[Path], list[Log]]] = {
+    ".csv": read_csv,
+    ".npz": read_npz,
+    ".mat": read_mat,
+    ".parquet": read_parquet,
+    ".mcap": read_mcap,
+    ".db3": read_bag,
+}
+"""The reader of each suffix."""
+
+
+def read_logs(paths: Sequence[str | Path]) -> list[Log]:
+    """Return the logs in files and folders; nothing in them is ever run.
+
+    A folder is a ROS 2 bag if it has a file ``metadata.yaml``, a LeRobot data set if it has ``meta/info.json``, and
+    otherwise all logs in it are read, in the order of their names.
+
+    Raises:
+        InputError: if there is no such file, if it has another suffix, or if it cannot be read.
+    """
+    logs = [log for path in paths for log in _logs(Path(path))]
+    if not logs:
+        raise InputError("there is no log: give at least one file or folder.")
+    return logs
+
+
+def is_log(path: Path) -> bool:
+    """Return whether a path can only be a log of a program: no CSV or NPZ file, and no plain folder."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file() or is_lerobot(path)
+    return path.suffix.lower() in READERS and path.suffix.lower() not in (".csv", ".npz")
+
+
+def is_lerobot(path: Path) -> bool:
+    """Return whether a folder is a LeRobot data set."""
+    return (path / "meta" / "info.json").is_file()
+
+
+def _logs(path: Path) -> list[Log]:
+    if path.is_dir():
+        if (path / "metadata.yaml").is_file():
+            return read_bag(path)
+        if is_lerobot(path):
+            return read_lerobot(path)
+        found = [one for one in sorted(path.iterdir()) if one.suffix.lower() in READERS]
+        if not found:
+            raise InputError(f"the folder {path} has no log: {_KINDS}.")
+        return [log for one in found for log in _logs(one)]
+    if not path.exists():
+        raise InputError(f"there is no file {path}.")
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"{path} is not a log that can be read: {_KINDS}.")
+    return reader(path)
+
+
+_KINDS = (
+    f"files must end in {', '.join(READERS)}, and folders must be ROS 2 bags or LeRobot data sets or contain such files"
+)

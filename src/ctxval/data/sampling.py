@@ -1,0 +1,244 @@
+"""Resampling to equal steps: states are interpolated, inputs are held, and nothing is bridged over a gap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Mask
+from ctxval._util.representation import record
+from ctxval.core.trajectory import Trajectory
+from ctxval.errors import InputError
+
+_LONGEST = 1.5
+"""Longest time between two samples without a gap, in median periods of the field."""
+_SLACK = 1e-3
+"""A sample within this share of a period of a wanted time belongs to it, because times are rounded."""
+_MOST_STEPS = 20_000_000
+"""Largest number of steps of one recording."""
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Break:
+    """A place at which a log was split.
+
+    Attributes:
+        source: the file, and the episode in it.
+        time: the time of the last sample before it in the log, seconds.
+        seconds: the time that is left out; 0 if the times go back.
+        field: the name of the state or input.
+        reason: what is missing.
+    """
+
+    source: str
+    time: float
+    seconds: float
+    field: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.source}, {self.time:g} s: {self.field} {self.reason}"
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """One state or input over time, in the unit of the model.
+
+    Attributes:
+        name, unit: its name and its unit.
+        of_input: whether it is an input, which is held between samples; a state is interpolated.
+        times, values: its samples, shape ``(N,)``; NaN where there is no value.
+        angle: whether it is an angle that is continued over turns.
+        held: whether a value holds until the next one, however long that takes.
+        path: its field in the log.
+        place: what counts its samples in messages, and the number of the first one.
+    """
+
+    name: str
+    unit: str
+    of_input: bool
+    times: Array
+    values: Array
+    angle: bool = False
+    held: bool = False
+    path: str = ""
+    place: tuple[str, int] = ("row", 0)
+
+    @property
+    def period(self) -> float:
+        """The median time between two samples, seconds; 0 if there are fewer than two."""
+        steps = np.diff(self.times)
+        steps = steps[steps > 0]
+        return float(np.median(steps)) if len(steps) else 0.0
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def sampled(
+    source: str, channels: Sequence[Channel], dt: float, delay: float, longest_gap: float | None
+) -> tuple[list[tuple[float, Trajectory]], list[Break]]:
+    """Return the parts of a log in which all channels have values, at equal steps, and where it was split.
+
+    Args:
+        source: the file, and the episode in it, for messages.
+        channels: the states and inputs.
+        dt: length of a step, seconds.
+        delay: seconds between the time at which an input is logged and the time from which it acts.
+        longest_gap: longest time between two samples without a gap; None for 1.5 median periods.
+
+    Returns:
+        The start of each part in seconds with its trajectory, and the breaks.
+
+    Raises:
+        InputError: if a part has too many steps.
+    """
+    parts: list[tuple[float, Trajectory]] = []
+    breaks: list[Break] = []
+    for pieces in _forward_pieces(source, channels, breaks):
+        moved = [_moved(one, delay) if one.of_input else one for one in pieces]
+        common: list[Interval] = [(-np.inf, np.inf)]
+        for one in moved:
+            common = _intersection(common, _intervals(source, one, longest_gap, breaks))
+        for interval in common:
+            made = _part(source, moved, interval, dt)
+            if made is not None:
+                parts.append(made)
+            elif np.isfinite(interval).all():
+                length = interval[1] - interval[0]
+                breaks.append(Break(source, interval[0], length, "a part", f"of {length:.3g} s is shorter than a step"))
+    return parts, breaks
+
+
+def _forward_pieces(source: str, channels: Sequence[Channel], breaks: list[Break]) -> list[list[Channel]]:
+    """Return the channels in pieces in which times increase; channels with times of their own must increase."""
+    ends = np.flatnonzero(np.diff(channels[0].times) <= 0)
+    together = all(one.times is channels[0].times or np.array_equal(one.times, channels[0].times) for one in channels)
+    if not together:
+        for one in channels:
+            _require_forward(source, one)
+        return [list(channels)]
+    bounds = [0, *(ends + 1).tolist(), len(channels[0].times)]
+    for end in ends.tolist():
+        word, first = channels[0].place
+        reason = f"go back from {channels[0].times[end]:g} s to {channels[0].times[end + 1]:g} s at {word}"
+        breaks.append(Break(source, float(channels[0].times[end]), 0.0, "times", f"{reason} {first + end + 1}"))
+    return [[_between(one, start, stop) for one in channels] for start, stop in pairwise(bounds)]
+
+
+def _require_forward(source: str, channel: Channel) -> None:
+    back = np.flatnonzero(np.diff(channel.times) <= 0)
+    if len(back):
+        k, (word, first) = int(back[0]), channel.place
+        raise InputError(
+            f"{source}, {word} {first + k + 1} of {channel.path}: its time must be after that of the one before, "
+            f"{channel.times[k]:.9g} s, got {channel.times[k + 1]:.9g} s."
+        )
+
+
+def _between(channel: Channel, start: int, stop: int) -> Channel:
+    return _replaced(channel, channel.times[start:stop], channel.values[start:stop], start)
+
+
+def _moved(channel: Channel, delay: float) -> Channel:
+    return _replaced(channel, channel.times + delay, channel.values, 0)
+
+
+def _replaced(channel: Channel, times: Array, values: Array, skipped: int) -> Channel:
+    word, first = channel.place
+    return Channel(
+        *(channel.name, channel.unit, channel.of_input, times, values),
+        *(channel.angle, channel.held, channel.path, (word, first + skipped)),
+    )
+
+
+def _intervals(source: str, channel: Channel, longest_gap: float | None, breaks: list[Break]) -> list[Interval]:
+    """Return the intervals of time in which a channel has a value; what lies between them is added to the breaks."""
+    times, good = channel.times, np.isfinite(channel.values)
+    if not good.any():
+        if len(times):
+            breaks.append(Break(source, float(times[0]), float(np.ptp(times)), channel.name, "has no value"))
+        return []
+    period = channel.period
+    if channel.held:
+        return [(float(times[good][0]), np.inf)]
+    # The input of the last row of a trajectory is not needed.
+    _report_missing(source, channel, good, breaks)
+    longest = _LONGEST * period if longest_gap is None else longest_gap
+    kept = times[good]
+    rows = np.flatnonzero(good)
+    cut = (np.diff(rows) > 1) | (np.diff(kept) > longest * (1 + 1e-9))
+    for k in np.flatnonzero(cut & (np.diff(rows) == 1)).tolist():
+        gap = float(kept[k + 1] - kept[k])
+        breaks.append(Break(source, float(kept[k]), gap, channel.name, f"has no sample for {gap:.3g} s"))
+    starts, ends = kept[np.append(True, cut)], kept[np.append(cut, True)]
+    reach = min(period, longest) if channel.of_input else 0.0
+    return [(float(a), float(b) + reach) for a, b in zip(starts, ends, strict=True)]
+
+
+def _report_missing(source: str, channel: Channel, good: Mask, breaks: list[Break]) -> None:
+    """Add each run of samples without a value between two with one to the breaks."""
+    rows = np.flatnonzero(good)
+    word, first = channel.place
+    for before, after in ((int(rows[k]), int(rows[k + 1])) for k in np.flatnonzero(np.diff(rows) > 1)):
+        where = f"{word} {first + before + 1}"
+        if after - before > 2:
+            where = f"{word}s {first + before + 1} to {first + after - 1}"
+        gap = float(channel.times[after] - channel.times[before])
+        breaks.append(Break(source, float(channel.times[before]), gap, channel.name, f"has no value in {where}"))
+
+
+def _intersection(first: list[Interval], second: list[Interval]) -> list[Interval]:
+    found, i, j = list[Interval](), 0, 0
+    while i < len(first) and j < len(second):
+        start, end = max(first[i][0], second[j][0]), min(first[i][1], second[j][1])
+        if start <= end:
+            found.append((start, end))
+        if first[i][1] < second[j][1]:
+            i += 1
+        else:
+            j += 1
+    return found
+
+
+def _part(source: str, channels: Sequence[Channel], interval: Interval, dt: float) -> tuple[float, Trajectory] | None:
+    start, end = interval
+    steps = np.floor((end - start) / dt + 1e-3)
+    if not 1 <= steps < np.inf:
+        return None
+    if steps > _MOST_STEPS:
+        raise InputError(f"{source} has {steps:.3g} steps of {dt:g} s, more than {_MOST_STEPS}: give a larger dt.")
+    times: Array = np.asarray(dt * np.arange(int(steps) + 1), dtype=np.float64)
+    states = [_interpolated(one, start + times) for one in channels if not one.of_input]
+    inputs = [_held(one, start + times[:-1], dt) for one in channels if one.of_input]
+    columns = np.stack(inputs, axis=-1) if inputs else np.empty((int(steps), 0))
+    return start, Trajectory(times, np.stack(states, axis=-1), columns)
+
+
+def _interpolated(channel: Channel, times: Array) -> Array:
+    good = np.isfinite(channel.values)
+    own, values = channel.times[good], channel.values[good]
+    first = max(int(np.searchsorted(own, times[0] + _SLACK * channel.period, side="right")) - 1, 0)
+    last = int(np.searchsorted(own, times[-1] - _SLACK * channel.period)) + 1
+    own, values = own[first:last], values[first:last]
+    if channel.angle:
+        values = np.unwrap(values)
+    found = np.interp(times, own, values)
+    # Times of equal steps differ from recorded ones by rounding; the recorded value is then meant.
+    after = np.clip(np.searchsorted(own, times), 0, len(own) - 1)
+    for row in (after, np.maximum(after - 1, 0)):
+        same = np.abs(own[row] - times) <= _SLACK * channel.period
+        found[same] = values[row][same]
+    return np.asarray(found)
+
+
+def _held(channel: Channel, times: Array, dt: float) -> Array:
+    good = np.isfinite(channel.values)
+    own, values = channel.times[good], channel.values[good]
+    at = np.searchsorted(own, times + _SLACK * dt, side="right") - 1
+    return np.asarray(values[np.maximum(at, 0)])

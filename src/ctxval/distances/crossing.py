@@ -1,0 +1,146 @@
+"""Distances at the events at which a state crosses a level, which M and S may reach at different times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from ctxval._util.arrays import Array, as_finite, vector_norm
+from ctxval._util.registry import part
+from ctxval._util.representation import record
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.distances.base import ErrorNorm, require_indices, turned
+from ctxval.errors import InputError, UnknownNameError
+
+Direction = Literal["up", "down", "either"]
+
+
+@part()
+@dataclass(frozen=True, repr=False)
+class AtCrossing(ErrorNorm):
+    """Largest norm of the difference between the states at which M and S first cross a level, such as a gate.
+
+    The k-th crossing of S is compared with the k-th crossing of M. Between two samples the states are interpolated. A
+    trajectory that does not cross so often is compared at its final state.
+
+    Attributes:
+        norm: order of the norm over the states at one crossing: 1, 2 or infinity.
+        components: indices of the states that are compared; all states by default.
+        state: index of the state that crosses the level.
+        level: the level, in the unit of this state.
+        direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
+        crossings: number of crossings that are compared; only the first one by default.
+        weights, scales, angles: as in :class:`StateNorm`. An angle crosses the level wherever it does on the circle.
+
+    Raises:
+        InputError: if the order of the norm is not 1, 2 or infinity, or another argument cannot be used.
+    """
+
+    norm: float = 2
+    state: int = 0
+    level: float = 0.0
+    direction: Direction = "either"
+    crossings: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_level(self.level, self.direction)
+        if not isinstance(self.crossings, int) or self.crossings < 1:
+            raise InputError(f"crossings must be an integer >= 1, got {self.crossings!r}.")
+
+    def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        """Return the weighted differences at the crossings, one after the other, shape ``(..., crossings k)``."""
+        gap = self.difference(self._states(system_trajectory), self._states(model_trajectory))
+        return np.asarray(gap.reshape(*gap.shape[:-2], -1))
+
+    def compose(self, error: Array) -> Array:
+        """Return the largest norm over the crossings of error vectors ``(..., crossings k)``, shape ``(...)``."""
+        gap = error.reshape(*error.shape[:-1], self.crossings, -1)
+        return np.asarray(vector_norm(gap, self.norm).max(axis=-1))
+
+    def _states(self, trajectory: Trajectory) -> Array:
+        """Return the states at the crossings, shape ``(..., crossings, n)``."""
+        states = trajectory.states
+        require_indices("state", [self.state], states.shape[-1])
+        n = states.shape[-1]
+        on_circle = self.state % n in {index % n for index in self.angles}
+        places = _crossings(states[..., self.state] - self.level, self.direction, self.crossings, on_circle)
+        before = np.minimum(places.astype(np.intp), trajectory.horizon - 1)[..., None]
+        first = np.take_along_axis(states, before, axis=-2)
+        second = np.take_along_axis(states, before + 1, axis=-2)
+        return np.asarray(first + (places[..., None] - before) * self.unwrapped(second - first))
+
+
+@part()
+@dataclass(frozen=True, repr=False)
+class CrossingTime:
+    """Difference in seconds between the times at which M and S first cross a level; interpolated between samples.
+
+    A trajectory that does not cross the level counts as if it crossed it at its end.
+
+    Attributes:
+        state: index of the state that crosses the level.
+        level: the level, in the unit of this state.
+        direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
+        angle: whether the state is an angle in radians, which crosses the level wherever it crosses it on the circle.
+
+    Raises:
+        InputError: if the level is not finite.
+        UnknownNameError: if there is no such direction.
+    """
+
+    state: int = 0
+    level: float = 0.0
+    direction: Direction = "either"
+    angle: bool = False
+
+    def __post_init__(self) -> None:
+        _require_level(self.level, self.direction)
+
+    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        """Return the distance in seconds, shape ``(...)``."""
+        return np.asarray(np.abs(self._place(system_trajectory) - self._place(model_trajectory)) * task.dt)
+
+    def _place(self, trajectory: Trajectory) -> Array:
+        require_indices("state", [self.state], trajectory.states.shape[-1])
+        above = trajectory.states[..., self.state] - self.level
+        return _crossings(above, self.direction, 1, self.angle)[..., 0]
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def _crossings(above: Array, direction: Direction, count: int, on_circle: bool) -> Array:
+    """Return the places of the first crossings of 0, in steps, shape ``(..., count)``; the last step if there is none.
+
+    Args:
+        above: the values at the steps, shape ``(..., H + 1)``.
+        direction: the direction of the crossings.
+        count: number of crossings.
+        on_circle: whether the values are angles, which are the same after a turn.
+    """
+    if on_circle:
+        above = turned(above)
+    first, second = above[..., :-1], above[..., 1:]
+    up, down = (first < 0) & (second >= 0), (first > 0) & (second <= 0)
+    crossed = {"up": up, "down": down, "either": up | down}[direction]
+    if on_circle:
+        crossed &= np.abs(second - first) < np.pi  # a larger step passes the opposite point of the circle
+    with np.errstate(all="ignore"):
+        places = np.arange(first.shape[-1]) + first / (first - second)
+    numbers = np.cumsum(crossed, axis=-1)
+    found = []
+    for number in range(1, count + 1):
+        at = crossed & (numbers == number)
+        place = np.take_along_axis(places, at.argmax(axis=-1)[..., None], axis=-1)[..., 0]
+        found.append(np.where(at.any(axis=-1), place, float(first.shape[-1])))
+    return np.stack(found, axis=-1)
+
+
+def _require_level(level: float, direction: str) -> None:
+    as_finite("level", level)
+    if direction not in get_args(Direction):
+        raise UnknownNameError.among("direction", str(direction), get_args(Direction))

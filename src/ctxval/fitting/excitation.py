@@ -1,0 +1,151 @@
+"""Executions that teach a model: a signal is added to the inputs of the controllers of random tasks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from ctxval._util.arrays import Array, ArrayLike, as_finite
+from ctxval._util.representation import call
+from ctxval.core.controller import Controller, Limits
+from ctxval.core.plan import Plan
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.validation import Validation
+from ctxval.errors import InputError, ShapeError, UnknownNameError
+
+SignalKind = Literal["random", "multisine", "chirp"]
+
+_HELD = 4
+"""Number of steps for which a random value is held."""
+_SINES = 12
+"""Largest number of sines in a multisine."""
+_FASTEST = 0.1
+"""Highest frequency, in cycles per step."""
+_DRAWN = 20
+"""Number of sets of random phases, of which that with the smallest peak is used."""
+
+
+def excitation(kind: SignalKind, horizon: int, amplitude: ArrayLike, rng: np.random.Generator) -> Array:
+    """Return a signal for each input, shape ``(H, m)``, with magnitudes up to the amplitude.
+
+    ``random`` holds uniform values for four steps. ``multisine`` is a sum of sines of equally spaced frequencies with
+    random phases, of which those with a small peak are used. ``chirp`` is a sine of growing frequency. The highest
+    frequency is a tenth of a cycle per step.
+
+    Args:
+        kind: the kind of signal.
+        horizon: number of steps H.
+        amplitude: the largest magnitude for each input, shape ``(m,)``.
+        rng: the source of the random numbers.
+
+    Raises:
+        UnknownNameError: if there is no such kind.
+        InputError: if an amplitude is negative or not finite.
+    """
+    if kind not in get_args(SignalKind):
+        raise UnknownNameError.among("kind of excitation", str(kind), get_args(SignalKind))
+    sizes = np.atleast_1d(as_finite("amplitude", amplitude))
+    if sizes.ndim != 1 or (sizes < 0).any() or not sizes.any():
+        raise InputError(f"amplitude must be numbers >= 0, not all of them 0, got {np.asarray(amplitude).tolist()}.")
+    makers = {"random": _random, "multisine": _multisine, "chirp": _chirp}
+    return np.stack([size * makers[kind](horizon, rng) for size in sizes], axis=-1)
+
+
+def _random(horizon: int, rng: np.random.Generator) -> Array:
+    return np.asarray(np.repeat(rng.uniform(-1, 1, -(-horizon // _HELD)), _HELD)[:horizon])
+
+
+def _multisine(horizon: int, rng: np.random.Generator) -> Array:
+    cycles = np.unique(np.linspace(1, max(1, _FASTEST * horizon), _SINES).round())
+    t = np.arange(horizon)[:, None] / horizon
+    waves = [np.sin(2 * np.pi * (cycles * t + rng.uniform(size=len(cycles)))).sum(axis=1) for _ in range(_DRAWN)]
+    best = min(waves, key=lambda wave: float(np.abs(wave).max()))
+    return np.asarray(best / max(float(np.abs(best).max()), 1e-12))
+
+
+def _chirp(horizon: int, rng: np.random.Generator) -> Array:
+    t = np.arange(horizon)
+    first = min(1 / horizon, _FASTEST)
+    turns = first * t + 0.5 * (_FASTEST - first) * t**2 / horizon
+    return np.asarray(np.sin(2 * np.pi * (turns + rng.uniform())))
+
+
+@dataclass(frozen=True, eq=False)
+class Excited:
+    """A controller with a signal added to its inputs, within limits.
+
+    Attributes:
+        controller: the controller.
+        signal: the signal, shape ``(H, m)``.
+        limits: the limits of the sum.
+    """
+
+    controller: Controller
+    signal: Array
+    limits: Limits
+
+    def __call__(self, t: int, x: Array) -> Array:
+        """Return the input at step t, shape ``(..., m)``."""
+        whole = np.asarray(self.controller(t, x)) + self.signal[t]
+        return np.asarray(np.clip(whole, self.limits.low, self.limits.high))
+
+    def __repr__(self) -> str:
+        return call(self, self.controller, signal=self.signal)
+
+
+class Excitation:
+    """Executes random tasks of an experiment with a signal that is added to the inputs.
+
+    Run k depends only on the seed and on k.
+
+    Args:
+        validation: the map p -> d(p), whose system is executed.
+        kind: the kind of signal.
+        amplitude: the largest magnitude of the signal for each input, shape ``(m,)``, or a number.
+        limits: the limits of the inputs; by default those of the controllers.
+        seed: the seed.
+
+    Raises:
+        UnknownNameError: if there is no such kind.
+        InputError: if the system is operated by people, or there are no limits.
+        ShapeError: if the number of amplitudes is not that of the inputs.
+    """
+
+    def __init__(
+        self, validation: Validation, kind: SignalKind, amplitude: ArrayLike, limits: Any = None, seed: int = 0
+    ) -> None:
+        if getattr(validation.system, "manual", False):
+            raise InputError("people execute the tasks of this system, so it cannot be run here.")
+        self.validation, self.kind, self.seed = validation, kind, seed
+        plan = self.plan(0)
+        m = plan.model_trajectory.inputs.shape[-1]
+        sizes = np.atleast_1d(as_finite("amplitude", amplitude))
+        if sizes.shape not in ((1,), (m,)):
+            raise ShapeError(f"amplitude must be one number for each of {m} inputs, got {sizes.tolist()}.")
+        self.amplitude: Array = np.broadcast_to(sizes, (m,))
+        excitation(kind, 2, self.amplitude, np.random.default_rng(0))
+        own = getattr(plan.controller, "limits", None) if limits is None else limits
+        if own is None:
+            raise InputError("the controllers have no limits: give the limits within which the inputs must stay.")
+        self.limits = Limits.of(own, m)
+
+    def plan(self, number: int) -> Plan:
+        """Return the plan of a run: a random task."""
+        space = self.validation.space
+        return self.validation.plan(space.iid(1, np.random.default_rng([self.seed, number, 0]))[0])
+
+    def run(self, number: int) -> Trajectory:
+        """Execute S once and return its trajectory.
+
+        Raises:
+            ExecutionError: if the execution fails; the message gives the reason.
+        """
+        plan = self.plan(number)
+        signal = excitation(self.kind, plan.task.horizon, self.amplitude, np.random.default_rng([self.seed, number, 1]))
+        excited = Excited(plan.controller, signal, self.limits)
+        return self.validation.execute(Plan(plan.parameters, plan.task, excited, plan.model_trajectory))
+
+    def __repr__(self) -> str:
+        return call(self, self.validation, self.kind, amplitude=self.amplitude)

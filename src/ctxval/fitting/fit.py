@@ -1,0 +1,266 @@
+"""``fit``: models that are learned from recordings, each with its errors on recordings that were held out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.representation import call, counted, record
+from ctxval.core.model import Model
+from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.data.recordings import Recording, Recordings
+from ctxval.errors import InputError, UnknownNameError
+from ctxval.fitting.least_squares import FittedParameter, as_bounds, fit_parameters
+from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear
+from ctxval.models.parametric import ParametricStep
+from ctxval.replay.accuracy import StepError, step_errors
+from ctxval.replay.steps import RecordedSteps
+
+Kind = Literal["linear", "network", "gaussian-process", "parameters"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+STEPS = (1, 20)
+"""Numbers of steps after which the held-out errors are computed, unless others are given."""
+HOLD_OUT = 0.25
+"""Share of the recordings that is held out, unless another one is given."""
+
+_UNITS = (32, 32)
+"""Numbers of units in the hidden layers of the network."""
+_POINTS = 400
+"""Number of transitions that the Gaussian process is conditioned on."""
+_MOST = 20_000
+"""Largest number of transitions that a network is trained on; of more, every second, third, ... one is."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedModel:
+    """A model that was learned from recordings.
+
+    Attributes:
+        kind: its kind.
+        model: the model, with the transitions that it was learned from.
+        errors: its errors on the held-out recordings.
+        parameters: the parameters of the user's function; none for other kinds.
+        notes: sentences on the fit, such as how well the recordings determine a linear model.
+    """
+
+    kind: Kind
+    model: Model
+    errors: tuple[StepError, ...]
+    parameters: tuple[FittedParameter, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def relative(self) -> float:
+        """The largest one-step error of a state on held-out recordings, as a share of its recorded change."""
+        return max((one.relative for one in self.errors if one.steps == 1), default=float("inf"))
+
+    def __repr__(self) -> str:
+        return call(self, self.kind, self.model, relative=self.relative)
+
+
+@dataclass(frozen=True)
+class FailedFit:
+    """A kind of model that could not be learned from recordings.
+
+    Attributes:
+        kind: the kind.
+        reason: why.
+    """
+
+    kind: Kind
+    reason: str
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True, eq=False)
+class FitReport:
+    """Models that were learned from the same recordings, with their errors on the same held-out recordings.
+
+    Attributes:
+        fitted: the models, the most accurate first: that with the smallest error after the largest number of steps.
+        failed: the kinds that could not be learned.
+        learned_from, held_out: the recordings that models were learned from, and those that were held out.
+    """
+
+    fitted: tuple[FittedModel, ...]
+    failed: tuple[FailedFit, ...]
+    learned_from: Recordings
+    held_out: Recordings
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all results but the models as plain values; numbers that are not finite are None."""
+        found = [
+            {
+                "kind": one.kind,
+                "errors": [{**asdict(error), "relative": error.relative} for error in one.errors],
+                "parameters": [asdict(parameter) for parameter in one.parameters],
+                "notes": list(one.notes),
+            }
+            for one in self.fitted
+        ]
+        sizes = {"recordings": len(self.learned_from.runs), "steps": self.learned_from.steps}
+        held = {"recordings": len(self.held_out.runs), "steps": self.held_out.steps}
+        failed = [asdict(one) for one in self.failed]
+        report = {"fitted": found, "failed": failed, "learned_from": sizes, "held_out": held}
+        return {**_plain(report), "dt": self.held_out.dt, "notes": list(self.held_out.notes)}
+
+    def __repr__(self) -> str:
+        return call(self, [one.kind for one in self.fitted], failed=[one.kind for one in self.failed])
+
+
+def fit(
+    recordings: Recordings,
+    kinds: Sequence[Kind] = KINDS[:3],
+    *,
+    step: ParametricStep | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    vectorized: bool = False,
+    hold_out: float = HOLD_OUT,
+    steps: Sequence[int] = STEPS,
+    seed: int = 0,
+) -> FitReport:
+    """Learn models from recordings; a part of the recordings is held out and never learned from.
+
+    Args:
+        recordings: the recordings.
+        kinds: the kinds of models.
+        step: the user's function ``(x, u, theta) -> x_next``, for the kind ``parameters``.
+        bounds: the bounds of its parameters by name.
+        vectorized: whether this function takes whole batches.
+        hold_out: the share of the recordings that is held out; of a single recording, its last part.
+        steps: numbers of steps after which errors are computed.
+        seed: seed of all random numbers.
+
+    Raises:
+        UnknownNameError: if there is no such kind.
+        InputError: if no kind is given, if too little is recorded, or if ``step`` or ``bounds`` is missing.
+    """
+    for kind in kinds:
+        if kind not in KINDS:
+            raise UnknownNameError.among("kind of model", str(kind), KINDS)
+    if not kinds:
+        raise InputError(f"at least one kind of model is needed: {', '.join(KINDS)}.")
+    if "parameters" in kinds:
+        if step is None or not bounds:
+            raise InputError("the kind 'parameters' needs a function (x, u, theta) -> x_next and the bounds of theta.")
+        as_bounds(bounds)
+    learned_from, held_out = split(recordings, hold_out, seed)
+    data, _ = learned_from.transitions()
+
+    def parameters() -> tuple[Model, tuple[FittedParameter, ...], tuple[str, ...]]:
+        model, found = fit_parameters(step, bounds, data, vectorized=vectorized, seed=seed)  # type: ignore[arg-type]
+        return model, found, ()
+
+    makers: dict[Kind, Callable[[], tuple[Model, tuple[FittedParameter, ...], tuple[str, ...]]]] = {
+        "linear": lambda: _linear(data, learned_from),
+        "network": lambda: (FeedforwardReLU.fit(_some(data), _UNITS, seed=seed, restarts=2), (), ()),
+        "gaussian-process": lambda: (GaussianProcessModel.fit(data, _POINTS, seed=seed), (), ()),
+        "parameters": parameters,
+    }
+    fitted: list[FittedModel] = []
+    failed: list[FailedFit] = []
+    recorded = RecordedSteps(held_out, range(len(held_out.runs)))
+    for kind in dict.fromkeys(kinds):
+        try:
+            with single_threaded():
+                model, found, notes = makers[kind]()
+                errors = step_errors(model, recorded, sorted(set(steps)))
+        except InputError as error:
+            failed.append(FailedFit(kind, str(error)))
+            continue
+        fitted.append(FittedModel(kind, model, errors, found, notes))
+    return FitReport(tuple(sorted(fitted, key=_rank)), tuple(failed), learned_from, held_out)
+
+
+def _rank(one: FittedModel) -> float:
+    last = max((error.steps for error in one.errors), default=0)
+    found = max((error.relative for error in one.errors if error.steps == last), default=np.inf)
+    return found if np.isfinite(found) else np.inf
+
+
+def split(recordings: Recordings, share: float, seed: int) -> tuple[Recordings, Recordings]:
+    """Return the recordings to learn from, and those that are held out.
+
+    Whole recordings are held out, drawn at random. Of a single recording, the last part is held out.
+
+    Raises:
+        InputError: if the share is not between 0 and 1, or too little is recorded.
+    """
+    if not isinstance(share, int | float) or not 0 < share < 1:
+        raise InputError(f"the share that is held out must be between 0 and 1, got {share!r}.")
+    runs = recordings.runs
+    if len(runs) == 1:
+        horizon = runs[0].trajectory.horizon
+        cut = round((1 - share) * horizon)
+        if not 1 <= cut < horizon:
+            raise InputError(f"the only recording has {counted(horizon, 'step')}: too few to hold a part out.")
+        parts = [_part(runs[0], 0, cut), _part(runs[0], cut, horizon)]
+        return replace(recordings, runs=(parts[0],)), replace(recordings, runs=(parts[1],))
+    count = min(max(1, round(share * len(runs))), len(runs) - 1)
+    chosen = set(np.random.default_rng(seed).permutation(len(runs))[:count].tolist())
+    kept = tuple(run for number, run in enumerate(runs) if number not in chosen)
+    return replace(recordings, runs=kept), replace(recordings, runs=tuple(runs[number] for number in sorted(chosen)))
+
+
+def _part(run: Recording, first: int, last: int) -> Recording:
+    one = run.trajectory
+    times: Array = one.times[first : last + 1] - one.times[first]
+    part = Trajectory(times, one.states[first : last + 1], one.inputs[first:last])
+    return Recording(run.source, run.start + float(one.times[first]), part)
+
+
+def _some(data: Transitions) -> Transitions:
+    every = max(1, -(-len(data) // _MOST))
+    return Transitions(data.x[::every], data.u[::every], data.x_next[::every])
+
+
+def _linear(data: Transitions, recordings: Recordings) -> tuple[Model, tuple[FittedParameter, ...], tuple[str, ...]]:
+    model = Linear.fit(data)
+    return model, (), tuple(identifiability(data, [*recordings.states, *recordings.inputs]))
+
+
+_WEAK = 30.0
+"""Ratio of the standard deviations of coefficients with and without the others, from which a regressor is named."""
+
+
+def identifiability(data: Transitions, names: Sequence[str]) -> list[str]:
+    """Return sentences on how well transitions determine a linear model: the variance inflation of each regressor.
+
+    Args:
+        data: the recorded transitions.
+        names: the names of the states and inputs.
+    """
+    Z = np.concatenate([data.x, data.u], axis=1)
+    deviations = Z.std(axis=0)
+    still = [name for name, size in zip(names, deviations, strict=True) if size <= 0]
+    if still:
+        return [f"{', '.join(still)} never changes, so its coefficients are not determined"]
+    correlation = np.corrcoef(Z, rowvar=False).reshape(len(names), -1)
+    inflation = np.sqrt(np.diag(np.linalg.pinv(correlation)))
+    weak = [name for name, ratio in zip(names, inflation, strict=True) if ratio > _WEAK]
+    worst = float(inflation.max())
+    if weak:
+        return [
+            f"{' and '.join(weak)} nearly depend on each other in these recordings: the standard errors of their "
+            f"coefficients are up to {worst:.2g} times those of independent excitation"
+        ]
+    return [
+        f"all states and inputs vary independently enough: standard errors of coefficients are at most {worst:.2g} "
+        "times those of independent excitation"
+    ]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    return value

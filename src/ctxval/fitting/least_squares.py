@@ -1,0 +1,183 @@
+"""Parameters of a user's own model by least squares, with bounds and confidence intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import t as student
+
+from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.representation import record
+from ctxval._util.texts import reason_of
+from ctxval.core.trajectory import Transitions
+from ctxval.errors import CtxvalError, InputError, ModelError
+from ctxval.models import Parametric
+from ctxval.models.parametric import ParametricStep
+
+_STARTS = 8
+"""Number of starting points, of which the first is the middle of the bounds."""
+_MOST = 4000
+"""Largest number of transitions that are used; of more, every second, third, ... one is."""
+_AT_BOUND = 1e-4
+"""Share of the width of the bounds within which a value counts as at a bound."""
+_CONDITION = 1e8
+"""Largest condition number of the scaled Jacobian; beyond it the data do not determine all parameters."""
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """One parameter of a model.
+
+    Attributes:
+        name: its name.
+        value: the estimate.
+        low, high: the confidence interval; infinite if the recordings do not determine the parameter.
+        note: what is unusual: the value is at a bound, or depends on others; empty otherwise.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+    note: str = ""
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def fit_parameters(
+    step: ParametricStep,
+    bounds: Mapping[str, tuple[float, float]],
+    data: Transitions,
+    *,
+    vectorized: bool = False,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> tuple[Parametric, tuple[FittedParameter, ...]]:
+    """Return a model with the parameters of least squared one-step errors, and their confidence intervals.
+
+    The errors of each state are divided by their size at the estimate, so that states of different units count alike
+    (two rounds). The intervals assume that the model is right and that the errors of the steps are independent. Noise
+    of the measured states biases the estimate.
+
+    Args:
+        step: the user's function ``(x, u, theta) -> x_next``.
+        bounds: the lower and upper bound of each parameter by name, in the order of theta.
+        data: the recorded transitions.
+        vectorized: whether ``step`` takes whole batches.
+        confidence: the confidence of each interval.
+        seed: seed of the starting points.
+
+    Raises:
+        InputError: if bounds or data cannot be used.
+        ModelError: if the function fails on the recorded states.
+    """
+    low, high = as_bounds(bounds)
+    every = max(1, -(-len(data) // _MOST))
+    some = Transitions(data.x[::every], data.u[::every], data.x_next[::every])
+    if some.x.size <= len(low):
+        raise InputError(f"{len(low)} parameters need more than {some.x.size} recorded numbers.")
+    problem = _Problem(step, list(bounds), some, vectorized)
+    sizes = np.maximum((some.x_next - some.x).std(axis=0), 1e-12)
+    with single_threaded():
+        theta = _best(problem, low, high, sizes, seed)
+        left = problem.errors(theta)
+        sizes = np.maximum(np.sqrt((left**2).mean(axis=0)), 1e-9 * sizes)
+        found = least_squares(
+            lambda p: (problem.errors(p) / sizes).ravel(), theta, bounds=(low, high), x_scale=high - low
+        )
+    intervals = _intervals(list(bounds), found.x, found.jac, found.fun, (low, high), confidence)
+    return Parametric(step, dict(zip(bounds, found.x, strict=True)), vectorized=vectorized, data=data), intervals
+
+
+def as_bounds(bounds: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
+    """Return the lower and the upper bounds of parameters, shapes ``(p,)``.
+
+    Raises:
+        InputError: if there is none, or one is not two numbers with the lower one first.
+    """
+    if not bounds:
+        raise InputError("at least one parameter with its bounds is needed, such as mass = [0.5, 2.0].")
+    for name, pair in bounds.items():
+        valid = isinstance(pair, Sequence) and not isinstance(pair, str) and len(pair) == 2
+        if not valid or not all(isinstance(b, int | float) and np.isfinite(b) for b in pair) or pair[0] >= pair[1]:
+            raise InputError(f"the bounds of {name} must be two numbers, the lower one first, got {pair!r}.")
+    ends = np.array([[float(b) for b in pair] for pair in bounds.values()])
+    return ends[:, 0], ends[:, 1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The one-step errors of a model as a function of its parameters."""
+
+    step: ParametricStep
+    names: list[str]
+    data: Transitions
+    vectorized: bool
+
+    def errors(self, theta: Array) -> Array:
+        """Return the errors ``(N, n)``."""
+        model = Parametric(self.step, dict(zip(self.names, theta, strict=True)), vectorized=self.vectorized)
+        try:
+            with np.errstate(all="ignore"):
+                predicted = model.step(self.data.x, self.data.u)
+        except CtxvalError:
+            raise
+        except Exception as error:  # the user's function
+            raise ModelError(f"the model failed on the recordings: {reason_of(error)}.") from error
+        if predicted.shape != self.data.x.shape:
+            raise ModelError(f"the model must return states of shape {self.data.x.shape}, got {predicted.shape}.")
+        # Parameters for which the model diverges are far from the estimate; the search needs finite numbers.
+        return np.nan_to_num(predicted - self.data.x_next, nan=1e6, posinf=1e6, neginf=-1e6).clip(-1e6, 1e6)
+
+
+def _best(problem: _Problem, low: Array, high: Array, sizes: Array, seed: int) -> Array:
+    """Return the parameters of least squared errors from several starting points."""
+    rng = np.random.default_rng(seed)
+    starts = np.concatenate([[0.5 * (low + high)], rng.uniform(low, high, (_STARTS - 1, len(low)))])
+    few = max(1, len(problem.data) // 400)
+    data = problem.data
+    small = _Problem(
+        *(problem.step, problem.names, Transitions(data.x[::few], data.u[::few], data.x_next[::few])),
+        problem.vectorized,
+    )
+    found = [
+        least_squares(lambda p: (small.errors(p) / sizes).ravel(), start, bounds=(low, high), x_scale=high - low)
+        for start in starts
+    ]
+    return np.asarray(min(found, key=lambda one: one.cost).x)
+
+
+def _intervals(
+    names: Sequence[str], theta: Array, J: Array, errors: Array, bounds: tuple[Array, Array], confidence: float
+) -> tuple[FittedParameter, ...]:
+    """Return the confidence intervals of least squares (Seber and Wild 1989, section 5.1)."""
+    width = bounds[1] - bounds[0]
+    _, singular, V = np.linalg.svd(J * width, full_matrices=False)
+    degrees = max(len(errors) - len(theta), 1)
+    variance = float((errors**2).sum()) / degrees
+    weak = V[singular <= singular.max(initial=0.0) / _CONDITION] if singular.max(initial=0.0) > 0 else V
+    undetermined = (np.abs(weak) > 0.1).any(axis=0) if len(weak) else np.zeros(len(theta), dtype=bool)
+    with np.errstate(all="ignore"):
+        deviations = width * np.sqrt(variance * ((V / singular[:, None]) ** 2).sum(axis=0))
+    reach = np.where(undetermined, np.inf, deviations * student.ppf(0.5 + confidence / 2, degrees))
+    found = []
+    for i, name in enumerate(names):
+        at = [
+            end for end, value in (("lower", bounds[0][i]), ("upper", bounds[1][i])) if _near(theta[i], value, width[i])
+        ]
+        others = [names[j] for j in np.flatnonzero(undetermined).tolist() if j != i]
+        note = f"at its {at[0]} bound" if at else ""
+        if undetermined[i]:
+            note = f"not determined together with {', '.join(others)}" if others else "not determined"
+        found.append(
+            FittedParameter(name, float(theta[i]), float(theta[i] - reach[i]), float(theta[i] + reach[i]), note)
+        )
+    return tuple(found)
+
+
+def _near(value: float, bound: float, width: float) -> bool:
+    return bool(abs(value - bound) <= _AT_BOUND * width)

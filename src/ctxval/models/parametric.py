@@ -1,0 +1,62 @@
+"""A model with named parameters: a user's own function of state, input and parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array, as_finite
+from ctxval._util.registry import part
+from ctxval._util.representation import call
+from ctxval.core.model import Function
+from ctxval.core.trajectory import Transitions
+from ctxval.errors import InputError
+
+ParametricStep = Callable[[Array, Array, Array], Array]
+
+
+@part(functions={"step": "(x, u, theta) -> x_next"})
+class Parametric:
+    """A function ``(x, u, theta) -> x_next`` with the values of its parameters theta as a model.
+
+    Args:
+        step: a function of one state ``(n,)``, one input ``(m,)`` and the parameters ``(p,)``.
+        theta: the values of the parameters by name, in the order of theta.
+        vectorized: True if ``step`` takes whole batches ``(..., n)`` and ``(..., m)``.
+        data: the transitions that the parameters were learned from, if any.
+
+    Raises:
+        InputError: if ``step`` is not a function, or a value is not finite.
+    """
+
+    def __init__(
+        self,
+        step: ParametricStep,
+        theta: Mapping[str, float],
+        *,
+        vectorized: bool = False,
+        data: Transitions | None = None,
+    ) -> None:
+        if not callable(step):
+            raise InputError(f"step must be a function (x, u, theta) -> x_next, got {step!r}.")
+        if not isinstance(theta, Mapping) or not theta:
+            raise InputError(f"theta must be a table of parameters by name, got {theta!r}.")
+        self.function = step
+        self.theta = {str(name): float(as_finite(f"theta[{name}]", value)) for name, value in theta.items()}
+        self.vectorized = vectorized
+        self.data = data
+        values = np.array(list(self.theta.values()))
+        self._step = Function(lambda x, u: step(x, u, values), vectorized=vectorized)
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
+        return self._step.step(x, u)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this model in a store."""
+        return {"step": self.function, "theta": self.theta}
+
+    def __repr__(self) -> str:
+        return call(self, self.function, theta=self.theta, transitions=None if self.data is None else len(self.data))

@@ -1,0 +1,21 @@
+"""Replay of recordings on a model: errors, their causes, and what the recordings predict of the tasks."""
+
+from __future__ import annotations
+
+from ctxval.replay.accuracy import Region, StepError
+from ctxval.replay.explained import ResidualShare
+from ctxval.replay.report import RecordedData, ReplayReport, replay
+from ctxval.replay.timing import Suggestion
+from ctxval.replay.untested import PredictedTask, PredictedTasks
+
+__all__ = [
+    "PredictedTask",
+    "PredictedTasks",
+    "RecordedData",
+    "Region",
+    "ReplayReport",
+    "ResidualShare",
+    "StepError",
+    "Suggestion",
+    "replay",
+]

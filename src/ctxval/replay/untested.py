@@ -1,0 +1,184 @@
+"""What recordings predict of the tasks of an experiment: the worst ones, a bound, and which executions tell most."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.boxes import separated_rows
+from ctxval._util.representation import call, record
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.validation import Validation
+from ctxval.learning import DynamicsStudy, LearnedDynamics
+from ctxval.learning.worst_case import WorstCase, loop_pairs
+
+_WORST = 5
+"""Number of tasks with large predicted distances that are listed."""
+_RANDOM = 96
+"""Number of random tasks among those from which executions are chosen."""
+_CANDIDATES = 192
+"""Largest number of these tasks."""
+_PAIRS = 700
+"""Number of state-input pairs from which the pivots of the draws are chosen."""
+_SAME = 0.02
+"""Least distance of two listed tasks, as a share of the cube's diagonal."""
+_ELSEWHERE = 0.01
+"""Weight of all tasks together, against that of the likely worst ones."""
+_DIVERGED = 10.0
+"""A draw that diverges counts as this many times the 0.95 quantile of the finite distances."""
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedTask:
+    """The predicted distance of one task.
+
+    Attributes:
+        parameters: the task parameters.
+        median, low, high: median, 0.05 and 0.95 quantile of the distance over draws of the dynamics.
+        resolved: for a proposed execution, the share of the variance of the distances of likely worst tasks that it and
+            those before it resolve; None for others.
+    """
+
+    parameters: dict[str, Any]
+    median: float
+    low: float
+    high: float
+    resolved: float | None = None
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedTasks:
+    """What recordings predict of the tasks of an experiment. No execution has tested it.
+
+    Attributes:
+        worst: tasks with large predicted distances, the largest first.
+        median, upper: median and 0.95 quantile of the largest distance over all tasks, over draws of the dynamics.
+        executions: the executions that would tell most of the largest distance, in this order.
+        draws: number of draws of the dynamics.
+        unplanned: share of the tasks for which no controller can be designed, or on which the model diverges.
+        beyond: how far the closed loops of the tasks lead beyond all records of one state or input, as a share of the
+            range that they visit.
+        beyond_of: the index of this state or input; states come before inputs.
+    """
+
+    worst: tuple[PredictedTask, ...]
+    median: float
+    upper: float
+    executions: tuple[PredictedTask, ...]
+    draws: int
+    unplanned: float
+    beyond: float
+    beyond_of: int
+
+    def __repr__(self) -> str:
+        return call(self, median=self.median, upper=self.upper, draws=self.draws)
+
+
+def predicted_tasks(
+    validation: Validation, recorded: Sequence[Trajectory], *, executions: int = 10, seed: int = 0
+) -> PredictedTasks | None:
+    """Return what recordings predict of the tasks of an experiment; S is never executed.
+
+    Returns None if the model explains the recordings, or if no task can be planned.
+
+    Args:
+        validation: the map p -> d(p).
+        recorded: trajectories of the system with the time step of the tasks.
+        executions: number of executions that are proposed.
+        seed: seed of all random numbers.
+    """
+    study = DynamicsStudy(validation, seed)
+    learned = study.learn([], recorded)
+    if learned is None:
+        return None
+    with single_threaded():
+        worst = learned.worst_case
+        points = _candidates(worst, study, seed)
+        drawn = _distances(learned, points, seed)
+    planned = ~np.isnan(drawn).any(axis=0)
+    points, drawn = points[planned], _finite(drawn[:, planned])
+    if not len(points):
+        return None
+    order = np.argsort(-np.median(drawn, axis=0), kind="stable")
+    apart = order[separated_rows(points[order], _SAME * np.sqrt(points.shape[1]), len(points))]
+    points, drawn = points[apart], drawn[:, apart]
+    chosen, resolved = _informative(drawn, executions)
+    maxima = worst.maxima
+    return PredictedTasks(
+        tuple(_task(validation, points[row], drawn[:, row]) for row in range(min(_WORST, len(points)))),
+        float(np.median(maxima)),
+        float(np.quantile(maxima, 0.95, method="higher")),
+        tuple(
+            _task(validation, points[row], drawn[:, row], share) for row, share in zip(chosen, resolved, strict=True)
+        ),
+        len(maxima),
+        worst.unplanned,
+        learned.coverage.beyond.size,
+        learned.coverage.beyond.coordinates[0],
+    )
+
+
+def _candidates(worst: WorstCase, study: DynamicsStudy, seed: int) -> Array:
+    """Return tasks that may be worst, and random ones, points of the unit cube ``(T, d)``."""
+    pool = study.search.pool
+    random = pool[np.random.default_rng([seed, 3]).permutation(len(pool))[:_RANDOM]]
+    together = np.concatenate([worst.elites[:24], worst.points, random])
+    return np.unique(together.round(6), axis=0)[:: max(1, -(-len(together) // (2 * _CANDIDATES)))]
+
+
+def _distances(learned: LearnedDynamics, points: Array, seed: int) -> Array:
+    """Return the distances ``(S, T)`` of tasks on draws of the dynamics."""
+    rng, planner = np.random.default_rng([seed, 4]), learned.study.planner
+    pairs = loop_pairs(planner, learned.posterior, points)
+    draws = learned.posterior.draw(pairs[rng.permutation(len(pairs))[:_PAIRS]], rng)
+    return planner.distances(draws, planner.plan(points), len(points))
+
+
+def _finite(drawn: Array) -> Array:
+    known = drawn[np.isfinite(drawn)]
+    largest = _DIVERGED * float(np.quantile(known, 0.95)) if len(known) else 1.0
+    return np.minimum(drawn, max(largest, float(known.max(initial=0.0))))
+
+
+def _informative(drawn: Array, count: int) -> tuple[Rows, Array]:
+    """Return the tasks whose execution tells most of the worst tasks, one after the other.
+
+    The distances of tasks are taken as jointly normal, with the covariance of the draws. The weight of a task is the
+    share of the draws in which it is worst. Each choice resolves the largest part of the weighted variance that those
+    before it leave.
+
+    Args:
+        drawn: distances of T tasks on S draws, shape ``(S, T)``.
+        count: the number of tasks to choose.
+
+    Returns:
+        The tasks, and the share of the weighted variance that each and those before it resolve.
+    """
+    C = np.cov(drawn, rowvar=False).reshape(drawn.shape[1], -1)
+    worst = np.bincount(drawn.argmax(axis=1), minlength=drawn.shape[1]) / len(drawn)
+    weights = (1 - _ELSEWHERE) * worst + _ELSEWHERE / drawn.shape[1]
+    total = float(weights @ np.diag(C))
+    noise = 1e-6 * float(np.trace(C)) / len(C)
+    chosen, shares = list[int](), list[float]()
+    for _ in range(min(count, drawn.shape[1])):
+        gains = (weights @ C**2) / (np.diag(C) + noise) if noise > 0 else np.diag(C)
+        gains = np.where(np.isin(np.arange(len(C)), chosen), -np.inf, gains)
+        best = int(np.argmax(gains))
+        chosen.append(best)
+        C = C - np.outer(C[:, best], C[best]) / (C[best, best] + noise) if noise > 0 else C
+        shares.append(1 - float(weights @ np.diag(C).clip(min=0)) / total if total > 0 else 1.0)
+    return np.array(chosen, dtype=np.intp), np.array(shares)
+
+
+def _task(validation: Validation, point: Array, values: Array, resolved: float | None = None) -> PredictedTask:
+    space = validation.space
+    low, median, high = np.quantile(values, [0.05, 0.5, 0.95])
+    parameters = space.describe_point(space.from_unit(point))
+    return PredictedTask(parameters, float(median), float(low), float(high), resolved)

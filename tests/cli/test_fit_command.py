@@ -1,0 +1,144 @@
+"""``ctxval fit``, as users call it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from ctxval import models
+from ctxval.cli import app
+from ctxval.config.parts import part
+from rig_logs import DT, run, write_mcap_json
+
+Invoke = Callable[..., Result]
+
+STEP = f"""
+import numpy as np
+
+def step(x, u, theta):
+    mass, friction = theta
+    return np.array([x[0] + {DT} * x[1], x[1] + {DT} * (u[0] - friction * x[1]) / mass])
+"""
+
+
+@pytest.fixture
+def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Invoke:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    for module in ("my_cart_step", "my_batch_step"):  # each test has a module of its own
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    Path("logs").mkdir()
+    for seed in range(4):
+        run(80, seed).to_csv(f"logs/{seed}.csv")
+    Path("my_cart_step.py").write_text(STEP)
+
+    def called(*arguments: str) -> Result:
+        return CliRunner().invoke(app, ["fit", *arguments])
+
+    return called
+
+
+def report(result: Result) -> dict[str, Any]:
+    assert result.exit_code == 0, result.stdout + result.stderr
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
+
+
+def test_a_linear_model_is_learned_and_written_with_its_data(invoke: Invoke) -> None:
+    found = report(invoke("logs", "--kind", "linear", "--out", "model.npz", "--hold-out", "0.5", "--json"))
+    assert found["files"] == ["model.npz"]
+    assert (found["learned_from"]["recordings"], found["held_out"]["recordings"]) == (2, 2)
+    assert found["fitted"][0]["errors"][0]["relative"] < 1e-10
+    read: Any = models.read_model("model.npz")
+    np.testing.assert_allclose(read.A, [[1, DT], [0, 1 - 0.3 * DT]], atol=1e-10)
+    assert len(read.data) == 160
+
+
+def test_what_is_learned_is_printed(invoke: Invoke) -> None:
+    result = invoke("logs", "--kind", "linear, gaussian-process", "--steps", "1,5", "--seed", "2")
+    assert result.exit_code == 0, result.stderr
+    assert "learned from 240 steps of 3 recordings; errors on 80 steps of 1 others" in result.stdout
+    assert "all states and inputs vary independently enough" in result.stdout
+
+
+@pytest.mark.slow
+def test_a_network_is_written_as_onnx_with_its_data_beside_it(invoke: Invoke) -> None:
+    pytest.importorskip("onnxruntime")
+    found = report(invoke("logs", "--kind", "network", "--out", "model.onnx", "--json"))
+    assert found["files"] == ["model.onnx", "model.data.npz"]
+    model = part("model", {"type": "Onnx", "source": "model.onnx", "data": "model.data.npz"}, Path())
+    assert len(model.data) == 240
+    one = run(80, 0)
+    np.testing.assert_allclose(model.step(one.states[:-1], one.inputs), one.states[1:], atol=0.05)
+
+
+def test_parameters_of_a_function_are_estimated_with_their_intervals(invoke: Invoke) -> None:
+    options = ("--step", "my_cart_step:step", "--parameter", "mass=[0.5, 2.0]", "--parameter", "friction=[0, 1]")
+    found = report(invoke("logs", *options, "--out", "model.toml", "--json"))
+    mass, friction = found["fitted"][0]["parameters"]
+    assert mass["low"] <= mass["value"] <= mass["high"]
+    assert mass["value"] == pytest.approx(1.0, rel=1e-6)
+    assert friction["value"] == pytest.approx(0.3, rel=1e-6)
+    assert 'type = "Parametric"' in Path("model.toml").read_text()
+    result = invoke("logs", *options)
+    assert "mass = 1, between 1 and 1 with confidence 0.95" in result.stdout
+
+
+def test_fields_are_named_as_for_replay(invoke: Invoke) -> None:
+    for seed in range(3):
+        write_mcap_json(Path(f"{seed}.mcap"), run(60, seed))
+    fields = ("--state", "p=/state.cart.position", "--state", "v=/state.cart.speed", "--input", "f=/command.force")
+    files = ("0.mcap", "1.mcap", "2.mcap")
+    found = report(invoke(*files, *fields, "--kind", "linear", "--dt", "0.05", "--delay", "0", "--json"))
+    assert {one["state"] for one in found["fitted"][0]["errors"]} == {"p", "v"}
+    Path("map.toml").write_text('states = ["/state.cart.position"]\ninputs = ["/command.force"]\n')
+    mapped = report(invoke(*files, "--mapping", "map.toml", "--kind", "linear", "--json"))
+    assert mapped["fitted"][0]["errors"][0]["relative"] > 0.1
+    Path("clock.csv").write_text(Path("logs/0.csv").read_text().replace("t,", "clock,", 1))
+    assert report(invoke("clock.csv", "--time", "clock", "--kind", "linear", "--json"))["held_out"]["steps"] == 20
+
+
+def test_recordings_that_determine_nothing_are_said_to(invoke: Invoke) -> None:
+    Path("still.csv").write_text("t,x0,u0\n" + "".join(f"{k / 10},1,0\n" for k in range(20)))
+    result = invoke("still.csv", "--kind", "linear")
+    assert result.exit_code == 3
+    assert "linear: the data do not determine a linear model" in result.stderr
+
+
+@pytest.mark.slow
+def test_batches_are_taken_if_they_are_promised(invoke: Invoke) -> None:
+    Path("my_batch_step.py").write_text("def step(x, u, theta):\n    return x + theta[0] * u\n")
+    options = ("--step", "my_batch_step:step", "--parameter", "gain=[0, 1]", "--vectorized", "--out", "a.toml")
+    assert report(invoke("logs", *options, "--json"))["fitted"][0]["kind"] == "parameters"
+    assert "vectorized = true" in Path("a.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--kind", "linaer"), "no kind of model is called 'linaer'; did you mean 'linear'"),
+        (("--hold-out", "1"), "the share that is held out must be between 0 and 1, got 1"),
+        (("--kind", "linear", "--out", "a.txt"), "the file of a model must end in .npz, .onnx, .toml, got 'a.txt'"),
+        (
+            ("--kind", "linear", "--out", "a.toml"),
+            "no model that was learned (linear) can be written to a file that ends",
+        ),
+        (("--step", "my_cart_step:step"), "--step and --parameter must be given together"),
+        (("--parameter", "a=[0, 1]"), "--step and --parameter must be given together"),
+        (("--step", "my_cart_step:step", "--parameter", "mass"), "--parameter must be NAME=VALUE"),
+        (("--step", "my_cart_step:step", "--parameter", "mass=1"), "the bounds of mass must be two numbers"),
+        (("--step", "os:getcwd", "--parameter", "mass=[0, 1]"), "os:getcwd is in Python's standard library"),
+        (("--kind", "linear", "--steps", "x"), "--steps must be integers"),
+    ],
+)
+def test_what_cannot_be_used_is_said_in_one_sentence(arguments: tuple[str, ...], message: str, invoke: Invoke) -> None:
+    result = invoke("logs", *arguments)
+    assert result.exit_code == 2, result.stdout + result.stderr
+    assert message in " ".join(result.stderr.split())

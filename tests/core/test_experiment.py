@@ -1,0 +1,49 @@
+"""An experiment warns if its distance adds states of different units."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import pytest
+
+from conftest import make_validation
+from ctxval import Experiment, distances, systems
+from ctxval.core.experiment import UnitsWarning
+
+LABELS = ("angle [rad]", "rate [rad/s]")
+
+
+def test_states_of_different_units_without_weights_are_warned_of() -> None:
+    with pytest.warns(UnitsWarning, match=r"states in rad and rad/s without weights or scales.*give scales=\[\.\.\.\]"):
+        Experiment("x", make_validation(), states=LABELS)
+
+
+def test_the_units_of_the_system_count_if_the_experiment_names_none() -> None:
+    rig = systems.Manual(states={"angle": "rad", "rate": "rad/s"}, inputs={"torque": "N m"}, dt=0.02)
+    with pytest.warns(UnitsWarning):
+        Experiment("x", make_validation(system=rig))
+
+
+@pytest.mark.parametrize(
+    "distance",
+    [
+        distances.FinalState(scales=[0.05, 0.5]),
+        distances.FinalState(weights=[1, 1]),
+        distances.FinalState(components=[0]),
+        distances.RelativeDeviation(least=[0.1, 0.1]),
+        distances.CrossingTime(),
+        lambda model, system, task: 0.0,
+    ],
+)
+def test_comparable_states_give_no_warning(distance: Any) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Experiment("x", make_validation(distance=distance), states=LABELS)
+
+
+@pytest.mark.parametrize("labels", [(), ("angle", "rate"), ("a [rad]", "b [rad]"), ("a [rad]", "b")])
+def test_without_different_units_there_is_no_warning(labels: tuple[str, ...]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Experiment("x", make_validation(), states=labels)

@@ -1,0 +1,311 @@
+"""Every reader returns the run that the real library wrote."""
+
+from __future__ import annotations
+
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ctxval import Trajectory
+from ctxval.data import LogMapping, Recordings, read_logs, read_recordings
+from ctxval.errors import InputError
+from rig_logs import (
+    DT,
+    run,
+    write_bag,
+    write_lerobot,
+    write_mat,
+    write_mcap_json,
+    write_mcap_ros2,
+    write_parquet,
+)
+
+CART = LogMapping.from_table(
+    {
+        "states": {"position": "/state.cart.position", "speed": "/state.cart.speed[0]"},
+        "inputs": {"force": "/command.force"},
+    }
+)
+JOINTS = LogMapping.from_table(
+    {
+        "states": {"position": "/joints.position[0]", "speed": "/joints.velocity[0]"},
+        "inputs": {"force": "/joints.effort"},
+    }
+)
+TABLE = LogMapping.from_table({"states": ["position", "speed"], "inputs": ["force"]})
+MATLAB = LogMapping.from_table({"states": {"s": "log.state"}, "inputs": {"force": "force"}, "time": "log.time"})
+
+
+def to_csv(path: Path, one: Trajectory) -> None:
+    one.to_csv(path, states=["position [m]", "speed [m/s]"], inputs=["force [N]"])
+
+
+def to_npz(path: Path, one: Trajectory) -> None:
+    path.write_bytes(one.to_npz())
+
+
+WRITTEN: dict[str, tuple[Callable[[Path, Trajectory], None], LogMapping | None]] = {
+    "run.csv": (to_csv, TABLE),
+    "run.npz": (to_npz, None),
+    "json.mcap": (write_mcap_json, CART),
+    "ros2.mcap": (write_mcap_ros2, JOINTS),
+    "bag": (write_bag, JOINTS),
+    "bag of mcap": (lambda path, one: write_bag(path, one, storage="mcap"), JOINTS),
+    "level5.mat": (lambda path, one: write_mat(path, one, version="5"), MATLAB),
+    "level73.mat": (lambda path, one: write_mat(path, one, version="7.3"), MATLAB),
+    "run.parquet": (write_parquet, TABLE),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_file_of_each_kind_is_read_back(name: str, tmp_path: Path) -> None:
+    write, mapping = WRITTEN[name]
+    one = run()
+    write(tmp_path / name, one)
+    found = read_recordings([tmp_path / name], mapping)
+    assert (len(found.runs), found.breaks, found.dt) == (1, (), DT)
+    assert (len(found.states), len(found.inputs)) == (2, 1)
+    np.testing.assert_array_equal(found.runs[0].trajectory.states, one.states)
+    np.testing.assert_array_equal(found.runs[0].trajectory.inputs, one.inputs)
+    assert found.runs[0].source.startswith(str(tmp_path / name))
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_the_episodes_of_a_lerobot_data_set_are_recordings_with_its_names(version: str, tmp_path: Path) -> None:
+    runs = [run(seed=seed) for seed in range(3)]
+    write_lerobot(tmp_path / "set", runs, version=version)
+    found = read_recordings([tmp_path / "set"])
+    assert (len(found.runs), found.dt, found.breaks) == (3, DT, ())
+    assert (list(found.states), list(found.inputs)) == (["position", "speed"], ["force"])
+    for recording, one in zip(found.runs, runs, strict=True):
+        # The last frame has an action and no next state.
+        np.testing.assert_allclose(recording.trajectory.states, one.states[:-1], atol=1e-6)
+        np.testing.assert_allclose(recording.trajectory.inputs, one.inputs[:-1], atol=1e-6)
+    assert "episode 2" in found.runs[2].source
+
+
+def test_states_and_actions_of_one_name_are_kept_apart(tmp_path: Path) -> None:
+    write_lerobot(tmp_path / "set", [run()])
+    info = tmp_path / "set" / "meta" / "info.json"
+    info.write_text(info.read_text().replace('["force"]', '["position"]'))
+    assert list(read_recordings([tmp_path / "set"]).inputs) == ["position command"]
+
+
+def test_the_storage_file_of_a_bag_is_read_alone(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag", run())
+    (storage,) = (tmp_path / "bag").glob("*.db3")
+    assert read_recordings([storage], JOINTS).steps == 60
+
+
+def test_the_definition_of_a_message_that_an_old_bag_lacks_is_that_of_ros(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag", run())
+    (storage,) = (tmp_path / "bag").glob("*.db3")
+    with sqlite3.connect(storage) as database:
+        database.execute("DELETE FROM message_definitions")
+    np.testing.assert_array_equal(read_recordings([storage], JOINTS).runs[0].trajectory.states, run().states)
+    with sqlite3.connect(storage) as database:
+        database.execute("UPDATE topics SET type = 'my_robot/msg/State'")
+    with pytest.raises(InputError, match=r"definition of the messages of /joints, my_robot/msg/State, is not in the"):
+        read_recordings([storage], JOINTS)
+
+
+def test_messages_have_three_times(tmp_path: Path) -> None:
+    one = run(4)
+    write_mcap_ros2(tmp_path / "a.mcap", one, late=0.25)
+    table = {"states": {"position": "/joints.position"}, "inputs": {"force": "/joints.effort"}}
+    log = read_logs([tmp_path / "a.mcap"])[0]
+    for stamp in ("log", "publish", "header"):
+        clock = LogMapping.from_table({**table, "stamp": stamp}).clock
+        times = log.signals(["/joints.position"], clock)["/joints.position"].times
+        np.testing.assert_allclose(times, one.times, atol=1e-9)
+    write_mcap_json(tmp_path / "b.mcap", one)
+    with pytest.raises(InputError, match=r"message 0 of /state: it has no header.stamp"):
+        read_recordings([tmp_path / "b.mcap"], LogMapping(CART.states, stamp="header"))
+
+
+def test_all_files_of_a_folder_are_read_in_the_order_of_their_names(tmp_path: Path) -> None:
+    for seed in (2, 0, 1):
+        to_csv(tmp_path / f"{seed}.csv", run(10 + seed, seed))
+    (tmp_path / "notes.txt").write_text("no log")
+    found = read_recordings([tmp_path], TABLE)
+    assert [one.trajectory.horizon for one in found.runs] == [10, 11, 12]
+    transitions, sources = found.transitions()
+    assert (len(transitions), found.steps) == (33, 33)
+    assert sources.tolist() == [0] * 10 + [1] * 11 + [2] * 12
+    assert found.transitions([2])[1].tolist() == [2] * 12
+
+
+def test_a_batch_of_trajectories_in_one_npz_file_is_several_recordings(tmp_path: Path) -> None:
+    states, inputs = (np.stack([getattr(run(seed=seed), name) for seed in range(3)]) for name in ("states", "inputs"))
+    (tmp_path / "a.npz").write_bytes(Trajectory(run().times, states, inputs).to_npz())
+    found = read_recordings([tmp_path / "a.npz"])
+    assert len(found.runs) == 3
+    np.testing.assert_array_equal(found.runs[2].trajectory.states, run(seed=2).states)
+
+
+def test_a_log_without_times_has_one_row_for_each_step(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x0,u0\n1,5\n2,6\n4,7\n")
+    found = read_recordings(
+        [tmp_path / "a.csv"], LogMapping.from_table({"states": ["x0"], "inputs": ["u0"], "dt": 0.1})
+    )
+    np.testing.assert_allclose(found.runs[0].trajectory.times, [0, 0.1, 0.2])
+    assert found.runs[0].trajectory.inputs.tolist() == [[5], [6]]
+    with pytest.raises(InputError, match=r"a\.csv has no column of times \(t, time, times, timestamp\): name it"):
+        read_recordings([tmp_path / "a.csv"])
+
+
+def broken(tmp_path: Path, name: str, content: str | bytes) -> Path:
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        (
+            "a.csv",
+            "t,position,speed,force\n0,1,2,3\n0.1,1,fast,3\n",
+            r"a\.csv, line 3: speed must be a number, got 'fast'",
+        ),
+        ("a.csv", "t,position,speed\n0,1,2\n0.1,1,2\n", r"a\.csv has no field 'force'; it has t, position, speed\."),
+        ("a.csv", "t,position,speed,force\n0,1,2,3\nlate,1,2,3\n", r"a\.csv, line 3: t must be a number, got 'late'"),
+        ("a.csv", "t,position,speed,force\n,1,2,3\n0.1,1,2,3\n", r"a\.csv, line 2: the time t must be a number"),
+        ("a.csv", "t,t,force\n", r"a\.csv must be a table .* and has two columns 't'"),
+        ("a.csv", "", r"a\.csv must be a table .* and has no header"),
+        ("a.csv", b"\xff\xfe", r"a\.csv cannot be read as CSV: "),
+        ("a.csv", "t,position,speed,force\n0,1,2,3\n", r"a\.csv has fewer than two samples of position, so its"),
+        ("a.npz", b"PK", r"a\.npz cannot be read as NPZ: it is not a complete NPZ archive"),
+        ("a.mat", b"MATLAB", r"a\.mat cannot be read as a MATLAB file"),
+        ("a.mcap", b"\x89MCAP0\r\n", r"a\.mcap cannot be read as an MCAP file"),
+        ("a.parquet", b"PAR1", r"a\.parquet cannot be read as Parquet"),
+        ("a.db3", b"SQLite format 3", r"a\.db3 cannot be read as a ROS 2 bag"),
+        ("a.bag", b"", r"a\.bag is not a log that can be read: files must end in \.csv, \.npz, \.mat"),
+    ],
+)
+def test_what_cannot_be_read_is_named_by_file_field_and_row(
+    name: str, content: str | bytes, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message):
+        read_recordings([broken(tmp_path, name, content)], TABLE)
+
+
+@pytest.mark.parametrize("name", [name for name in WRITTEN if "." in name])
+def test_half_a_file_is_refused_or_read_in_part(name: str, tmp_path: Path) -> None:
+    write, mapping = WRITTEN[name]
+    write(tmp_path / name, run())
+    content = (tmp_path / name).read_bytes()
+    for share in (0.1, 0.5, 0.9):
+        (tmp_path / name).write_bytes(content[: int(share * len(content))])
+        try:
+            steps, said = read_recordings([tmp_path / name], mapping).steps, name
+        except InputError as error:
+            steps, said = 0, str(error)
+        assert (steps < 60, name in said) == (True, True)
+
+
+def test_fields_of_messages_are_named_if_one_is_missing_or_is_no_number(tmp_path: Path) -> None:
+    write_mcap_json(tmp_path / "a.mcap", run(4))
+    path = [tmp_path / "a.mcap"]
+    with pytest.raises(InputError, match=r"no field '/speed'; it has /state\.cart\.position, /state\.cart\.speed\[0\]"):
+        read_recordings(path, LogMapping.from_table({"states": ["/speed"]}))
+    with pytest.raises(InputError, match=r"message 0 of /state: cart\.angle must be a number or a list .* got nothing"):
+        read_recordings(path, LogMapping.from_table({"states": ["/state.cart.angle"]}))
+    with pytest.raises(
+        InputError, match=r"message 0 of /state: name must be a number or a list of numbers, got 'cart'"
+    ):
+        read_recordings(path, LogMapping.from_table({"states": ["/state.name"]}))
+
+
+def test_a_message_in_another_encoding_is_named(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("cart", "protobuf", b"")
+        topic = writer.register_channel("/state", "protobuf", schema)
+        writer.add_message(topic, log_time=0, publish_time=0, data=b"")
+        writer.finish()
+    with pytest.raises(
+        InputError, match="the messages of /state are in protobuf with a schema in protobuf; messages in"
+    ):
+        read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/state.x"]}))
+
+
+def test_components_that_a_vector_lacks_are_named(tmp_path: Path) -> None:
+    write_lerobot(tmp_path / "set", [run(5)])
+    with pytest.raises(
+        InputError, match=r"observation\.state has 2 components, so there is no observation\.state\[2\]"
+    ):
+        read_recordings([tmp_path / "set"], LogMapping.from_table({"states": ["observation.state[2]"]}))
+
+
+@pytest.mark.parametrize("content", ["{}", '{"fps": 0}', '{"fps": "fast"}', "[1]", "no json"])
+def test_a_data_set_with_an_unusable_description_is_refused(content: str, tmp_path: Path) -> None:
+    write_lerobot(tmp_path / "set", [run(5)])
+    (tmp_path / "set" / "meta" / "info.json").write_text(content)
+    with pytest.raises(InputError, match=r"info\.json"):
+        read_recordings([tmp_path / "set"])
+
+
+def test_no_log_at_all_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no log"):
+        read_logs([])
+    with pytest.raises(InputError, match=r"there is no file .*absent\.csv"):
+        read_logs([tmp_path / "absent.csv"])
+    with pytest.raises(InputError, match=r"the folder .* has no log"):
+        read_logs([tmp_path])
+
+
+def test_logs_of_different_systems_are_not_read_as_one(tmp_path: Path) -> None:
+    write_lerobot(tmp_path / "set", [run(5)])
+    np.savez(tmp_path / "other.npz", t=np.arange(3.0), x=np.zeros((3, 3)), u=np.zeros((2, 1)))
+    mapping = LogMapping.from_table({"states": {"x": "x"}, "inputs": {"u": "u"}})
+    one = read_recordings([tmp_path / "other.npz"], mapping)
+    assert isinstance(one, Recordings)
+    np.savez(tmp_path / "third.npz", t=np.arange(3.0), x=np.zeros((3, 2)), u=np.zeros((2, 1)))
+    with pytest.raises(InputError, match=r"third\.npz has other states or inputs than .*other\.npz"):
+        read_recordings([tmp_path / "other.npz", tmp_path / "third.npz"], mapping)
+
+
+def test_a_pickled_array_is_refused_and_its_code_does_not_run(tmp_path: Path) -> None:
+    class Hostile:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return (Path.touch, (tmp_path / "ran",))  # type: ignore[return-value]
+
+    np.savez(tmp_path / "a.npz", t=np.arange(2.0), x=np.array([Hostile(), Hostile()], dtype=object))
+    with pytest.raises(InputError, match="its array x holds neither real numbers nor text"):
+        read_recordings([tmp_path / "a.npz"])
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.slow
+def test_a_message_definition_with_code_in_it_runs_nothing(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag", run(3))
+    (storage,) = (tmp_path / "bag").glob("*.db3")
+    sentinel = tmp_path / "ran"
+    with sqlite3.connect(storage) as database:
+        text = f"float64[] position\nfloat64 x = __import__('pathlib').Path({str(sentinel)!r}).touch()\n"
+        database.execute("UPDATE message_definitions SET encoded_message_definition = ?", (text,))
+    with pytest.raises(InputError):
+        read_recordings([storage], JOINTS)
+    assert not sentinel.exists()
+
+
+@pytest.mark.slow
+def test_a_missing_library_is_named_with_its_extra(tmp_path: Path) -> None:
+    write_parquet(tmp_path / "a.parquet", run(3))
+    code = (
+        "import sys; sys.modules['pyarrow'] = None; sys.modules['pyarrow.parquet'] = None\n"
+        "from ctxval.data import read_logs\n"
+        f"try: read_logs([{str(tmp_path / 'a.parquet')!r}])\n"
+        "except Exception as error: print(error)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.strip() == "Parquet files need pyarrow: pip install 'ctxval[logs]'."

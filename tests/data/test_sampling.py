@@ -1,0 +1,145 @@
+"""Recordings at equal steps: interpolated, held, delayed, and split at gaps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ctxval.data import LogMapping, MemoryTable, Recordings, read_recordings, recordings_of
+from ctxval.errors import InputError
+from rig_logs import run, write_mcap_json
+
+
+def recorded(columns: dict[str, object], **options: object) -> Recordings:
+    log = MemoryTable("log", {name: np.asarray(column, dtype=np.float64) for name, column in columns.items()})
+    return recordings_of([log], LogMapping.from_table({"states": ["x"], "inputs": ["u"], **options}))
+
+
+def test_states_are_interpolated_and_inputs_are_held() -> None:
+    times = np.arange(0, 1.01, 0.1)
+    found = recorded({"t": times, "x": times**2, "u": times}, dt=0.04)
+    one = found.runs[0].trajectory
+    assert (one.horizon, found.dt) == (25, 0.04)
+    np.testing.assert_allclose(one.states[:, 0], np.interp(one.times, times, times**2), atol=1e-12)
+    np.testing.assert_allclose(one.inputs[:, 0], np.floor(one.times[:-1] / 0.1 + 1e-6) / 10, atol=1e-12)
+    assert any("less often than every step of 0.04 s: its values between two samples" in note for note in found.notes)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.floats(0.05, 0.15), min_size=4, max_size=40), st.floats(0.02, 0.2), st.floats(-3, 3), st.floats(-3, 3)
+)
+def test_a_linear_state_is_resampled_exactly(steps: list[float], dt: float, slope: float, start: float) -> None:
+    times = np.cumsum([0.0, *steps])
+    found = recorded({"t": times + 7, "x": start + slope * times, "u": times}, dt=dt, longest_gap=1.0)
+    (one,) = found.runs
+    assert one.start == 7
+    assert one.trajectory.times[-1] <= times[-1] + 0.01 * dt
+    assert one.trajectory.times[-1] > times[-1] - dt * 1.01
+    within = one.trajectory.times <= times[-1]
+    # A sample within a thousandth of a period of a step is taken as it is.
+    np.testing.assert_allclose(
+        one.trajectory.states[within, 0], start + slope * one.trajectory.times[within], atol=3e-4 + 1e-9
+    )
+
+
+def test_the_input_acts_after_its_delay() -> None:
+    times = np.arange(0, 1.05, 0.1)
+    for delay in (0.2, -0.1):
+        found = recorded({"t": times, "x": 10 * times, "u": 10 * times}, delay=delay)
+        one = found.runs[0].trajectory
+        np.testing.assert_allclose(one.inputs[:, 0], one.states[:-1, 0] - 10 * delay, atol=1e-9)
+        assert f"inputs act {delay:g} s after they are logged" in found.notes
+
+
+@pytest.mark.parametrize("missing", [[5], [5, 6], [5, 9], [0, 1], [10]])
+def test_a_missing_value_splits_the_recording_and_is_stated(missing: list[int]) -> None:
+    times = np.arange(11) / 10
+    x = times.copy()
+    x[missing] = np.nan
+    found = recorded({"t": times, "x": x, "u": times})
+    steps = sum(bool(np.isfinite(x[k]) and np.isfinite(x[k + 1])) for k in range(10))
+    assert found.steps == steps
+    assert all(np.isfinite(one.trajectory.states).all() for one in found.runs)
+    inside = [k for k in missing if np.isfinite(x[:k]).any() and np.isfinite(x[k:]).any()]
+    assert bool(inside) == any("has no value in row" in one.reason for one in found.breaks)
+
+
+def test_a_gap_between_samples_splits_the_recording_and_is_stated() -> None:
+    times = np.concatenate([np.arange(5), np.arange(8, 12)]) / 10
+    found = recorded({"t": times, "x": times, "u": times})
+    assert [one.trajectory.horizon for one in found.runs] == [4, 3]
+    gap = found.breaks[0]
+    assert (gap.field, gap.time) == ("x", 0.4)
+    assert gap.seconds == pytest.approx(0.4)
+    assert str(gap) == "log, 0.4 s: x has no sample for 0.4 s"
+    bridged = recorded({"t": times, "x": times, "u": times}, longest_gap=0.5)
+    assert ([one.trajectory.horizon for one in bridged.runs], bridged.breaks) == ([11], ())
+
+
+def test_lost_messages_split_a_recording(tmp_path: Path) -> None:
+    write_mcap_json(tmp_path / "a.mcap", run(), lost=(20, 21, 40))
+    mapping = LogMapping.from_table({"states": ["/state.cart.position"], "inputs": ["/command.force"]})
+    found = read_recordings([tmp_path / "a.mcap"], mapping)
+    assert [one.trajectory.horizon for one in found.runs] == [19, 17, 19]
+    assert [one.reason for one in found.breaks] == ["has no sample for 0.15 s", "has no sample for 0.1 s"]
+
+
+def test_times_that_go_back_begin_another_recording() -> None:
+    times = [0.0, 0.1, 0.2, 0.0, 0.1, 0.2, 0.3]
+    found = recorded({"t": times, "x": np.arange(7), "u": np.arange(7)})
+    assert [one.trajectory.states[:, 0].tolist() for one in found.runs] == [[0, 1, 2], [3, 4, 5, 6]]
+    assert "go back from 0.2 s to 0 s at row 3" in found.breaks[0].reason
+
+
+def test_a_held_command_is_no_gap() -> None:
+    table = {"states": {"x": "x"}, "inputs": {"u": {"path": "u", "held": True}}}
+    u = [5, np.nan, np.nan, np.nan, 6, np.nan]
+    log = MemoryTable("log", {"t": np.arange(6.0), "x": np.arange(6.0), "u": np.array(u)})
+    found = recordings_of([log], LogMapping.from_table(table))
+    assert found.runs[0].trajectory.inputs[:, 0].tolist() == [5, 5, 5, 5, 6]
+    assert found.breaks == ()
+
+
+def test_an_angle_is_continued_over_turns() -> None:
+    times = np.arange(0, 2, 0.1)
+    angle = 3.0 * times
+    wrapped = np.arctan2(np.sin(angle), np.cos(angle))
+    table = {"states": {"angle": {"path": "a", "angle": True}}, "dt": 0.05}
+    log = MemoryTable("log", {"t": times, "a": wrapped})
+    one = recordings_of([log], LogMapping.from_table(table)).runs[0].trajectory
+    np.testing.assert_allclose(one.states[:, 0], 3.0 * one.times, atol=1e-9)
+
+
+def test_units_are_converted() -> None:
+    log = MemoryTable("log", {"t": np.array([0.0, 500.0]), "a": np.array([180.0, 90.0]), "n": np.array([60.0, 0.0])})
+    table = {
+        "states": {"angle": {"path": "a", "unit": "rad", "recorded": "deg", "offset": 1.0}},
+        "inputs": {"rate": {"path": "n", "unit": "rad/s", "recorded": "rpm"}},
+        "time_unit": "ms",
+    }
+    found = recordings_of([log], LogMapping.from_table(table))
+    one = found.runs[0].trajectory
+    np.testing.assert_allclose(one.states[:, 0], [np.pi + 1, np.pi / 2 + 1])
+    np.testing.assert_allclose(one.inputs[:, 0], [2 * np.pi])
+    assert (found.dt, found.states, found.inputs) == (0.5, {"angle": "rad"}, {"rate": "rad/s"})
+
+
+def test_topics_with_times_that_go_back_are_refused() -> None:
+    from ctxval.data.sampling import Channel, sampled
+
+    first = Channel("x", "", False, np.arange(3.0), np.arange(3.0))
+    second = Channel("u", "", True, np.array([0.0, 2.0, 1.0]), np.arange(3.0), path="/u", place=("message", 0))
+    with pytest.raises(
+        InputError, match=r"message 2 of /u: its time must be after that of the one before, 2 s, got 1 s"
+    ):
+        sampled("log", [first, second], 1.0, 0.0, None)
+
+
+def test_too_many_steps_are_refused() -> None:
+    with pytest.raises(InputError, match=r"more than 20000000: give a larger dt"):
+        recorded({"t": [0.0, 1.0], "x": [0.0, 1.0], "u": [0.0, 0.0]}, dt=1e-9)
