@@ -38,7 +38,7 @@ def root_mean_square(model_trajectory: Trajectory, system_trajectory: Trajectory
 
 
 DISTANCES: dict[str, distances.Distance] = {
-    "printed": distances.WholeTrajectory(norm=2, per_step=True),
+    "printed": distances.WholeTrajectory(norm=2, per_step=True, weights=(1, 1, 1)),  # the paper adds m and rad
     "root-mean-square": root_mean_square,
     "mean-deviation": distances.MeanDeviation(norm=2, components=(0, 1)),
 }
