@@ -101,9 +101,11 @@ def test_waiting_for_another_process_is_reported(tmp_path: Path) -> None:
             second.ask(wait=0.1)
 
     with first.store.sole_writer():
-        last = last_of(reports_of(wait))["waiting for another process"]
+        last = last_of(reports_of(wait))["waiting for another process that is running the store"]
     assert 0.04 <= last.done <= 0.12
-    assert "waiting for another process" not in last_of(reports_of(lambda: second.ask(wait=0.1)))
+    assert "waiting for another process that is running the store" not in last_of(
+        reports_of(lambda: second.ask(wait=0.1))
+    )
 
 
 def test_a_program_is_told_nothing_unless_it_asks(capfd: Any) -> None:

@@ -128,7 +128,7 @@ def test_asking_and_waiting_for_the_lock_are_shown(folder: Path) -> None:
     with Holding(folder):
         screen, _, status = at_terminal(folder, "ask", "a.sqlite", release_after=b"waiting for another process")
     assert status == 0
-    assert re.search(r"waiting for another process +\S+ +\d+/60 s", screen)
+    assert re.search(r"waiting for another process that is running the store +\S+ +\d+/60 s", screen)
 
 
 class Holding:

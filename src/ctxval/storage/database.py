@@ -100,7 +100,7 @@ class Database:
             with suppress(LockedError):
                 lock.acquire()
                 return lock
-            with stage("waiting for another process", wait, "s"):
+            with stage("waiting for another process that is running the store", wait, "s"):
                 while True:
                     try:
                         lock.acquire()

@@ -18,7 +18,7 @@ from ctxval.certificates import Certificate, Verdict
 from ctxval.certificates import judge as judge_trials
 from ctxval.certificates.bounds import with_error
 from ctxval.core.labels import labels_of
-from ctxval.errors import InputError, StoreAccessError
+from ctxval.errors import InputError
 from ctxval.plot import overview, worst_trajectories
 from ctxval.web.background import Stage, TellStage
 from ctxval.web.served import ServedCampaign
@@ -104,17 +104,13 @@ def choose(served: ServedCampaign, tell: TellStage, request: TaskRequest) -> tup
         ModelError, DesignError: as in :meth:`ctxval.Campaign.ask`.
     """
     tell(Stage("choosing a task"))
-    try:
-        opened = _ask(served, request, 0.0)
-    except StoreAccessError:
-        tell(Stage("waiting for another process that is running the store"))
-        opened = _ask(served, request, _WAIT)
+    opened = _ask(served, request)
     return opened.number, _files(served, opened)
 
 
-def _ask(served: ServedCampaign, request: TaskRequest, wait: float) -> OpenTrial:
+def _ask(served: ServedCampaign, request: TaskRequest) -> OpenTrial:
     campaign = served.campaign
-    with campaign.store.sole_writer(wait):
+    with campaign.store.sole_writer(_WAIT):
         campaign.refresh()
         if request.trials is not None and request.trials != len(campaign.trials):
             raise InputError(
