@@ -6,6 +6,7 @@ valid. ``X`` and ``Z`` are points, shapes ``(n, d)`` and ``(m, d)``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,12 +18,18 @@ from ctxval.errors import InputError
 
 Bounds = list[tuple[float, float]]
 
+Towards = Callable[[Array], Array]
+"""Points ``(n, d)`` -> their covariances ``(n, m)`` with points that are fixed."""
+
 
 class Covariance(Protocol):
     """A covariance function k(x, z; theta)."""
 
     def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
         """Return the covariances ``(n, m)``."""
+
+    def towards(self, theta: Array, Z: Array) -> Towards:
+        """Return the covariances with points ``(m, d)`` as a function, which prepares these points only once."""
 
     def diagonal(self, theta: Array, X: Array) -> Array:
         """Return the variances k(x, x), shape ``(n,)``."""
@@ -75,8 +82,19 @@ class Matern:
 
     def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
         """Return the covariances ``(n, m)``."""
-        scales = np.exp(theta[1:])
-        return np.asarray(np.exp(theta[0]) * self._profile(cdist(X / scales, Z / scales)))
+        return self.towards(theta, Z)(X)
+
+    def towards(self, theta: Array, Z: Array) -> Towards:
+        """Return the covariances with points ``(m, d)`` as a function of other points."""
+        variance, scales = np.exp(theta[0]), np.exp(theta[1:])
+        own = Z / scales
+
+        def covariances(X: Array) -> Array:
+            found = self._profile(cdist(X / scales, own))
+            found *= variance
+            return found
+
+        return covariances
 
     def diagonal(self, theta: Array, X: Array) -> Array:
         """Return the variance at each point, shape ``(n,)``."""
@@ -117,8 +135,11 @@ class Matern:
         return np.zeros_like(X)
 
     def _profile(self, r: Array) -> Array:
-        """Return k(r) for unit variance and length-scale."""
-        return self._profile_and_slope(r)[0]
+        """Return k(r) for unit variance and length-scale; r is overwritten."""
+        r *= np.sqrt(2 * self.nu)
+        found = np.exp(-r)
+        found *= self._polynomial(r)
+        return found
 
     def _slope(self, r: Array) -> Array:
         """Return ``-k'(r) / r``, which is finite at r = 0."""
@@ -127,9 +148,20 @@ class Matern:
     def _profile_and_slope(self, r: Array) -> tuple[Array, Array]:
         s = np.sqrt(2 * self.nu) * r
         decay = np.exp(-s)
+        slope = 3 * decay if self.nu == 1.5 else 5 / 3 * (1 + s) * decay
+        decay *= self._polynomial(s)
+        return decay, slope
+
+    def _polynomial(self, s: Array) -> Array:
+        """Return the polynomial that multiplies ``exp(-s)``; s is overwritten."""
         if self.nu == 1.5:
-            return (1 + s) * decay, 3 * decay
-        return (1 + s + s**2 / 3) * decay, 5 / 3 * (1 + s) * decay
+            s += 1
+            return s
+        squares = s**2
+        squares /= 3
+        s += 1
+        s += squares
+        return s
 
 
 @dataclass(frozen=True)
@@ -151,7 +183,19 @@ class Linear:
 
     def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
         """Return the covariances ``(n, m)``."""
-        return np.asarray(np.exp(theta[0]) + np.exp(theta[1]) * (X - self.centre) @ (Z - self.centre).T)
+        return self.towards(theta, Z)(X)
+
+    def towards(self, theta: Array, Z: Array) -> Towards:
+        """Return the covariances with points ``(m, d)`` as a function of other points."""
+        constant, slope = np.exp(theta)
+        own = (Z - self.centre).T
+
+        def covariances(X: Array) -> Array:
+            found = (slope * (X - self.centre)) @ own
+            found += constant
+            return np.asarray(found)
+
+        return covariances
 
     def diagonal(self, theta: Array, X: Array) -> Array:
         """Return the variances, shape ``(n,)``."""
@@ -189,8 +233,19 @@ class Sum:
 
     def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
         """Return the covariances ``(n, m)``."""
-        a, b = self._split(theta, X.shape[1])
-        return self.first(a, X, Z) + self.second(b, X, Z)
+        return self.towards(theta, Z)(X)
+
+    def towards(self, theta: Array, Z: Array) -> Towards:
+        """Return the covariances with points ``(m, d)`` as a function of other points."""
+        a, b = self._split(theta, Z.shape[1])
+        first, second = self.first.towards(a, Z), self.second.towards(b, Z)
+
+        def covariances(X: Array) -> Array:
+            found = first(X)
+            found += second(X)
+            return found
+
+        return covariances
 
     def diagonal(self, theta: Array, X: Array) -> Array:
         """Return the variances, shape ``(n,)``."""

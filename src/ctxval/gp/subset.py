@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import farthest_rows
+from ctxval._util.representation import call
 from ctxval.gp.kernels import Covariance
 
 LONG = 1000
@@ -40,16 +44,51 @@ def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: 
         count: largest number of rows.
         least: the choice ends if no remaining variance is larger than this.
     """
-    left = kernel.diagonal(theta, X)
-    columns = np.zeros((min(count, len(X)), len(X)))
+    towards = kernel.towards(theta, X)
+    return pivoted_cholesky(kernel.diagonal(theta, X), lambda row: towards(X[row : row + 1])[0], count, least).rows
+
+
+@dataclass(frozen=True, eq=False)
+class PivotedCholesky:
+    """A part of a positive semidefinite matrix of which each row has the largest variance given the rows before it.
+
+    Attributes:
+        rows: the rows, shape ``(k,)``.
+        L: the Cholesky factor of the matrix of these rows, shape ``(k, k)``.
+        left: the variances of all n rows given these, shape ``(n,)``.
+    """
+
+    rows: Rows
+    L: Array
+    left: Array
+
+    def __repr__(self) -> str:
+        return call(self, len(self.rows), of=len(self.left))
+
+
+def pivoted_cholesky(
+    variances: Array, covariances: Callable[[int], Array], count: int, least: float
+) -> PivotedCholesky:
+    """Return the Cholesky factor of those rows of a covariance matrix that represent all of it.
+
+    Args:
+        variances: the diagonal of the matrix, shape ``(n,)``.
+        covariances: a row of the matrix -> its n entries, in an array that may be overwritten.
+        count: largest number of rows.
+        least: the choice ends if no remaining variance is larger than this.
+    """
+    left = np.array(variances)
+    columns = np.empty((min(count, len(left)), len(left)))
     chosen: list[int] = []
-    for k in range(len(columns)):
-        pivot = int(np.argmax(left))
+    for k, column in enumerate(columns):
+        pivot = int(left.argmax())
         if left[pivot] <= least:
             break
-        row = kernel(theta, X[pivot : pivot + 1], X)[0] - columns[:k, pivot] @ columns[:k]
-        columns[k] = row / np.sqrt(left[pivot])
-        left = left - columns[k] ** 2
+        row = covariances(pivot)
+        row -= columns[:k, pivot] @ columns[:k]
+        np.divide(row, np.sqrt(left[pivot]), out=column)
+        left -= np.square(column, out=row)
         left[pivot] = 0.0
         chosen.append(pivot)
-    return np.array(chosen, dtype=np.intp)
+    rows = np.array(chosen, dtype=np.intp)
+    return PivotedCholesky(rows, np.tril(columns[: len(rows)][:, rows].T), np.maximum(left, 0.0))

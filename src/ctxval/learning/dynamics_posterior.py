@@ -7,8 +7,10 @@ that all draws of one set of hyperparameters share, and thousands of closed loop
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise, tenfold
-from ctxval.gp.subset import pivoted_rows
+from ctxval.gp.subset import pivoted_cholesky, pivoted_rows
 from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters, draw_hyperparameters, learning_rows
 from ctxval.learning.kernel_expansion import KernelExpansion
 from ctxval.learning.residual_data import ResidualData, residual_data
@@ -72,6 +74,7 @@ class Component:
         centres: standardised pairs that it is conditioned on, shape ``(M, k)``.
         factor: Cholesky factor of their covariance with noise.
         weights: weights of the mean, shape ``(M, n)``.
+        squares: squared size of each state's residuals, relative to the covariance, shape ``(n,)``.
         amplitudes: standard deviations of the states' residuals, relative to the covariance, shape ``(n,)``.
     """
 
@@ -79,6 +82,7 @@ class Component:
     centres: Array
     factor: CholeskyFactor
     weights: Array
+    squares: Array
     amplitudes: Array
 
     @classmethod
@@ -91,8 +95,11 @@ class Component:
         factor = factorise(kernel(theta, Z[rows], Z[rows]), tenfold(noise))
         weights = factor.solve(Y[rows])
         squares = (Y[rows] * weights).sum(axis=0)
-        amplitudes = np.sqrt(squares / rng.chisquare(len(rows), len(squares)))
-        return cls(hyperparameters, Z[rows], factor, weights, amplitudes)
+        return cls(hyperparameters, Z[rows], factor, weights, squares, _amplitudes(squares, len(rows), rng))
+
+    def again(self, rng: np.random.Generator) -> Component:
+        """Return the same process with other amplitudes."""
+        return replace(self, amplitudes=_amplitudes(self.squares, len(self.centres), rng))
 
     @property
     def mean(self) -> KernelExpansion:
@@ -122,45 +129,47 @@ class Component:
             pivots: largest number of pivots.
             rng: the source of the draws.
         """
-        chosen, L, left_out = self._pivots(relevant, pivots)
-        n = self.weights.shape[1]
-        if not len(chosen):
-            return KernelExpansion(
-                self.hyperparameters, self.centres, np.repeat(self.weights[None], count, 0)
-            ), left_out
-        kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
-        normal = rng.standard_normal((count, len(chosen), n)) * self.amplitudes
-        # The values L xi at the pivots are interpolated by the posterior covariance L L', with weights L'^-1 xi.
-        weights = np.linalg.solve(L.T, normal)
-        cross = self.factor.solve(kernel(theta, self.centres, relevant[chosen]))
-        at_centres = self.weights - np.matmul(cross, weights)
-        together = np.concatenate([at_centres, weights], axis=1)
-        return KernelExpansion(
-            self.hyperparameters, np.concatenate([self.centres, relevant[chosen]]), together
-        ), left_out
+        return _drawn([self], relevant, count, pivots, rng)
 
-    def _pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
+    def pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
         """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
         half, left = self._halved(relevant)
         first = left.max(initial=0.0)
         # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
         rounding = _ROUNDING * kernel.diagonal(theta, relevant).max(initial=0.0)
-        columns = np.zeros((min(count, len(relevant)), len(relevant)))
-        chosen: list[int] = []
-        for k in range(len(columns)):
-            pivot = int(np.argmax(left))
-            if left[pivot] <= max(_NEGLIGIBLE * first, rounding):
-                break
-            covariances = kernel(theta, relevant[pivot : pivot + 1], relevant)[0]
-            row = covariances - half[:, pivot] @ half - columns[:k, pivot] @ columns[:k]
-            columns[k] = row / np.sqrt(left[pivot])
-            left = np.maximum(left - columns[k] ** 2, 0.0)
-            left[pivot] = 0.0
-            chosen.append(pivot)
-        L = np.tril(columns[: len(chosen)][:, chosen].T)
-        left_out = left.max() / first if first > rounding else 0.0
-        return np.array(chosen, dtype=np.intp), L, float(left_out)
+        towards = kernel.towards(theta, relevant)
+
+        def covariances(row: int) -> Array:
+            return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
+
+        found = pivoted_cholesky(left, covariances, count, least=max(_NEGLIGIBLE * first, rounding))
+        left_out = found.left.max() / first if first > rounding else 0.0
+        return found.rows, found.L, float(left_out)
+
+
+def _amplitudes(squares: Array, count: int, rng: np.random.Generator) -> Array:
+    """Return a draw of the amplitudes from their posterior, given ``count`` transitions."""
+    return np.asarray(np.sqrt(squares / rng.chisquare(count, len(squares))))
+
+
+def _drawn(
+    alike: Sequence[Component], relevant: Array, count: int, pivots: int, rng: np.random.Generator
+) -> tuple[KernelExpansion, float]:
+    """Return ``count`` draws of each of some components that differ in their amplitudes only; see Component.draw."""
+    own = alike[0]
+    chosen, L, left_out = own.pivots(relevant, pivots)
+    if not len(chosen):
+        return own.mean.repeated(count * len(alike)), left_out
+    kernel, theta = own.hyperparameters.kernel, own.hyperparameters.theta
+    shape = (count, len(chosen), own.weights.shape[1])
+    normal = np.concatenate([rng.standard_normal(shape) * one.amplitudes for one in alike])
+    # The values L xi at the pivots are interpolated by the posterior covariance L L', with weights L'^-1 xi.
+    weights = np.linalg.solve(L.T, normal)
+    cross = own.factor.solve(kernel(theta, own.centres, relevant[chosen]))
+    together = np.concatenate([own.weights - np.matmul(cross, weights), weights], axis=1)
+    centres = np.concatenate([own.centres, relevant[chosen]])
+    return KernelExpansion(own.hyperparameters, centres, together), left_out
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +204,9 @@ class DynamicsPosterior:
         """
         count = self.settings.functions if functions is None else functions
         with single_threaded():
-            drawn = [one.draw(relevant, count, self.settings.pivots, rng) for one in self.components]
+            # Adjacent components of the same hyperparameters share their pivots and are evaluated together.
+            groups = [list(group) for _, group in groupby(self.components, lambda one: id(one.hyperparameters))]
+            drawn = [_drawn(group, relevant, count, self.settings.pivots, rng) for group in groups]
         return DynamicsDraws(self.model, self.data, *(tuple(part) for part in zip(*drawn, strict=True)))
 
     @property
@@ -315,10 +326,11 @@ def _conditioned(
     drawn: Sequence[Hyperparameters], Z: Array, Y: Array, centres: int, rng: np.random.Generator
 ) -> list[Component]:
     """Return the processes of those hyperparameters whose covariance matrix is positive definite."""
-    found = []
+    found: list[Component] = []
     for one in drawn:
-        try:
-            found.append(Component.conditioned(one, Z, Y, centres, rng))
-        except InputError:
+        if found and found[-1].hyperparameters is one:
+            found.append(found[-1].again(rng))
             continue
+        with contextlib.suppress(InputError):
+            found.append(Component.conditioned(one, Z, Y, centres, rng))
     return found

@@ -16,7 +16,7 @@ from scipy.special import gammaln, logsumexp
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
-from ctxval.gp.cholesky import factorise
+from ctxval.gp.cholesky import CholeskyFactor, factorise
 from ctxval.gp.regression import most_likely
 from ctxval.gp.subset import pivoted_rows
 from ctxval.learning.residual_kernel import ResidualKernel
@@ -119,7 +119,9 @@ def draw_hyperparameters(
         modes += of_family
     best = max(modes, key=lambda mode: mode.height)
     chosen = _resampled(np.concatenate(weights), count - 1, rng)
-    return [_of(best.kernel, best.mode), *(_of(*found[row]) for row in chosen)]
+    # A pair that is drawn again is the same object, so that what follows from it is computed once.
+    drawn_pairs = {row: _of(*found[row]) for row in chosen.tolist()}
+    return [_of(best.kernel, best.mode), *(drawn_pairs[row] for row in chosen.tolist())]
 
 
 def draw_prior(dimension: int, inputs: int, rng: np.random.Generator) -> Hyperparameters:
@@ -151,18 +153,26 @@ def log_posterior(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array)
     Raises:
         InputError: if the covariance matrix is not positive definite.
     """
-    within = np.clip(parameters, *_box(kernel, Z.shape[1]))
-    theta, noise = within[:-1], float(np.exp(within[-1]))
+    theta, noise = _within(kernel, parameters)
+    value, factor, scaled = _log_likelihood(kernel, theta, noise, Z, Y)
+    W = scaled @ scaled.T
+    W -= Y.shape[1] * factor.inverse()
+    W *= 0.5
+    gradient = np.append(kernel.weighted_gradient(theta, Z, W), noise * np.trace(W))
+    prior, slope = _log_prior(parameters)
+    return float(value + prior), gradient + slope
+
+
+def _log_likelihood(
+    kernel: ResidualKernel, theta: Array, noise: float, Z: Array, Y: Array
+) -> tuple[float, CholeskyFactor, Array]:
+    """Return the log likelihood, the factor of the covariance, and ``K^-1 y_i`` over the amplitudes, ``(N, n)``."""
     N, n = Y.shape
     factor = factorise(kernel(theta, Z, Z), noise)
     weights = factor.solve(Y)
     squares = np.maximum((Y * weights).sum(axis=0) / N, 1e-300)
     value = -0.5 * N * np.log(squares).sum() - n * factor.half_log_determinant()
-    scaled = weights / np.sqrt(squares)
-    W = 0.5 * (scaled @ scaled.T - n * factor.inverse())
-    gradient = np.append(kernel.weighted_gradient(theta, Z, W), noise * np.trace(W))
-    prior, slope = _log_prior(parameters)
-    return float(value + prior), gradient + slope
+    return float(value), factor, weights / np.sqrt(squares)
 
 
 def _log_prior(parameters: Array) -> tuple[float, Array]:
@@ -221,9 +231,10 @@ def _gradient_or_zero(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Ar
 def _log_posterior_or_none(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array) -> float:
     """Return the log density; minus infinity if the covariance is not positive definite."""
     try:
-        return log_posterior(kernel, parameters, Z, Y)[0]
+        value = _log_likelihood(kernel, *_within(kernel, parameters), Z, Y)[0]
     except InputError:
         return -np.inf
+    return value + _log_prior(parameters)[0]
 
 
 def _resampled(log_weights: Array, count: int, rng: np.random.Generator) -> Rows:
@@ -236,5 +247,10 @@ def _resampled(log_weights: Array, count: int, rng: np.random.Generator) -> Rows
 
 
 def _of(kernel: ResidualKernel, parameters: Array) -> Hyperparameters:
+    return Hyperparameters(kernel, *_within(kernel, parameters))
+
+
+def _within(kernel: ResidualKernel, parameters: Array) -> tuple[Array, float]:
+    """Return theta and the noise variance, within their bounds."""
     within = np.clip(parameters, *_box(kernel, len(parameters) - 3))
-    return Hyperparameters(kernel, within[:-1], float(np.exp(within[-1])))
+    return within[:-1], float(np.exp(within[-1]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,6 +36,10 @@ class KernelExpansion:
         for functions, rows in _blocks(*z.shape[:2]):
             values[functions, rows] += np.matmul(self._matern(z[functions, rows]), self.weights[functions])
         return np.asarray(values)
+
+    def repeated(self, count: int) -> KernelExpansion:
+        """Return the only function of this expansion, ``count`` times."""
+        return replace(self, weights=np.repeat(self.weights, count, axis=0))
 
     @functools.cached_property
     def _linear(self) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.gp.kernels import Bounds, Linear, Matern
+from ctxval.gp.kernels import Bounds, Linear, Matern, Towards
 
 _LINEAR = Linear(centre=0.0, variance=(1e-4, 1e6))
 
@@ -37,7 +37,19 @@ class ResidualKernel:
 
     def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
         """Return the covariances ``(n, m)``."""
-        return self._matern(theta, X, Z) * self._grown(X, Z) + _LINEAR(theta[-2:], X, Z)
+        return self.towards(theta, Z)(X)
+
+    def towards(self, theta: Array, Z: Array) -> Towards:
+        """Return the covariances with points ``(m, k)`` as a function of other points."""
+        matern = Matern(self.nu, ard=True).towards(self._unit(theta), Z)
+        linear = _LINEAR.towards(theta[-2:], Z)
+
+        def covariances(X: Array) -> Array:
+            found = self._grow(matern(X), X, Z)
+            found += linear(X)
+            return found
+
+        return covariances
 
     def diagonal(self, theta: Array, X: Array) -> Array:
         """Return the variances k(z, z), shape ``(n,)``."""
@@ -46,14 +58,18 @@ class ResidualKernel:
 
     def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
         """Return ``sum_ij W_ij dK_ij/dtheta`` for K = k(X, X) and a symmetric W, in the shape of theta."""
-        of_scales = Matern(self.nu, ard=True).weighted_gradient(self._unit(theta), X, W * self._grown(X, X))[1:]
+        grown = self._grow(W.copy(), X, X)
+        of_scales = Matern(self.nu, ard=True).weighted_gradient(self._unit(theta), X, grown)[1:]
         return np.concatenate([of_scales, _LINEAR.weighted_gradient(theta[-2:], X, W)])
 
-    def _matern(self, theta: Array, X: Array, Z: Array) -> Array:
-        return Matern(self.nu, ard=True)(self._unit(theta), X, Z)
-
-    def _grown(self, X: Array, Z: Array) -> Array:
-        return np.asarray(1 + self.growth * (self._inputs(X) @ self._inputs(Z).T))
+    def _grow(self, covariances: Array, X: Array, Z: Array) -> Array:
+        """Multiply covariances ``(n, m)`` by the growth with the inputs, and return them."""
+        if self.growth:
+            factors = self._inputs(X) @ self._inputs(Z).T
+            factors *= self.growth
+            factors += 1
+            covariances *= factors
+        return covariances
 
     def _inputs(self, Z: Array) -> Array:
         """Return the columns of the inputs; a system may have none."""
