@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 
 from ctxval._util.arrays import Array
@@ -34,6 +35,14 @@ class CholeskyFactor:
     def whiten(self, right: Array) -> Array:
         """Return ``L^-1 right``; if a column of ``right`` has covariance K, that of the result is the identity."""
         return np.asarray(dtrtrs(self.L, right, lower=1)[0])
+
+    def whiten_many(self, right: Array) -> Array:
+        """Return ``L^-1 right`` for many columns by a product with the inverse factor, which is faster.
+
+        Args:
+            right: shape ``(n, k)``, columns contiguous; it may be overwritten.
+        """
+        return np.asarray(dtrmm(1.0, self.inverse_factor, right, lower=1, overwrite_b=1))
 
     def inverse(self) -> Array:
         """Return ``K^-1``, shape ``(n, n)``."""

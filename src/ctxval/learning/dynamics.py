@@ -103,15 +103,18 @@ class Residual:
     def in_units(self, function: Callable[[Array], Array], x: Array, u: Array) -> Array:
         """Return a function of standardised pairs as a function of states and inputs, in the units of the states."""
         z = self.inputs(x, u)
-        bounded = np.clip(function(z.reshape(-1, z.shape[-1])), -self.limit, self.limit)
-        return np.asarray((self.scale_out * bounded).reshape(x.shape))
+        found = function(z.reshape(-1, z.shape[-1]))
+        np.maximum(found, -self.limit, out=found)
+        np.minimum(found, self.limit, out=found)
+        found *= self.scale_out
+        return found.reshape(x.shape)
 
     def variance(self, x: Array, u: Array) -> Array:
         """Return the posterior variance of the standardised residual, ``(...)``."""
         z = self.inputs(x, u)
         rows = z.reshape(-1, z.shape[-1])
         # For many rows, a product with the inverse factor is several times as fast as substitution.
-        half = self.process.factor.inverse_factor @ _KERNEL(self.theta, self.centres, rows)
+        half = self.process.factor.whiten_many(_KERNEL(self.theta, rows, self.centres).T)
         variance = _KERNEL.diagonal(self.theta, rows) - np.einsum("ij,ij->j", half, half)
         return np.asarray(np.maximum(variance, 0.0).reshape(z.shape[:-1]))
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import call
@@ -45,7 +45,7 @@ class ResidualExpansion:
         """Return the values ``(q, n)`` at standardised pairs ``(q, k)``."""
         own = rows / self.scales
         if self.weights.ndim == 3:
-            covariances = _matern(cdist(own, self.centres))
+            covariances = self._covariances(own)
             linear = self.constant + np.matmul(rows[:, None, :], self.slopes)[:, 0]
             return np.asarray(np.matmul(covariances[:, None, :], self.weights)[:, 0] + linear)
         output = self.constant + rows @ self.slopes
@@ -53,8 +53,31 @@ class ResidualExpansion:
         size = max(1, _CACHED // len(self.centres))
         for first in range(0, len(rows), size):
             block = slice(first, first + size)
-            output[block] += _matern(cdist(own[block], self.centres)) @ self.weights
+            output[block] += self._covariances(own[block]) @ self.weights
         return output
+
+    def _covariances(self, own: Array) -> Array:
+        """Return the Matern 5/2 covariances ``(q, M)`` of pairs in units of the length-scales, of unit variance."""
+        q, k = own.shape
+        extended = np.ones((q, k + 2))
+        extended[:, :k] = own
+        extended[:, k] = np.einsum("ij,ij->i", own, own)
+        r2 = extended @ self._factors
+        np.abs(r2, out=r2)  # rounding errors around zero
+        r = np.sqrt(r2)
+        r2 *= 1 / 3
+        r2 += r
+        r2 += 1
+        np.negative(r, out=r)
+        np.exp(r, out=r)
+        r *= r2
+        return np.asarray(r)
+
+    @functools.cached_property
+    def _factors(self) -> Array:
+        """Factors of a pair, of its square and of 1 in five times the squared distances, shape ``(k + 2, M)``."""
+        squares = (self.centres**2).sum(axis=1)
+        return 5 * np.stack([*(-2 * self.centres.T), np.ones(len(squares)), squares])
 
     def __repr__(self) -> str:
         return call(self, centres=self.centres, weights=self.weights)
@@ -85,14 +108,3 @@ def _parts(theta: Array) -> tuple[float, Array, float, float]:
     values = np.exp(theta)
     return float(values[0]), values[1:-2], float(values[-2]), float(values[-1])
 
-
-def _matern(r: Array) -> Array:
-    """Return the Matern 5/2 covariance of distances; the argument is overwritten."""
-    r *= np.sqrt(5.0)
-    decay = np.exp(-r)
-    polynomial = r * (1 / 3)
-    polynomial += 1
-    polynomial *= r
-    polynomial += 1
-    decay *= polynomial
-    return decay

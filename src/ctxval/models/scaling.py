@@ -70,11 +70,13 @@ class IncrementScaling:
 
 def standardised_pairs(x: Array, u: Array, shift: Array, scale: Array) -> Array:
     """Return ``((x, u) - shift) / scale``, shape ``(..., n + m)``, for states ``(..., n)`` and inputs ``(..., m)``."""
-    batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+    batch = x.shape[:-1] if x.shape[:-1] == u.shape[:-1] else np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
     n = x.shape[-1]
     z = np.empty((*batch, n + u.shape[-1]))
     z[..., :n], z[..., n:] = x, u
-    return (z - shift) / scale
+    z -= shift
+    z /= scale
+    return z
 
 
 def standard_deviations(columns: Array) -> Array:
