@@ -11,8 +11,8 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.learning.hyperparameters import Hyperparameters
 
-_ROWS = 128
-"""Number of arguments that are evaluated together, so that intermediate results stay in the processor's cache."""
+_CACHED = 20_000
+"""Number of covariances that are computed together, so that intermediate results stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class KernelExpansion:
         """Return the values ``(S, q, n)`` of each function at arguments of its own, ``(S, q, k)``."""
         constants, slopes = self._linear
         values = np.matmul(z, slopes) + constants[:, None, :]
-        for functions, rows in _blocks(*z.shape[:2]):
+        for functions, rows in _blocks(*z.shape[:2], max(1, _CACHED // len(self.centres))):
             values[functions, rows] += np.matmul(self._matern(z[functions, rows]), self.weights[functions])
         return np.asarray(values)
 
@@ -68,12 +68,15 @@ class KernelExpansion:
         r2 += (own**2).sum(axis=-1)[..., None]
         np.maximum(r2, 0.0, out=r2)
         r = np.sqrt(r2)
-        decay = np.exp(-r)
+        # The same array holds the squares, the polynomial's quadratic term, and then the decay.
         if kernel.nu == 2.5:
             r2 *= 1 / 3
-            r += r2
-        r += 1
-        decay *= r
+            polynomial = np.add(r, r2)
+            polynomial += 1
+        else:
+            polynomial = np.add(r, 1)
+        decay = np.exp(np.negative(r, out=r), out=r2)
+        decay *= polynomial
         if kernel.growth:
             first = z.shape[-1] - kernel.inputs
             growth = z[..., first:] @ (kernel.growth * self.centres[:, first:].T)
@@ -82,11 +85,11 @@ class KernelExpansion:
         return np.asarray(decay)
 
 
-def _blocks(functions: int, arguments: int) -> Iterator[tuple[slice, slice]]:
-    """Yield blocks of functions and arguments that are evaluated together."""
-    if functions * arguments <= _ROWS:
+def _blocks(functions: int, arguments: int, largest: int) -> Iterator[tuple[slice, slice]]:
+    """Yield blocks of functions and arguments that are evaluated together, no more than ``largest`` arguments."""
+    if functions * arguments <= largest:
         yield slice(None), slice(None)
         return
     for one in range(functions):
-        for first in range(0, arguments, _ROWS):
-            yield slice(one, one + 1), slice(first, first + _ROWS)
+        for first in range(0, arguments, largest):
+            yield slice(one, one + 1), slice(first, first + largest)

@@ -107,4 +107,3 @@ def _parts(theta: Array) -> tuple[float, Array, float, float]:
     """Return Matern variance, length-scales, and the linear kernel's constant and slope variances."""
     values = np.exp(theta)
     return float(values[0]), values[1:-2], float(values[-2]), float(values[-1])
-

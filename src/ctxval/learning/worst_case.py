@@ -207,11 +207,17 @@ class WorstCaseSearch:
             moved = self._moves(points, second, share, rng)
             found = _finite(self.planner.own_distances(draws, moved))
             together = _together(points, best, moved, found)[:, None]
-            last = _finite(self.planner.own_distances(draws, together))
+            last = self._new_distances(draws, together, np.concatenate([points[:, None], moved], axis=1))
             tried, found = np.concatenate([moved, together], axis=1), np.concatenate([found, last], axis=1)
             points, best = _better(points, best, tried, found)
             loops += tried.shape[1]
         return points, best, loops
+
+    def _new_distances(self, draws: DynamicsDraws, tasks: Array, known: Array) -> Array:
+        """Return the distances ``(S, 1)`` of each draw on its task; minus infinity if none of them is a new one."""
+        if (tasks == known).all(axis=2).any(axis=1).all():
+            return np.full(tasks.shape[:2], -np.inf)
+        return _finite(self.planner.own_distances(draws, tasks))
 
     def _exchanged(self, draws: DynamicsDraws, points: Array, best: Array) -> tuple[Array, Array, int]:
         """Return the better of each draw's best point and the best points of all others, and the number of loops."""
