@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
 from ctxval import searches
 from ctxval._util.arrays import Array
 from ctxval.gp.kernels import Matern
-from ctxval.gp.subset import LONG, kept_rows, pivoted_rows
+from ctxval.gp.subset import LONG, kept_rows, pivoted_cholesky, pivoted_rows
 
 
 def long_history(count: int, dimension: int = 2, failed: int = 0) -> tuple[Array, Array]:
@@ -109,3 +111,17 @@ def test_each_pivot_has_the_largest_variance_that_those_before_it_leave() -> Non
 def test_pivots_end_where_the_others_add_nothing() -> None:
     X = np.repeat(np.random.default_rng(0).random((3, 2)), 5, axis=0)
     assert len(pivoted_rows(Matern(), np.log([1.0, 0.5]), X, 10, least=1e-9)) == 3
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 12), st.integers(1, 12))
+def test_a_pivoted_factor_is_that_of_the_chosen_rows(seed: int, count: int, rank: int) -> None:
+    root = np.random.default_rng(seed).normal(size=(12, rank))
+    matrix = root @ root.T
+    found = pivoted_cholesky(np.diag(matrix), lambda row: matrix[row].copy(), count, least=1e-9)
+    assert len(found.rows) == min(count, rank)
+    chosen = matrix[np.ix_(found.rows, found.rows)]
+    np.testing.assert_allclose(found.L @ found.L.T, chosen, atol=1e-8)
+    np.testing.assert_array_equal(np.triu(found.L, 1), 0.0)
+    others = matrix[found.rows]
+    left = matrix - others.T @ np.linalg.pinv(chosen, rcond=1e-12) @ others if count else matrix
+    np.testing.assert_allclose(found.left, np.maximum(np.diag(left), 0.0), atol=1e-5 * np.trace(matrix))

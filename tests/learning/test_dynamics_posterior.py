@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -302,3 +304,29 @@ def test_factors_are_of_the_covariance_of_the_centres() -> None:
     one = component()
     kernel, theta = one.hyperparameters.kernel, one.hyperparameters.theta
     np.testing.assert_allclose(one.factor.L, factorise(kernel(theta, one.centres, one.centres), NOISE).L)
+
+
+def test_components_of_equal_hyperparameters_are_drawn_as_if_alone() -> None:
+    posterior = learn(record(40, truth=models.Function(rough, vectorized=True)))
+    names = [id(one.hyperparameters) for one in posterior.components]
+    assert len(set(names)) < len(names)  # resampling repeats likely hyperparameters
+    together = posterior.draw(posterior.data.pairs, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    alone = [
+        one.draw(posterior.data.pairs, posterior.settings.functions, posterior.settings.pivots, rng)[0]
+        for one in posterior.components
+    ]
+    assert len(together) == sum(len(one.weights) for one in alone)
+    found = [weights for one in together.expansions for weights in one.weights]
+    for weights, expected in zip(found, (weights for one in alone for weights in one.weights), strict=True):
+        np.testing.assert_array_equal(weights, expected)
+
+
+def test_pairs_that_are_not_finite_have_a_finite_residual() -> None:
+    posterior = learn(record(20, truth=models.Function(rough, vectorized=True)))
+    draws = posterior.draw(posterior.data.pairs, np.random.default_rng(0))
+    x, u = np.zeros((len(draws), 4, 2)), np.zeros((len(draws), 4, 1))
+    u[:, :, 0] = [np.nan, np.inf, -np.inf, 1e300]
+    still = models.Function(lambda x, u: x, vectorized=True)
+    residuals = replace(draws, model=still).step(x, u)
+    assert np.isfinite(residuals).all()

@@ -172,3 +172,20 @@ def test_pairs_of_loops_that_diverge_are_left_out() -> None:
 @pytest.mark.parametrize(("dimension", "evaluations"), [(1, 512), (2, 2048), (3, 4096), (4, 6000), (20, 12000)])
 def test_few_task_parameters_need_fewer_loops(dimension: int, evaluations: int) -> None:
     assert WorstCaseSettings.for_dimension(dimension).evaluations == evaluations
+
+
+class Counting(LoopPlanner):
+    """A planner that counts the batches of tasks of the draws' own."""
+
+    batches = 0
+
+    def own_distances(self, draws: DynamicsDraws, points: Array) -> Array:
+        self.batches += 1
+        return super().own_distances(draws, points)
+
+
+def test_loops_whose_distance_is_known_are_not_run_again() -> None:
+    planner = Counting(make_planner(1).validation)
+    search = WorstCaseSearch(planner, 0, WorstCaseSettings(pool=16, evaluations=80, elites=4, shared=4, rounds=3))
+    search.maxima(learned(), np.empty((0, 1)), np.random.default_rng(0))
+    assert planner.batches == 3  # with one task parameter, all moves that help together are one of the moves

@@ -244,7 +244,9 @@ class DynamicsDraws:
         """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
         with np.errstate(all="ignore"):
             z = self.data.standardised(x, u)
-            np.clip(np.nan_to_num(z, copy=False, posinf=_LARGEST, neginf=-_LARGEST), -_LARGEST, _LARGEST, out=z)
+            np.maximum(z, -_LARGEST, out=z)
+            np.minimum(z, _LARGEST, out=z)
+            z[np.isnan(z)] = 0.0
             residuals, learned, first = np.zeros_like(x), self.data.learned, 0
             for one in self.expansions:
                 last = first + len(one.weights)

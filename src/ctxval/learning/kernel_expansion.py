@@ -33,7 +33,8 @@ class KernelExpansion:
         """Return the values ``(S, q, n)`` of each function at arguments of its own, ``(S, q, k)``."""
         constants, slopes = self._linear
         values = np.matmul(z, slopes) + constants[:, None, :]
-        for functions, rows in _blocks(*z.shape[:2], max(1, _CACHED // len(self.centres))):
+        largest = max(1, _CACHED // len(self.centres))
+        for functions, rows in _blocks(z.shape[0], z.shape[1], largest):
             values[functions, rows] += np.matmul(self._matern(z[functions, rows]), self.weights[functions])
         return np.asarray(values)
 

@@ -84,7 +84,7 @@ class WorstCase:
         points: where it lies, points of the unit cube ``(S, d)``.
         of_mean: the largest distance on the posterior mean.
         elites: tasks with large distances on the posterior mean, points ``(e, d)``, the largest first.
-        evaluations: number of closed loops that were run.
+        evaluations: number of closed loops that were compared; a few of them may be the same.
         left_out: largest share of the posterior variance that a draw leaves out between its pivots.
         unplanned: share of the pool's tasks for which no controller can be designed, or on which M diverges.
     """
