@@ -182,7 +182,7 @@ class ResidualsWithout:
 
     def __getitem__(self, rows: Rows) -> ResidualsWithout:
         """Return some of the residuals."""
-        parts = {name: getattr(self.expansion, name)[rows] for name in ("weights", "constant", "slopes")}
+        parts = {name: getattr(self.expansion, name)[rows] for name in ("weights", "linear")}
         return ResidualsWithout(self.residual, replace(self.expansion, **parts))
 
     def __repr__(self) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,47 +21,50 @@ class ResidualExpansion:
     """A sum of covariances with centres, as a function of standardised pairs ``(q, k)``.
 
     Attributes:
-        scales: length-scales of the Matern part, shape ``(k,)``.
-        centres: the centres in units of the length-scales, shape ``(M, k)``.
+        factors: factors of a pair, of its squared entries and of 1 in the squared arguments of the Matern function,
+            shape ``(2 k + 1, M)``.
         weights: weights of the Matern part, shape ``(M, n)``, or ``(q, M, n)`` if each pair has its own.
-        constant, slopes: the linear part, shapes ``(n,)`` and ``(k, n)``, or with the same first axis.
+        linear: the same factors in the linear part, shape ``(2 k + 1, n)``, or with the same first axis.
     """
 
-    scales: Array
-    centres: Array
+    factors: Array
     weights: Array
-    constant: Array
-    slopes: Array
+    linear: Array
 
     @classmethod
     def of(cls, theta: Array, centres: Array, weights: Array) -> ResidualExpansion:
         """Return the expansion with centres ``(M, k)``, and weights of the whole covariance."""
         variance, scales, constant, slope = _parts(theta)
-        linear = constant * weights.sum(axis=-2), slope * np.matmul(centres.T, weights)
-        return cls(scales, centres / scales, variance * weights, *linear)
+        inverse = 5 / scales**2
+        squares = (inverse * centres**2).sum(axis=1)
+        factors = [*(-2 * inverse * centres).T, *np.repeat(inverse[:, None], len(centres), axis=1), squares]
+        slopes = slope * np.matmul(centres.T, weights)
+        constants = constant * weights.sum(axis=-2, keepdims=True)
+        return cls(
+            np.stack(factors), variance * weights, np.concatenate([slopes, np.zeros_like(slopes), constants], axis=-2)
+        )
 
     def __call__(self, rows: Array) -> Array:
         """Return the values ``(q, n)`` at standardised pairs ``(q, k)``."""
-        own = rows / self.scales
+        q, k = rows.shape
+        extended = np.ones((q, 2 * k + 1))
+        extended[:, :k] = rows
+        np.multiply(rows, rows, out=extended[:, k : 2 * k])
         if self.weights.ndim == 3:
-            covariances = self._covariances(own)
-            linear = self.constant + np.matmul(rows[:, None, :], self.slopes)[:, 0]
-            return np.asarray(np.matmul(covariances[:, None, :], self.weights)[:, 0] + linear)
-        output = self.constant + rows @ self.slopes
+            covariances = self._covariances(extended)[:, None, :]
+            found = np.matmul(covariances, self.weights) + np.matmul(extended[:, None, :], self.linear)
+            return np.asarray(found[:, 0])
+        output = extended @ self.linear
         # Blocks whose covariances stay in the processor's cache take half the time.
-        size = max(1, _CACHED // len(self.centres))
-        for first in range(0, len(rows), size):
+        size = max(1, _CACHED // self.factors.shape[1])
+        for first in range(0, q, size):
             block = slice(first, first + size)
-            output[block] += self._covariances(own[block]) @ self.weights
-        return output
+            output[block] += self._covariances(extended[block]) @ self.weights
+        return np.asarray(output)
 
-    def _covariances(self, own: Array) -> Array:
-        """Return the Matern 5/2 covariances ``(q, M)`` of pairs in units of the length-scales, of unit variance."""
-        q, k = own.shape
-        extended = np.ones((q, k + 2))
-        extended[:, :k] = own
-        extended[:, k] = np.einsum("ij,ij->i", own, own)
-        r2 = extended @ self._factors
+    def _covariances(self, extended: Array) -> Array:
+        """Return the Matern 5/2 covariances ``(q, M)`` of unit variance of pairs with their squares and 1."""
+        r2 = extended @ self.factors
         np.abs(r2, out=r2)  # rounding errors around zero
         r = np.sqrt(r2)
         r2 *= 1 / 3
@@ -73,14 +75,8 @@ class ResidualExpansion:
         r *= r2
         return np.asarray(r)
 
-    @functools.cached_property
-    def _factors(self) -> Array:
-        """Factors of a pair, of its square and of 1 in five times the squared distances, shape ``(k + 2, M)``."""
-        squares = (self.centres**2).sum(axis=1)
-        return 5 * np.stack([*(-2 * self.centres.T), np.ones(len(squares)), squares])
-
     def __repr__(self) -> str:
-        return call(self, centres=self.centres, weights=self.weights)
+        return call(self, centres=self.factors.shape[1], weights=self.weights)
 
 
 def weights_without(covariance: Array, noise: float, outputs: Array, gone: Mask) -> Array:
