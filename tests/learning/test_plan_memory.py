@@ -6,6 +6,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Task, controllers, models
 from ctxval._util.arrays import Array
+from ctxval._util.progress import Progress, listening, stage
 from ctxval.learning import plan_memory
 from ctxval.learning.plan_memory import PlanMemory
 
@@ -58,3 +59,14 @@ def test_the_oldest_plans_make_room_for_new_ones(monkeypatch: pytest.MonkeyPatch
     assert not plans.has(POINTS[0])
     assert repr(plans).startswith("PlanMemory(")
     assert synthesizer.designed >= len(POINTS)
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_each_task_is_counted_once_whether_it_is_planned_or_kept(batched: bool) -> None:
+    plans, _ = memory(batched)
+    assert plans.planner.batched is batched  # found out before the count, with tasks of its own
+    heard: list[Progress] = []
+    with listening(heard.append), stage("choosing a task", unit="designs"):
+        plans.plan(POINTS)
+        plans.plan(POINTS)
+    assert heard[-1].done == 2 * len(POINTS)

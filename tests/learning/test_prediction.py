@@ -8,6 +8,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Task, TaskSpace, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
+from ctxval._util.progress import Progress, listening, stage
 from ctxval.cases import linear
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning import prediction
@@ -142,3 +143,14 @@ def test_slow_designs_are_spread_over_processes_and_come_out_the_same(monkeypatc
         # What other processes design leaves no trace here.
         assert (len(designers) > before) == (slow > 0)
     np.testing.assert_array_equal(*results)
+
+
+def test_progress_counts_each_predicted_task_once() -> None:
+    validation = make_validation()
+    prediction = predict_distance(validation, [])
+    assert prediction is not None
+    prediction.expected(np.array([[0.05]]))  # it finds out first whether controllers are designed in batches
+    heard: list[Progress] = []
+    with listening(heard.append), stage("choosing a task", unit="designs"):
+        prediction.expected(np.linspace(0, 1, 7)[:, None])
+    assert heard[-1].done == 7

@@ -46,7 +46,6 @@ def predict_from(predictor: DistancePredictor, store: Store, trials: Sequence[Tr
         predictor: predicts d(p) from executions.
         store: the store of the trajectories.
         trials: all trials.
-        errors: keeps the vectors of earlier executions.
     """
     executed = executed_trials(store, trials)
     prediction = predictor.predict([(trial.unit_point, trajectory) for trial, trajectory in executed])

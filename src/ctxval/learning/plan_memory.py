@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.progress import advance
 from ctxval._util.representation import call
 from ctxval.core.validation import Validation
 from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks
@@ -46,6 +47,7 @@ class PlanMemory:
         key = points.tobytes()
         if key in self._kept:
             self._kept.move_to_end(key)
+            advance(len(points))  # the planner reports only the tasks that it plans
             return self._kept[key][0]
         planned = self.planner.plan(points, together=max(1, len(points)))
         size = sum(map(_size, planned)) + len(key)

@@ -15,7 +15,6 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.cores import on_all_cores
-from ctxval._util.progress import advance
 from ctxval._util.representation import call
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.model import Model, Step
@@ -211,7 +210,6 @@ class _PredictedDistance:
             rows = planned.rows
             try:
                 distance[rows], doubt[rows] = self._closed_loops(planned, residual(rows))
-                advance(len(rows))
             except Exception:  # the user's controller, on states that may never be reached
                 for half in np.array_split(rows, 2) if len(rows) > 1 else []:
                     distance[half], doubt[half] = self._looped(points[half], functools.partial(_of, residual, half))
