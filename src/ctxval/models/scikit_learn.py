@@ -110,13 +110,16 @@ class ScikitLearn:
 
         The formula gives what ``predict`` gives, without its checks, which take longer than the formula on few rows.
         """
-        formula = self._formula()
-        if formula is not None:
-            return np.concatenate([formula.value(block) for block in _blocks(rows)])
         finite: Mask = np.asarray(np.isfinite(rows).all(axis=-1, keepdims=True))
         if finite.all():
+            return self._predicted_finite(rows)
+        return np.where(finite, self._predicted_finite(np.where(finite, rows, 0.0)), np.nan)
+
+    def _predicted_finite(self, rows: Array) -> Array:
+        formula = self._formula()
+        if formula is None:
             return _as_columns(self.regressor.predict(rows))
-        return np.where(finite, _as_columns(self.regressor.predict(np.where(finite, rows, 0.0))), np.nan)
+        return np.concatenate([formula.value(block) for block in _blocks(rows)])
 
     def _formula(self) -> SmoothMap | None:
         # It is read again each time, because a regressor may be fitted again.
