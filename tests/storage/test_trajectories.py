@@ -13,7 +13,7 @@ from ctxval import Store, Trajectory, Trial
 from ctxval.errors import ForeignStoreError
 from ctxval.storage.database import Database
 from ctxval.storage.rows import checksum_of
-from ctxval.storage.trajectories import StoredTrajectories
+from ctxval.storage.trajectories import Side, StoredTrajectories
 
 
 def trajectory(seed: int, steps: int = 3) -> Trajectory:
@@ -58,6 +58,17 @@ def test_a_trajectory_in_memory_cannot_be_changed(tmp_path: Path) -> None:
     found = store.trajectories([0], "system")[0]
     with pytest.raises(ValueError, match="read-only"):
         found.states[0] = 7.0
+
+
+@pytest.mark.parametrize("side", ["model", "system"])
+def test_a_single_trajectory_belongs_to_the_caller(side: Side) -> None:
+    store = Store()
+    add(store, 0, trajectory(0))
+    for _ in range(2):
+        found = store.trajectory(0, side)
+        assert found is not None
+        np.testing.assert_array_equal(found.states, trajectory(0).states)
+        found.states[:] = found.inputs[:] = 7.0
 
 
 def test_trajectories_of_the_model_are_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

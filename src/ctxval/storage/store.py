@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -318,7 +319,7 @@ class Store:
         return int(row[0]), int(row[1]), int(row[2])
 
     def trajectory(self, number: int, side: Side) -> Trajectory | None:
-        """Return a stored trajectory of a trial. Returns None if there is none.
+        """Return a stored trajectory of a trial, whose arrays may be changed. Returns None if there is none.
 
         Args:
             number: the number of the trial.
@@ -327,7 +328,9 @@ class Store:
         Raises:
             ForeignStoreError: if the trajectory is damaged.
         """
-        return self.trajectories([number], side).get(number)
+        found = self.trajectories([number], side).get(number)
+        # Some distances change the arrays that they are given.
+        return None if found is None else replace(found, states=found.states.copy(), inputs=found.inputs.copy())
 
     def trajectories(self, numbers: Iterable[int], side: Side) -> dict[int, Trajectory]:
         """Return stored trajectories by the numbers of their trials; a trial without one is left out.
