@@ -41,6 +41,7 @@ def test_requests_of_every_kind() -> None:
         ({"seen": "1", "how": "own", **{f"parameter-{k}": "nan" for k in range(3)}}, "goal must be a number"),
         ({"seen": "1", "how": "again"}, "the trial must be a whole number"),
         ({"seen": "1" * 5000, "how": "next"}, "must be a whole number"),
+        ({"seen": "1" * 400, "how": "next"}, "must be a whole number"),
     ],
 )
 def test_a_request_that_cannot_be_used_is_refused(fields: dict[str, str], sentence: str) -> None:

@@ -61,6 +61,13 @@ def test_the_reason_of_a_choice(asked: Trial, sentences: list[str]) -> None:
 KEYS = st.sampled_from(["how", "why", "expected", "doubt", PREDICTION])
 
 
+@pytest.mark.parametrize(
+    "note", [{"expected": 10**400}, {PREDICTION: {**PREDICTED.to_json(), "deviation": 10**400}}]
+)
+def test_numbers_of_a_note_may_be_too_large(note: dict[str, Any]) -> None:
+    assert why(trial("acquisition", note), "m")
+
+
 @given(st.dictionaries(KEYS, JSON), st.text(), st.sampled_from(["iid", "initial", "acquisition", "covering", "manual"]))
 def test_no_note_is_too_odd(note: dict[str, Any], units: str, origin: Origin) -> None:
     for sentence in why(trial(origin, note), units):

@@ -84,7 +84,7 @@ class ExecutionPrediction:
                 _rows(values["deviations"]),
                 float(values["diverged"]),
             )
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             return None
         return found if found._is_consistent else None
 

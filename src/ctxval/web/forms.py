@@ -85,8 +85,9 @@ def _read(fields: Fields, field: str, sentence: str, kind: Callable[[str], Numbe
     given = fields.get(field, "").strip()
     try:
         value = kind(given)
-    except ValueError:
-        raise InputError(f"{sentence}, got {given[:60]!r}.") from None
-    if not math.isfinite(value):
-        raise InputError(f"{sentence}, got {given!r}.")
+        finite = math.isfinite(value)
+    except (ValueError, OverflowError):  # a whole number may be too large for a float
+        finite = False
+    if not finite:
+        raise InputError(f"{sentence}, got {given[:60]!r}.")
     return value

@@ -51,7 +51,7 @@ def why(trial: Trial, units: str) -> list[str]:
 
 def _reason(trial: Trial, note: Mapping[str, Any], units: str) -> str:
     expected = note.get("expected")
-    if trial.origin == "acquisition" and isinstance(expected, int | float) and math.isfinite(expected):
+    if trial.origin == "acquisition" and isinstance(expected, int | float) and abs(expected) < math.inf:
         return (
             f"The search expects a distance of {number(expected)} {text(units)}".rstrip()
             + " here, the largest in the region that it examines."
