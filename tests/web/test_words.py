@@ -61,9 +61,7 @@ def test_the_reason_of_a_choice(asked: Trial, sentences: list[str]) -> None:
 KEYS = st.sampled_from(["how", "why", "expected", "doubt", PREDICTION])
 
 
-@pytest.mark.parametrize(
-    "note", [{"expected": 10**400}, {PREDICTION: {**PREDICTED.to_json(), "deviation": 10**400}}]
-)
+@pytest.mark.parametrize("note", [{"expected": 10**400}, {PREDICTION: {**PREDICTED.to_json(), "deviation": 10**400}}])
 def test_numbers_of_a_note_may_be_too_large(note: dict[str, Any]) -> None:
     assert why(trial("acquisition", note), "m")
 
