@@ -154,3 +154,21 @@ def test_progress_counts_each_predicted_task_once() -> None:
     with listening(heard.append), stage("choosing a task", unit="designs"):
         prediction.expected(np.linspace(0, 1, 7)[:, None])
     assert heard[-1].done == 7
+
+
+class InPlace:
+    """A distance that changes the arrays that it is given."""
+
+    def __call__(self, model: Trajectory, system: Trajectory, task: Task) -> Array:
+        for one in (model, system):
+            one.states[..., 0] -= 1.0
+        return np.asarray(np.abs(model.states[..., -1, 0] - system.states[..., -1, 0]))
+
+
+def test_a_distance_that_changes_its_arrays_does_not_change_later_predictions() -> None:
+    validation = make_validation().with_distance(InPlace())
+    points = np.linspace(0.1, 0.9, 4)[:, None]
+    prediction = predict_distance(validation, executed(validation, points))
+    assert prediction is not None
+    first = prediction.left_out(np.arange(4))
+    np.testing.assert_array_equal(prediction.left_out(np.arange(4)), first)

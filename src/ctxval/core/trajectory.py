@@ -110,6 +110,10 @@ class Trajectory:
         whole = np.isfinite(self.states).all(axis=(-1, -2)) & np.isfinite(self.inputs).all(axis=(-1, -2))
         return np.asarray(whole)
 
+    def copy(self) -> Trajectory:
+        """Return the same trajectory with arrays of its own, which may be changed."""
+        return Trajectory(self.times.copy(), self.states.copy(), self.inputs.copy(), self.ended)
+
     def __getitem__(self, index: int) -> Trajectory:
         """Return one trajectory of the batch; the batch's ``ended`` applies to trajectories that are not finite."""
         one = Trajectory(self.times, self.states[index], self.inputs[index])

@@ -185,7 +185,8 @@ class LoopPlanner:
         """
         try:
             with np.errstate(all="ignore"):
-                values = np.asarray(self.validation.distance(model, system, task), dtype=np.float64)
+                # The trajectories are used again, and some distances change the arrays that they are given.
+                values = np.asarray(self.validation.distance(model.copy(), system.copy(), task), dtype=np.float64)
             if values.shape == model.batch_shape:
                 return np.where(np.isfinite(values), values, np.inf)
         except Exception:  # the user's distance

@@ -49,7 +49,8 @@ class ErrorVectors:
         known = self._known.get(trajectory)
         if known is None:
             plan = self.validation.plan(self.validation.space.from_unit(point))
-            known = self._known[trajectory] = distance.error(plan.model_trajectory, trajectory, plan.task)
+            # Some distances change the arrays that they are given.
+            known = self._known[trajectory] = distance.error(plan.model_trajectory, trajectory.copy(), plan.task)
         return known
 
     def __repr__(self) -> str:

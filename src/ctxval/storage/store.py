@@ -6,7 +6,6 @@ import json
 import os
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -330,7 +329,7 @@ class Store:
         """
         found = self.trajectories([number], side).get(number)
         # Some distances change the arrays that they are given.
-        return None if found is None else replace(found, states=found.states.copy(), inputs=found.inputs.copy())
+        return None if found is None else found.copy()
 
     def trajectories(self, numbers: Iterable[int], side: Side) -> dict[int, Trajectory]:
         """Return stored trajectories by the numbers of their trials; a trial without one is left out.
