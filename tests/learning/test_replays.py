@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from conftest import make_validation
-from ctxval import Validation, models
+from ctxval import Task, Validation, controllers, models
+from ctxval._util.progress import Progress, listening, stage
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning import replay_executed
 
@@ -61,3 +62,42 @@ def test_nothing_is_replayed_if_nothing_can_be_learned_or_planned() -> None:
     parts = ("space", "task", "system", "model", "distance")
     other = Validation(**{part: getattr(validation, part) for part in parts}, synthesizer=Refusing())  # type: ignore[arg-type]
     assert replay_executed(other, [], [np.array([0.5])]) == [None]
+
+
+class Solving(controllers.LQR):
+    """A user's synthesizer, whose method of this name is another one."""
+
+    def solve(self, riccati: object) -> None:
+        raise RuntimeError("no matrix")
+
+
+class InPlace:
+    """A distance that changes the arrays that it is given."""
+
+    def __call__(self, model: Trajectory, system: Trajectory, task: Task) -> np.ndarray:
+        found = np.abs(model.states[..., -1, 0] - system.states[..., -1, 0])
+        system.states[...] = 0.0
+        return np.asarray(found)
+
+
+def test_a_method_of_the_synthesizer_that_is_another_one_loses_no_replay() -> None:
+    validation = make_validation()
+    validation.synthesizer = Solving([1.0, 0.1], [1e-2], [10.0, 1.0])
+    replay = replay_executed(validation, [], [np.array([0.5])])[0]
+    assert replay is not None
+    assert replay.converged is None
+    assert np.isfinite(replay.distance)
+
+
+def test_a_distance_that_changes_its_arrays_does_not_change_the_replay() -> None:
+    replay = replay_executed(make_validation().with_distance(InPlace()), [], [np.array([0.5])])[0]
+    assert replay is not None
+    assert replay.corrected is not None
+    assert replay.corrected.states.any()
+
+
+def test_each_replay_is_reported() -> None:
+    heard: list[Progress] = []
+    with listening(heard.append), stage("replaying executed tasks", 2, "tasks"):
+        replay_executed(make_validation(), [], [np.array([0.2]), np.array([0.7])])
+    assert (heard[-1].done, heard[-1].expected) == (2, 2)

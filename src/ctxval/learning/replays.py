@@ -7,12 +7,14 @@ system did. The system is never executed.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.progress import advance
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
@@ -108,6 +110,7 @@ class _OneCorrected:
 
 
 def _replayed(validation: Validation, model: _OneCorrected | None, point: Array) -> Replay | None:
+    advance()
     space = validation.space
     try:
         task = validation.task(space.parameters(space.from_unit(point)))
@@ -121,7 +124,8 @@ def _replayed(validation: Validation, model: _OneCorrected | None, point: Array)
         promised = rollout(validation.model.step, controller, task)
         predicted = rollout(model.step, controller, task)
         with np.errstate(all="ignore"):
-            distance = float(validation.distance(promised, predicted, task))
+            # Some distances change the arrays that they are given.
+            distance = float(validation.distance(promised, predicted.copy(), task))
     except Exception:  # the same
         return nothing
     finite = bool(predicted.finite.all()) and np.isfinite(distance)
@@ -132,8 +136,9 @@ def _designed(validation: Validation, task: Task) -> tuple[Controller, bool | No
     """Return the controller of a task, and whether its design converged, if the synthesizer tells."""
     solve = getattr(validation.synthesizer, "solve", None)
     if callable(solve):
-        solution = solve(task, validation.model)
-        controller, converged = getattr(solution, "controller", None), getattr(solution, "converged", None)
-        if callable(controller) and converged is not None:
-            return controller, bool(np.all(converged))
+        with contextlib.suppress(Exception):  # a user's synthesizer may have another method of this name
+            solution = solve(task, validation.model)
+            controller, converged = getattr(solution, "controller", None), getattr(solution, "converged", None)
+            if callable(controller) and converged is not None:
+                return controller, bool(np.all(converged))
     return validation.synthesizer.design(task, validation.model), None

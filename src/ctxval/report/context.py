@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.progress import stage
 from ctxval._util.representation import call
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.dynamics import NEAR
@@ -212,7 +213,8 @@ class ReportContext:
         by_number = {trial.number: trial for trial in self.completed}
         numbers = list(self.recordings)[: MOST_REPLAYS if quick else _SLOW_REPLAYS]
         executed = [(by_number[number].unit_point, one.system) for number, one in self.recordings.items()]
-        found = replay_executed(self.validation, executed, [by_number[number].unit_point for number in numbers])
+        with stage("replaying executed tasks", len(numbers), "tasks"):
+            found = replay_executed(self.validation, executed, [by_number[number].unit_point for number in numbers])
         return {number: one for number, one in zip(numbers, found, strict=True) if one is not None}
 
     def __repr__(self) -> str:
