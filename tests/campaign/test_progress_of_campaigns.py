@@ -58,7 +58,7 @@ def test_choosing_counts_designs_towards_what_is_expected() -> None:
     assert designs[0].done == 0
     assert [report.done for report in designs] == sorted(report.done for report in designs)
     assert 40 <= designs[-1].done <= 220  # a choice that leaves its region needs two ascents
-    assert any(report.expected == 102 for report in designs)
+    assert any(report.expected == 73 for report in designs)  # a usual search, and the two known points
     assert last_of(reports)["predicting the execution"].done > 0
 
 

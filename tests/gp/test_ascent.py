@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctxval._util.arrays import Array
-from ctxval.gp.ascent import Ascent
+from ctxval.gp.ascent import Ascent, usual_evaluations
 
 
 def maximum(function: object, dimension: int, budget: int = 1500, seed: int = 0) -> tuple[Array, float]:
@@ -92,3 +92,18 @@ def test_in_few_dimensions_the_function_is_asked_for_the_same_points_each_time()
 def test_the_same_randomness_finds_the_same_points() -> None:
     first, again = (maximum(lambda X: np.sin(9 * X).prod(axis=1), 5, seed=3) for _ in range(2))
     np.testing.assert_array_equal(first[0], again[0])
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 3, 4, 11])
+@pytest.mark.parametrize("budget", [150, 400, 2000])
+def test_the_usual_number_of_evaluations_is_about_that_of_a_search(dimension: int, budget: int) -> None:
+    seen: list[int] = []
+
+    def function(X: Array) -> Array:
+        seen.append(len(X))
+        return np.asarray(np.exp(-np.abs(X - 0.3).sum(axis=1)))
+
+    maximum(function, dimension, budget)
+    usual = usual_evaluations(dimension, budget)
+    assert usual <= budget
+    assert 0.4 * usual <= sum(seen) <= 1.6 * usual

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.boxes import moves_to_bounds, separated_rows
-from ctxval.gp.evaluations import Evaluations, Values
+from ctxval.gp.evaluations import Evaluations, Values, line_search_cost
 
 _STARTS = 10
 """Number of points from which the function, or its approximation, is climbed."""
@@ -117,9 +117,18 @@ class Ascent:
 
     def _climb(self, done: Evaluations, starts: int, rounds: int) -> None:
         """Climb from the best points, from as many of them as the budget allows."""
-        allowed = self._left // (rounds * done.line_search_cost)
+        allowed = self._left // (rounds * line_search_cost(done.dimension))
         if allowed:
             done.search_lines(_best(done, min(starts, allowed)), rounds)
+
+
+def usual_evaluations(dimension: int, budget: int) -> int:
+    """Return about how many evaluations a search takes; one that goes on improving takes up to its budget."""
+    if dimension <= _FEW:
+        each = _ZOOMED + (_SAMPLES + 2 * _MOVED) * dimension
+        return min(budget, min(_POOL * dimension, budget // 3) + (2 * dimension - 1) * each + _STARTS)
+    lines = _STARTS * _ROUNDS + _FINALISTS[0] * _FINALISTS[1]
+    return min(budget, max(8, budget // 6) + _STARTS + _REFINED + lines * line_search_cost(dimension))
 
 
 def _best(done: Evaluations, count: int, share: float = _SEPARATION) -> Array:

@@ -104,11 +104,6 @@ class Evaluations:
 
         climb(sloped, starts, self.low, self.high, scale=scale, iterations=calls, evaluations=calls)
 
-    @property
-    def line_search_cost(self) -> int:
-        """The number of evaluations of one line search from one point."""
-        return self.dimension + 1 + len(_SHARES) + len(_LENGTHS) + len(_COORDINATES)
-
     def search_lines(self, starts: Array, rounds: int) -> None:
         """Search along lines from all starts at once, several times; the points reached are among those evaluated.
 
@@ -167,3 +162,8 @@ class Evaluations:
         gain = 1e-9 * abs(values[0]) if np.isfinite(values[0]) else 0.0
         moved = np.concatenate([single, several])[: max(1, self.left)]
         return bool(self.evaluate(moved).max() > values[0] + gain)
+
+
+def line_search_cost(dimension: int) -> int:
+    """Return the number of evaluations of one line search from one point."""
+    return dimension + 1 + len(_SHARES) + len(_LENGTHS) + len(_COORDINATES)

@@ -11,6 +11,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import expect
 from ctxval._util.registry import part
 from ctxval.errors import InputError
+from ctxval.gp.ascent import usual_evaluations
 from ctxval.searches.base import Costs, Prediction
 from ctxval.searches.trust_region import TrustRegion
 
@@ -56,7 +57,7 @@ class Auto(TrustRegion):
         self._fixed_now = None
         if prediction is not None:
             prediction = replace(prediction, budget=self.designs(prediction))
-            expect(prediction.budget + self.predicted_besides)
+            expect(usual_evaluations(self.dimension, prediction.budget) + self.predicted_besides)
         super().use_prediction(prediction)
 
     def propose(self, rng: np.random.Generator) -> Array:
