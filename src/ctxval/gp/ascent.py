@@ -123,12 +123,14 @@ class Ascent:
 
 
 def usual_evaluations(dimension: int, budget: int) -> int:
-    """Return about how many evaluations a search takes; one that goes on improving takes up to its budget."""
+    """Return about how many evaluations a search takes, rather too many; one that goes on improving takes more."""
     if dimension <= _FEW:
         each = _ZOOMED + (_SAMPLES + 2 * _MOVED) * dimension
-        return min(budget, min(_POOL * dimension, budget // 3) + (2 * dimension - 1) * each + _STARTS)
-    lines = _STARTS * _ROUNDS + _FINALISTS[0] * _FINALISTS[1]
-    return min(budget, max(8, budget // 6) + _STARTS + _REFINED + lines * line_search_cost(dimension))
+        count = min(_POOL * dimension, budget // 3) + (2 * dimension - 1) * each
+    else:
+        lines = _STARTS * _ROUNDS + _FINALISTS[0] * _FINALISTS[1]
+        count = budget // 6 + _REFINED + lines * line_search_cost(dimension)
+    return min(budget, round(1.1 * count) + _STARTS)
 
 
 def _best(done: Evaluations, count: int, share: float = _SEPARATION) -> Array:
