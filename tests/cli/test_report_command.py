@@ -150,3 +150,13 @@ def test_a_report_leaves_the_store_as_it_is(invoke: Any, store: Path) -> None:
     before = [repr(trial) for trial in Store.existing(kept).trials()]
     assert invoke("report", "copy.sqlite").exit_code == 0
     assert [repr(trial) for trial in Store.existing(kept).trials()] == before
+
+
+@pytest.mark.parametrize("option", ["--out", "--junit", "--markdown"])
+def test_a_report_does_not_replace_a_store(invoke: Any, store: Path, option: str) -> None:
+    kept = Path(shutil.copy(store, "copy.sqlite"))
+    before = kept.read_bytes()
+    done = invoke("report", "a.sqlite", option, "copy.sqlite")
+    assert done.exit_code == 2
+    assert "must not replace it" in " ".join(done.stderr.split())
+    assert kept.read_bytes() == before

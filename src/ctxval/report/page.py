@@ -20,6 +20,7 @@ from ctxval.errors import InputError
 from ctxval.report.context import ReportContext
 from ctxval.report.markup import paragraph, text
 from ctxval.report.sections import SECTIONS, Section, sections_of
+from ctxval.report.twins import write_text
 from ctxval.version import VERSION
 
 if TYPE_CHECKING:
@@ -64,15 +65,14 @@ def write_page(context: ReportContext, path: str | Path, sections: Sequence[Sect
     """Write a report as one HTML file.
 
     Raises:
-        InputError: if the file cannot be written, or a section is none.
+        InputError: if the file cannot be written or is a store, or a section is none.
     """
     content = page(context, sections)
     try:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        Path(path).write_text(content, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"the report {path} cannot be written: {error.strerror}.") from error
-    return Path(path)
+        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+    return write_text(path, content)
 
 
 def _rendered(section: Section, context: ReportContext) -> _Rendered:

@@ -23,6 +23,9 @@ from ctxval.report.sections.repeat import command_of, command_snippet, identity,
 
 _WORST = 5
 
+_DATABASE = b"SQLite format 3\0"
+"""The first bytes of a store."""
+
 
 def to_json(context: ReportContext) -> dict[str, Any]:
     """Return the verdict, the findings, the worst tasks, what repeats them, and the appendix, ready for JSON."""
@@ -162,13 +165,23 @@ def plain(words: str) -> str:
 
 
 def write_text(path: str | Path, content: str) -> Path:
-    """Write a twin of a report.
+    """Write a report or a twin of it.
 
     Raises:
-        InputError: if the file cannot be written.
+        InputError: if the file cannot be written, or is a store, whose executions were paid for.
     """
+    target = Path(path)
     try:
-        Path(path).write_text(content, encoding="utf-8")
+        if _begins_with(target, _DATABASE):
+            raise InputError(f"{path} is a store or another database, and a report must not replace it.")
+        target.write_text(content, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror}.") from error
-    return Path(path)
+    return target
+
+
+def _begins_with(path: Path, content: bytes) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(content)) == content
