@@ -20,6 +20,7 @@ import pytest
 import rig_cluster
 from conftest import make_validation
 from ctxval import Campaign, Store, Task, Trajectory, Trial, controllers, searches
+from ctxval._util.progress import ignore, is_heard, listening
 from ctxval.campaign.choices import Choice
 from ctxval.errors import CampaignError, InputError, ModelError
 from ctxval.testing import FaultyRig
@@ -31,6 +32,23 @@ HERE = Path(__file__).parents[1]
 
 def run_of(system: Any, budget: int = 8, **options: Any) -> Campaign:
     return Campaign(make_validation(system=system), search=searches.Random(), seed=5).run(budget, **options)
+
+
+class Heard:
+    """Fails if the progress of the campaign is heard in its process."""
+
+    def __init__(self) -> None:
+        self.inner = make_validation().system
+
+    def execute(self, controller: Any, task: Task) -> Trajectory:
+        if is_heard():
+            raise RuntimeError("heard")
+        return self.inner.execute(controller, task)
+
+
+def test_the_work_of_a_worker_is_not_shown_as_that_of_the_campaign() -> None:
+    with listening(ignore):
+        assert not run_of(Heard(), 2, workers=2).failed
 
 
 def facts(campaign: Campaign) -> list[tuple[object, ...]]:

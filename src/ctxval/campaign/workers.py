@@ -22,6 +22,7 @@ import numpy as np
 
 from ctxval._util.cores import can_fork, forking
 from ctxval._util.interrupts import exits_as_exceptions, raised_by_signal
+from ctxval._util.progress import mute
 from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller
 from ctxval.core.plan import Plan
@@ -224,6 +225,7 @@ def _run_worker(system: System, pipe: Connection, others: list[Connection], pare
     signal.signal(signal.SIGTERM, _exit_on_signal)
     for other in others:
         other.close()
+    mute()  # a forked worker would draw over the progress of the campaign, and may wait for its lock for ever
     threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
     # With a copy of the campaign's random state, every worker would have the same noise.
     np.random.seed()  # noqa: NPY002
