@@ -10,6 +10,7 @@ from ctxval import Task, TaskSpace, Validation, controllers, distances, models, 
 from ctxval._util.arrays import Array
 from ctxval._util.progress import Progress, listening, stage
 from ctxval.cases import linear
+from ctxval.core.controller import Controller, Synthesizer
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning import prediction
 from ctxval.learning.prediction import predict_distance
@@ -172,3 +173,30 @@ def test_a_distance_that_changes_its_arrays_does_not_change_later_predictions() 
     assert prediction is not None
     first = prediction.left_out(np.arange(4))
     np.testing.assert_array_equal(prediction.left_out(np.arange(4)), first)
+
+
+class OneByOne:
+    """A synthesizer without batches, which counts its designs."""
+
+    batched = False
+
+    def __init__(self, inner: Synthesizer) -> None:
+        self.inner, self.designed = inner, 0
+
+    def design(self, task: Task, model: models.Model) -> Controller:
+        self.designed += 1
+        return self.inner.design(task, model)
+
+
+def test_the_vectors_need_no_design_of_a_task_that_is_planned() -> None:
+    validation = linear.experiment(0, dim=2).validation
+    validation.synthesizer = synthesizer = OneByOne(validation.synthesizer)
+    prediction = predict_distance(validation, executed(validation, np.random.default_rng(0).random((6, 4))))
+    assert prediction is not None
+    assert prediction.otherwise is not None
+    prediction.left_out(np.arange(6))
+    designed = synthesizer.designed
+    second = prediction.otherwise()
+    assert second is not None
+    assert np.isfinite(second.left_out(np.arange(6))).all()
+    assert synthesizer.designed == designed

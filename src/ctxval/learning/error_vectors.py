@@ -8,10 +8,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.progress import advance
 from ctxval._util.representation import call
 from ctxval.core.distance import ComposedDistance
+from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.validation import Validation
+from ctxval.learning.plan_memory import PlanMemory
 
 Executed = Sequence[tuple[Array, Trajectory]]
 """Points of the unit cube ``(d,)`` with the system's trajectories there."""
@@ -23,11 +25,12 @@ class ErrorVectors:
     A vector is kept as long as its trajectory is.
 
     Args:
-        validation: the map p -> d(p).
+        plans: designs controllers, and keeps the latest ones.
     """
 
-    def __init__(self, validation: Validation) -> None:
-        self.validation = validation
+    def __init__(self, plans: PlanMemory) -> None:
+        self.validation = plans.planner.validation
+        self._plans = plans
         self._known: WeakKeyDictionary[Trajectory, Array] = WeakKeyDictionary()
 
     def of(self, executed: Executed) -> Array | None:
@@ -48,10 +51,19 @@ class ErrorVectors:
     def _of(self, distance: ComposedDistance, point: Array, trajectory: Trajectory) -> Array:
         known = self._known.get(trajectory)
         if known is None:
-            plan = self.validation.plan(self.validation.space.from_unit(point))
+            task, promised = self._planned(point)
             # Some distances change the arrays that they are given.
-            known = self._known[trajectory] = distance.error(plan.model_trajectory, trajectory.copy(), plan.task)
+            known = self._known[trajectory] = distance.error(promised.copy(), trajectory.copy(), task)
         return known
+
+    def _planned(self, point: Array) -> tuple[Task, Trajectory]:
+        """Return a task and the trajectory of M, without batch axes."""
+        if self._plans.planner.batched:
+            plan = self.validation.plan(self.validation.space.from_unit(point))
+            advance()
+            return plan.task, plan.model_trajectory
+        (planned,) = self._plans.plan(point[None])
+        return planned.task, planned.promised
 
     def __repr__(self) -> str:
         return call(self, self.validation)

@@ -66,7 +66,7 @@ class DistancePredictor:
     def __init__(self, validation: Validation) -> None:
         self.validation = validation
         self._plans = PlanMemory(validation)
-        self._errors = ErrorVectors(validation)
+        self._errors = ErrorVectors(self._plans)
         self._learned: tuple[bytes, LearnedCovariance | None] | None = None
 
     def predict(self, executed: Executed) -> Prediction | None:
