@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from ctxval.cases import linear
 from ctxval.core.controller import Controller, Synthesizer
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning import prediction
-from ctxval.learning.prediction import predict_distance
+from ctxval.learning.prediction import DistancePredictor, predict_distance
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 
@@ -200,3 +201,24 @@ def test_the_vectors_need_no_design_of_a_task_that_is_planned() -> None:
     assert second is not None
     assert np.isfinite(second.left_out(np.arange(6))).all()
     assert synthesizer.designed == designed
+
+
+@pytest.mark.parametrize("part", ["model", "synthesizer"])
+def test_parts_that_are_changed_in_place_are_planned_with_again(part: str) -> None:
+    validation = linear.experiment(0, dim=2).validation
+    runs = executed(validation, np.random.default_rng(0).random((4, 4)))
+    points = np.random.default_rng(1).random((5, 4))
+    predictor = DistancePredictor(validation)
+    before = predictor.predict(runs)
+    assert before is not None
+    first = before.expected(points)[0]
+    changed: Any = getattr(validation, part)
+    if part == "model":
+        changed.A = 0.9 * changed.A
+    else:
+        changed.limits = 0.1
+    after, fresh = predictor.predict(runs), predict_distance(validation, runs)
+    assert after is not None
+    assert fresh is not None
+    np.testing.assert_array_equal(after.expected(points)[0], fresh.expected(points)[0])
+    assert not np.allclose(after.expected(points)[0], first)

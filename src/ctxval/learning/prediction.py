@@ -15,6 +15,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.cores import on_all_cores
+from ctxval._util.describe import describe
 from ctxval._util.representation import call
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.model import Model, Step
@@ -56,8 +57,8 @@ class DistancePredictor:
     """Predicts d at points that were not executed, from growing sets of executions of one campaign.
 
     What does not depend on the executions is kept between predictions: the controllers of tasks that are looked at
-    again, and the trajectories of M there. Everything is a function of the executions, so a resumed campaign predicts
-    the same.
+    again, and the trajectories of M there. It is forgotten if M or the synthesizer is changed in place, such as by
+    fitting M again. Everything is a function of the executions, so a resumed campaign predicts the same.
 
     Args:
         validation: the map p -> d(p); S is never executed.
@@ -65,9 +66,28 @@ class DistancePredictor:
 
     def __init__(self, validation: Validation) -> None:
         self.validation = validation
-        self._plans = PlanMemory(validation)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._plans = PlanMemory(self.validation)
         self._errors = ErrorVectors(self._plans)
+        self._loops: tuple[Trajectory | None, float] | None = None
         self._learned: tuple[bytes, LearnedCovariance | None] | None = None
+        self._parts: tuple[str, bytes] | None = None
+
+    def _forget_if_changed(self) -> None:
+        """Forget what is kept if the parts that it was made with are not what they were."""
+        if self._loops is not None and self._parts != self._state_of_parts():
+            self._forget()
+
+    def _state_of_parts(self) -> tuple[str, bytes]:
+        """Return the description of M and the synthesizer, and some steps of M, which a description may not show."""
+        parts, loops = self.validation, self._loops_on_model()[0]
+        steps = b""
+        if loops is not None:
+            middle = loops.horizon // 2
+            steps = np.asarray(parts.model.step(loops.states[..., middle, :], loops.inputs[..., middle, :])).tobytes()
+        return repr(describe([parts.model, parts.synthesizer])), steps
 
     def predict(self, executed: Executed) -> Prediction | None:
         """Return a prediction of d from executions and from the data that the model was made from.
@@ -82,19 +102,22 @@ class DistancePredictor:
         Args:
             executed: points of the unit cube ``(d,)`` with the system's trajectories there.
         """
-        otherwise = functools.partial(_predict_vectors, self._errors, executed)
         with single_threaded():
+            self._forget_if_changed()
+            otherwise = functools.partial(_predict_vectors, self._errors, executed)
             found = self._predict(executed)
             return otherwise() if found is None else replace(found, otherwise=otherwise)
 
-    @functools.cached_property
-    def _loops(self) -> tuple[Trajectory | None, float]:
-        """Closed loops on M, and the seconds that they took."""
-        started = time.perf_counter()
-        return closed_loops_on_model(self.validation), time.perf_counter() - started
+    def _loops_on_model(self) -> tuple[Trajectory | None, float]:
+        """Return closed loops on M, and the seconds that they took."""
+        if self._loops is None:
+            started = time.perf_counter()
+            self._loops = closed_loops_on_model(self.validation), time.perf_counter() - started
+            self._parts = self._state_of_parts()
+        return self._loops
 
     def _predict(self, executed: Executed) -> Prediction | None:
-        loops, seconds = self._loops
+        loops, seconds = self._loops_on_model()
         corrected = None if loops is None else self._corrected(executed, loops)
         if loops is None or corrected is None:
             return None
