@@ -7,7 +7,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick check reliability crash-states attack bench bench-peers study reproduce search global-search calibrate parts pictures posterior-ranks clean
+.PHONY: demo test quick check docs reliability crash-states attack bench bench-peers study reproduce search global-search calibrate parts pictures posterior-ranks clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -46,9 +46,13 @@ bench-peers: .venv/peers/.installed .venv/peers-verifai/.installed  ## beside ot
 study: .venv/.test  ## the running example over many seeds; writes docs/main-job.md
 	$(BIN)/python benchmarks/study_main_job.py
 
-pictures: .venv/.installed  ## those of the README
-	$(BIN)/ctxval run pendulum --search gp-ucb --seed 1 --store docs/pictures/pendulum.sqlite
+docs: .venv/.test  ## the manual, with its gallery; writes docs/_build/html
+	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
+pictures: .venv/.test  ## those of the README and of the manual; needs Chromium
+	$(BIN)/ctxval run pendulum --search gp-ucb --seed 1 --store docs/pictures/pendulum.sqlite --no-report
 	rm docs/pictures/pendulum.sqlite
+	$(BIN)/python benchmarks/report_picture.py
 
 calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/calibration.md, and resumes
 	$(BIN)/python benchmarks/calibrate.py --campaigns $(CAMPAIGNS)
@@ -76,11 +80,12 @@ global-search: .venv/.test  ## what a global search of the true systems finds; w
 	$(BIN)/python benchmarks/study_global_search.py
 	$(BIN)/python benchmarks/search_page.py
 
-parts: .venv/.test  ## the parts that are found by name; writes docs/parts.md
+parts: .venv/.test  ## the parts and the commands; writes docs/parts.md and docs/reference/command-line.md
 	$(BIN)/python benchmarks/parts_page.py
+	$(BIN)/python benchmarks/command_line_page.py
 
 clean:
-	rm -rf .venv build dist
+	rm -rf .venv build dist docs/_build docs/auto_examples docs/reference/api
 
 .venv/bin/python:
 	$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("ctxval needs Python 3.11 or later; say: make PYTHON=python3.11")'

@@ -1,4 +1,4 @@
-"""Every how-to page does what it says: its blocks run one after the other, in a fresh folder."""
+"""Every page of the manual does what it says: its blocks run one after the other, in a fresh folder."""
 
 from __future__ import annotations
 
@@ -13,9 +13,13 @@ from pathlib import Path
 
 import pytest
 
-PAGES = sorted((Path(__file__).parents[1] / "docs" / "how-to").glob("*.md"))
+DOCS = Path(__file__).parents[1] / "docs"
+HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
+PAGES = [*HOW_TO, *sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("explanation/*.md"))]
+PAGES += sorted(DOCS.glob("reference/*.md"))
 NEEDS = {"gymnasium": ["gymnasium", "mujoco"], "mujoco": ["mujoco"], "fmu": ["fmpy", "pythonfmu"], "mpc": ["casadi"]}
 NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-space": ["control"]}
+NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
 NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
 PROGRAMS: dict[str, list[str]] = {"python": [], "ctxval": ["-c", "from ctxval.cli import main; main()"]}
 
@@ -44,13 +48,14 @@ def require_server(command: list[str]) -> None:
 
 def run_console(lines: str) -> None:
     for line in lines.splitlines():
+        status = int(found[1]) if (found := re.search(r"# exit status (\d+)$", line)) else 0
         program, *arguments = shlex.split(line.removeprefix("$ ").removesuffix(" &"), comments=True)
         command = [sys.executable, *PROGRAMS[program], *arguments]
         if line.endswith(" &"):
             require_server(command)
             continue
         done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "100"})
-        assert done.returncode == 0, line + done.stdout + done.stderr
+        assert done.returncode == status, line + done.stdout + done.stderr
 
 
 @pytest.mark.slow
@@ -67,6 +72,8 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytes
             Path(first.removeprefix("# file: ")).write_text(rest)
         elif language == "console":
             run_console(content)
+        elif language == "text":
+            continue  # what is printed, or an installation
         else:
             assert language == "python", f"{page.name} has a block that nobody runs: {language}"
             exec(compile(content, page.name, "exec"), names)
@@ -74,14 +81,14 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytes
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_links_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
         assert (page.parent / target).exists(), target
 
 
 def test_every_adapter_has_a_page() -> None:
     from ctxval import controllers, models, systems
 
-    text = "".join(page.read_text() for page in PAGES)
+    text = "".join(page.read_text() for page in HOW_TO)
     own = {"MuJoCo", "Gymnasium", "FMU", "Function", "Subprocess", "Manual", "ScikitLearn", "Onnx", "state_space"}
     own |= {"MPC", "StationaryLQR", "LQR", "ILQR", "OnnxPolicy", "Policy", "write_controller", "read_controller"}
     for name in own:

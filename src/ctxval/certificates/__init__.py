@@ -48,6 +48,7 @@ from ctxval.certificates.verdict import Verdict, judge, judge_by
 
 if TYPE_CHECKING:
     USES: dict[str, tuple[str, ...]]
+    """For each option of certificates, the kinds that use it."""
 
 __all__ = [
     "KINDS",

@@ -95,7 +95,7 @@ class TaskSpace:
 
     @property
     def dimension(self) -> int:
-        """The number of scalar parameters, the paper's |P|."""
+        """The number of scalar parameters; the paper writes it as the cardinality of P."""
         return len(self.names)
 
     @property

@@ -1,0 +1,21 @@
+"""
+Random linear systems: twenty task parameters
+=============================================
+
+The system and the model are random linear systems with ten states. The task has twenty parameters: the initial state
+and the goal. The largest distance is known in closed form, so the result can be checked.
+"""
+
+from matplotlib import pyplot
+
+from ctxval import Campaign, cases, plot, searches
+
+experiment = cases.by_name("linear", seed=0, dim=10)
+campaign = Campaign(experiment.validation, search=searches.Auto(thinking=200), seed=0).run(15)
+truth = experiment.truth()
+print(f"largest distance found {campaign.worst.distance:.4f}, d* = {truth.distance:.4f}")
+
+# %%
+# The line is the true d*.
+plot.convergence(campaign, bound=truth.distance)
+pyplot.show()
