@@ -33,7 +33,7 @@ def experiment(seed, name="rig", goal="goal", unit="m"):
         system=rig,
         model=models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]]),
         synthesizer=controllers.LQR([10, 1], [0.1], limits=3.0),
-        distance=distances.FinalState(),
+        distance=distances.FinalState(weights=[1, 1]),
     )
     return Experiment(name, validation, threshold=2.0, units=unit)
 

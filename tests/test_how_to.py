@@ -69,7 +69,9 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytes
     for language, content in blocks(page):
         first, _, rest = content.partition("\n")
         if first.startswith("# file: "):
-            Path(first.removeprefix("# file: ")).write_text(rest)
+            written = Path(first.removeprefix("# file: "))
+            written.write_text(rest)
+            sys.modules.pop(written.stem, None)  # another page may have a module of this name
         elif language == "console":
             run_console(content)
         elif language == "text":
