@@ -192,7 +192,7 @@ def predicted() -> learning.ExecutionPrediction:
 
 @functools.cache
 def covariance() -> learning.LearnedCovariance:
-    found = learning.learn_covariance(LINEAR, RECORDED, np.zeros(len(RECORDED), dtype=np.intp))
+    found = learning.learn_covariance(LINEAR, RECORDED, np.zeros(len(RECORDED), dtype=np.intp), 100)
     assert found is not None
     return found
 

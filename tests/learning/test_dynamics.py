@@ -24,7 +24,7 @@ def record(count: int, seed: int = 0, reach: float = 1.0) -> Transitions:
 
 def learn(data: Transitions, sources: Rows | None = None, centres: int = 450) -> Residual:
     of = np.full(len(data), -1) if sources is None else sources
-    learned = learn_covariance(MODEL, data, of)
+    learned = learn_covariance(MODEL, data, of, centres)
     assert learned is not None
     residual = learn_residual(replace(learned, model=MODEL), data, of, centres)
     assert residual is not None
@@ -80,7 +80,7 @@ def test_noise_in_the_recordings_is_not_learned() -> None:
 def test_a_model_without_error_leaves_nothing_to_be_learned() -> None:
     data = record(50)
     exact = Transitions(data.x, data.u, MODEL.step(data.x, data.u))
-    assert learn_covariance(MODEL, exact, np.full(50, -1)) is None
+    assert learn_covariance(MODEL, exact, np.full(50, -1), 100) is None
 
 
 def test_recordings_that_repeat_themselves_and_ones_that_diverged_do_no_harm() -> None:
@@ -95,13 +95,13 @@ def test_recordings_that_are_not_finite_are_left_out() -> None:
     data = record(100)
     broken = Transitions(data.x, data.u, np.where(np.arange(100)[:, None] % 7 == 0, np.nan, data.x_next))
     assert np.isfinite(learn(broken)(data.x, data.u)).all()
-    assert learn_covariance(MODEL, Transitions(data.x, data.u, data.x_next * np.nan), np.full(100, -1)) is None
+    assert learn_covariance(MODEL, Transitions(data.x, data.u, data.x_next * np.nan), np.full(100, -1), 100) is None
 
 
 def test_around_a_model_that_is_rougher_than_the_system_the_steps_are_learned_instead() -> None:
     rough = models.Function(lambda x, u: MODEL.step(x, u) + 0.3 * np.sign(np.sin(9 * x)), vectorized=True)
     data = record(400)
-    learned = [learn_covariance(model, data, np.full(400, -1)) for model in (MODEL, rough)]
+    learned = [learn_covariance(model, data, np.full(400, -1), 200) for model in (MODEL, rough)]
     assert [type(one.model) for one in learned if one is not None] == [models.Linear, Identity]
 
 
@@ -137,7 +137,7 @@ def test_a_rough_residual_has_fewer_centres_and_almost_the_same_values() -> None
 
 def test_a_covariance_that_was_learned_earlier_keeps_its_physical_length_scales() -> None:
     data = record(200)
-    learned = learn_covariance(MODEL, data, np.full(200, -1))
+    learned = learn_covariance(MODEL, data, np.full(200, -1), 200)
     assert learned is not None
     wider = Transitions.joined([data, record(100, seed=4, reach=3.0)])
     residual = learn_residual(learned, wider, np.full(300, -1), 200)

@@ -210,7 +210,7 @@ class LearnedCovariance:
         return call(self, self.model, error=self.error)
 
 
-def learn_covariance(model: Model, transitions: Transitions, sources: Rows) -> LearnedCovariance | None:
+def learn_covariance(model: Model, transitions: Transitions, sources: Rows, centres: int) -> LearnedCovariance | None:
     """Return the most likely covariance of the residual of M or, if this predicts much better, of the system's steps.
 
     If M is rougher than the system, such as a small network, then its residual has all of its kinks and is harder to
@@ -222,21 +222,25 @@ def learn_covariance(model: Model, transitions: Transitions, sources: Rows) -> L
         model: the model M.
         transitions: N transitions of the system.
         sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
+        centres: largest number of transitions that the residuals are conditioned on, whose errors are compared.
     """
-    of_model = _learned(model, transitions, sources)
+    of_model = _learned(model, transitions, sources, centres)
     if of_model is None:
         return None
-    of_steps = _learned(Identity(), transitions, sources)
+    of_steps = _learned(Identity(), transitions, sources, centres)
     return of_steps if of_steps is not None and of_steps.error < _MUCH_BETTER * of_model.error else of_model
 
 
-def _learned(model: Model, transitions: Transitions, sources: Rows) -> LearnedCovariance | None:
+def _learned(model: Model, transitions: Transitions, sources: Rows, centres: int) -> LearnedCovariance | None:
     data = residual_data(model, transitions, sources)
     if data is None:
         return None
     with single_threaded():
-        theta, noise, error = _most_likely(data.pairs, data.outputs[:, data.learned])
-    return LearnedCovariance(model, theta, noise, data.scale, _unit(data) * error)
+        theta, noise = _most_likely(data.pairs, data.outputs[:, data.learned])
+        found = LearnedCovariance(model, theta, noise, data.scale, np.nan)
+        # The transitions from which hyperparameters are learned are too few to tell which model errs less.
+        residual = learn_residual(found, transitions, sources, centres)
+        return None if residual is None else replace(found, error=residual.typical_error())
 
 
 def learn_residual(
@@ -275,20 +279,14 @@ def _unit(data: ResidualData) -> float:
     return float(np.sqrt(((data.sizes / data.steps)[data.learned] ** 2).mean()))
 
 
-def _most_likely(Z: Array, Y: Array) -> tuple[Array, float, float]:
-    """Return the hyperparameters and the noise that make outputs ``(N, n)`` of well-spread inputs most likely.
-
-    The third value is the median leave-one-out error of these outputs.
-    """
+def _most_likely(Z: Array, Y: Array) -> tuple[Array, float]:
+    """Return the hyperparameters and the noise that make outputs ``(N, n)`` of well-spread inputs most likely."""
     start = np.log([1.0, *[_START] * Z.shape[1], 0.1, 0.1, 1e-6])
     rows = pivoted_rows(_KERNEL, start[:-1], Z, _LEARNED_FROM, least=_PIVOT * _NOISE[0])
     bounds = [*_KERNEL.bounds(Z.shape[1]), (float(np.log(_NOISE[0])), float(np.log(_NOISE[1])))]
     Z, Y = Z[rows], Y[rows]
     found = most_likely(lambda theta: log_likelihood(theta, Z, Y), start[None], bounds, tolerance=_TOLERANCE)
-    theta, noise = found[:-1], float(np.exp(found[-1]))
-    process = MultiOutputProcess(_KERNEL, theta, Z, Y, tuple(tenfold(noise)))
-    errors = process.factor.left_out_errors(process.weights)
-    return theta, noise, float(np.median(np.sqrt((errors**2).mean(axis=1))))
+    return found[:-1], float(np.exp(found[-1]))
 
 
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:

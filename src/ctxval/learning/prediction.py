@@ -133,15 +133,15 @@ class DistancePredictor:
             return None
         # If nothing could be learned when it was scheduled, it is learned now.
         learned = self._covariance(executed[: _scheduled(len(executed))], loops) or self._covariance(executed, loops)
-        centres = int(np.clip(_WORK // loops.horizon, *_CENTRES))
-        residual = None if learned is None else learn_residual(learned, *recorded, centres)
+        residual = None if learned is None else learn_residual(learned, *recorded, _centres(loops))
         return None if learned is None or residual is None else (learned.model, residual)
 
     def _covariance(self, executed: Executed, loops: Trajectory) -> LearnedCovariance | None:
         key = b"".join(part.tobytes() for _, one in executed for part in (one.states, one.inputs))
         if self._learned is None or self._learned[0] != key:
             recorded = recorded_transitions(self.validation.model, [one for _, one in executed], loops)
-            self._learned = key, None if recorded is None else learn_covariance(self.validation.model, *recorded)
+            model = self.validation.model
+            self._learned = key, None if recorded is None else learn_covariance(model, *recorded, _centres(loops))
         return self._learned[1]
 
     def __repr__(self) -> str:
@@ -156,6 +156,11 @@ def predict_distance(validation: Validation, executed: Executed) -> Prediction |
         executed: points of the unit cube ``(d,)`` with the system's trajectories there.
     """
     return DistancePredictor(validation).predict(executed)
+
+
+def _centres(loops: Trajectory) -> int:
+    """Return the largest number of transitions that the residual is conditioned on."""
+    return int(np.clip(_WORK // loops.horizon, *_CENTRES))
 
 
 def _scheduled(count: int) -> int:

@@ -83,10 +83,11 @@ def _corrected(validation: Validation, executed: Executed) -> tuple[Model, Resid
         if loops is None:
             return None
         recorded = recorded_transitions(validation.model, [trajectory for _, trajectory in executed], loops)
-        learned = None if recorded is None else learn_covariance(validation.model, *recorded)
+        centres = int(np.clip(_WORK // loops.horizon, *_CENTRES))
+        learned = None if recorded is None else learn_covariance(validation.model, *recorded, centres)
         if recorded is None or learned is None:
             return None
-        residual = learn_residual(learned, *recorded, int(np.clip(_WORK // loops.horizon, *_CENTRES)))
+        residual = learn_residual(learned, *recorded, centres)
         return None if residual is None else (learned.model, residual)
     except Exception:  # the user's own parts, at states that no execution has reached
         return None

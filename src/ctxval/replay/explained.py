@@ -141,7 +141,7 @@ def _learned(model: Model, data: _Steps, held: Mask, seed: int) -> Array:
         rows = np.sort(np.random.default_rng(seed).permutation(rows)[:_LEARNED])
     some = Transitions(data.transitions.x[rows], data.transitions.u[rows], data.transitions.x_next[rows])
     with single_threaded():
-        learned = learn_covariance(model, some, data.folds[rows])
+        learned = learn_covariance(model, some, data.folds[rows], _CENTRES)
         residual = None if learned is None else learn_residual(learned, some, data.folds[rows], _CENTRES)
         if learned is None or residual is None:
             return np.zeros_like(data.residuals[held])
