@@ -143,5 +143,5 @@ def test_a_covariance_that_was_learned_earlier_keeps_its_physical_length_scales(
     residual = learn_residual(learned, wider, np.full(300, -1), 200)
     assert residual is not None
     np.testing.assert_allclose(
-        np.exp(residual.theta[1:-2]) * residual.scale_in, np.exp(learned.theta[1:-2]) * learned.scale
+        np.exp(residual.theta[1:-2]) * residual.scale_in, np.exp(learned.residual.theta[1:-2]) * learned.scale
     )

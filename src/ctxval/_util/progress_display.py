@@ -129,6 +129,8 @@ def _bars(console: Console) -> Bars:
     from rich.progress import Progress as Bars
 
     class Delayed(Bars):
+        """Bars of the stages that have lasted for some time."""
+
         def get_renderables(self) -> Iterable[RenderableType]:
             shown = [task for task in self.tasks if task.fields["lasts"] or (task.elapsed or 0.0) > _DELAY]
             yield self.make_tasks_table(shown)

@@ -195,19 +195,16 @@ class LearnedCovariance:
 
     Attributes:
         model: the model to which the residual is added.
-        theta, noise: see :class:`Residual`.
-        scale: the units of the standardised pairs to which theta belongs, shape ``(n + m,)``.
-        error: the median leave-one-out error of a step, as a share of a typical step.
+        scale: the units of the standardised pairs to which the hyperparameters belong, shape ``(n + m,)``.
+        residual: the residual, given the transitions from which the covariance was learned.
     """
 
     model: Model
-    theta: Array
-    noise: float
     scale: Array
-    error: float
+    residual: Residual
 
     def __repr__(self) -> str:
-        return call(self, self.model, error=self.error)
+        return call(self, self.model, error=self.residual.typical_error())
 
 
 def learn_covariance(model: Model, transitions: Transitions, sources: Rows, centres: int) -> LearnedCovariance | None:
@@ -228,7 +225,12 @@ def learn_covariance(model: Model, transitions: Transitions, sources: Rows, cent
     if of_model is None:
         return None
     of_steps = _learned(Identity(), transitions, sources, centres)
-    return of_steps if of_steps is not None and of_steps.error < _MUCH_BETTER * of_model.error else of_model
+    if of_steps is None:
+        return of_model
+    # The few transitions from which hyperparameters are learned could not tell which model errs less.
+    with single_threaded():
+        better = of_steps.residual.typical_error() < _MUCH_BETTER * of_model.residual.typical_error()
+    return of_steps if better else of_model
 
 
 def _learned(model: Model, transitions: Transitions, sources: Rows, centres: int) -> LearnedCovariance | None:
@@ -237,10 +239,7 @@ def _learned(model: Model, transitions: Transitions, sources: Rows, centres: int
         return None
     with single_threaded():
         theta, noise = _most_likely(data.pairs, data.outputs[:, data.learned])
-        found = LearnedCovariance(model, theta, noise, data.scale, np.nan)
-        # The transitions from which hyperparameters are learned are too few to tell which model errs less.
-        residual = learn_residual(found, transitions, sources, centres)
-        return None if residual is None else replace(found, error=residual.typical_error())
+        return LearnedCovariance(model, data.scale, _conditioned(data, theta, noise, centres))
 
 
 def learn_residual(
@@ -259,14 +258,19 @@ def learn_residual(
     data = residual_data(learned.model, transitions, sources)
     if data is None:
         return None
-    Z, Y = data.pairs, data.outputs
-    theta = learned.theta.copy()
+    theta = learned.residual.theta.copy()
     theta[1:-2] += np.log(learned.scale / data.scale)
     with single_threaded():
-        chosen = pivoted_rows(_KERNEL, theta, Z, centres, least=_PIVOT * learned.noise)
+        return _conditioned(data, theta, learned.residual.noise, centres)
+
+
+def _conditioned(data: ResidualData, theta: Array, noise: float, centres: int) -> Residual:
+    """Return the residual, given the transitions that represent all others."""
+    Z, Y = data.pairs, data.outputs
+    chosen = pivoted_rows(_KERNEL, theta, Z, centres, least=_PIVOT * noise)
     others = np.setdiff1d(np.arange(len(Z)), chosen)
     return Residual(
-        *(theta, learned.noise, Z[chosen], Y[chosen], data.sources[chosen], data.shift, data.scale),
+        *(theta, noise, Z[chosen], Y[chosen], data.sources[chosen], data.shift, data.scale),
         scale_out=data.units,
         limit=_REACH * np.abs(Y).max(axis=0),
         unit=_unit(data),

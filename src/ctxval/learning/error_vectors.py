@@ -19,6 +19,11 @@ Executed = Sequence[tuple[Array, Trajectory]]
 """Points of the unit cube ``(d,)`` with the system's trajectories there."""
 
 
+def executions_of(executed: Executed, point: Array) -> list[int]:
+    """Return the numbers of the executions of a point ``(d,)``."""
+    return [number for number, (other, _) in enumerate(executed) if np.array_equal(other, point)]
+
+
 class ErrorVectors:
     """Computes the vectors of executions; each needs the design of a controller, so they are kept.
 

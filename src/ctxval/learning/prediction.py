@@ -30,7 +30,7 @@ from ctxval.learning.dynamics import (
     learn_covariance,
     learn_residual,
 )
-from ctxval.learning.error_vectors import ErrorVectors, Executed
+from ctxval.learning.error_vectors import ErrorVectors, Executed, executions_of
 from ctxval.learning.plan_memory import PlanMemory
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.vector import predict_composed
@@ -128,13 +128,14 @@ class DistancePredictor:
         return Prediction(exact, exact.left_out, _DESIGNS if batched else _SLOW_DESIGNS, rough=rough)
 
     def _corrected(self, executed: Executed, loops: Trajectory) -> tuple[Model, Residual] | None:
+        learned = self._covariance(executed[: _scheduled(len(executed))], loops)
+        if learned is None or _scheduled(len(executed)) == len(executed):
+            # If nothing could be learned when it was scheduled, it is learned now.
+            learned = self._covariance(executed, loops)
+            return None if learned is None else (learned.model, learned.residual)
         recorded = recorded_transitions(self.validation.model, [one for _, one in executed], loops)
-        if recorded is None:
-            return None
-        # If nothing could be learned when it was scheduled, it is learned now.
-        learned = self._covariance(executed[: _scheduled(len(executed))], loops) or self._covariance(executed, loops)
-        residual = None if learned is None else learn_residual(learned, *recorded, _centres(loops))
-        return None if learned is None or residual is None else (learned.model, residual)
+        residual = None if recorded is None else learn_residual(learned, *recorded, _centres(loops))
+        return None if residual is None else (learned.model, residual)
 
     def _covariance(self, executed: Executed, loops: Trajectory) -> LearnedCovariance | None:
         key = b"".join(part.tobytes() for _, one in executed for part in (one.states, one.inputs))
@@ -223,13 +224,9 @@ class _PredictedDistance:
     def left_out(self, rows: Rows) -> Array:
         """Return the distances predicted at executed points, each from the executions of other points, ``(k,)``."""
         points = np.array([self.executed[k][0] for k in rows.tolist()])
-        without = self.residual.without([self._there(point) for point in points])
+        without = self.residual.without([executions_of(self.executed, point) for point in points])
         with single_threaded():
             return self._looped(points, lambda rows: without[rows])[0]
-
-    def _there(self, point: Array) -> list[int]:
-        """Return the executions of a point."""
-        return [source for source, (other, _) in enumerate(self.executed) if np.array_equal(other, point)]
 
     def _looped(self, points: Array, residual: _ResidualOf) -> tuple[Array, Array]:
         """Return distances and doubts ``(m,)``; NaN for a task that fails. A batch that fails is halved and retried."""

@@ -22,8 +22,8 @@ from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.dynamics import Residual, ResidualsWithout, learn_covariance, learn_residual
-from ctxval.learning.error_vectors import Executed
+from ctxval.learning.dynamics import Residual, ResidualsWithout, learn_covariance
+from ctxval.learning.error_vectors import Executed, executions_of
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 
 _CENTRES = (100, 300)
@@ -65,15 +65,10 @@ def replay_executed(validation: Validation, executed: Executed, wanted: Sequence
         corrected = _corrected(validation, executed)
         if corrected is None:
             return [_replayed(validation, None, point) for point in wanted]
-        without = corrected[1].without([_there(executed, point) for point in wanted])
+        without = corrected[1].without([executions_of(executed, point) for point in wanted])
         rows = np.arange(len(wanted))
         models = [_OneCorrected(corrected[0], without[rows[k : k + 1]]) for k in range(len(wanted))]
         return [_replayed(validation, model, point) for model, point in zip(models, wanted, strict=True)]
-
-
-def _there(executed: Executed, point: Array) -> list[int]:
-    """Return the executions of a point."""
-    return [source for source, (other, _) in enumerate(executed) if np.array_equal(other, point)]
 
 
 def _corrected(validation: Validation, executed: Executed) -> tuple[Model, Residual] | None:
@@ -85,10 +80,7 @@ def _corrected(validation: Validation, executed: Executed) -> tuple[Model, Resid
         recorded = recorded_transitions(validation.model, [trajectory for _, trajectory in executed], loops)
         centres = int(np.clip(_WORK // loops.horizon, *_CENTRES))
         learned = None if recorded is None else learn_covariance(validation.model, *recorded, centres)
-        if recorded is None or learned is None:
-            return None
-        residual = learn_residual(learned, *recorded, centres)
-        return None if residual is None else (learned.model, residual)
+        return None if learned is None else (learned.model, learned.residual)
     except Exception:  # the user's own parts, at states that no execution has reached
         return None
 

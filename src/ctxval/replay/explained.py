@@ -10,7 +10,7 @@ from ctxval._util.arrays import Array, Mask, Rows, single_threaded
 from ctxval._util.representation import record
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
-from ctxval.learning import CorrectedModel, learn_covariance, learn_residual
+from ctxval.learning import CorrectedModel, learn_covariance
 from ctxval.replay.steps import RecordedSteps, stepped
 
 _FOLDS = 4
@@ -142,9 +142,8 @@ def _learned(model: Model, data: _Steps, held: Mask, seed: int) -> Array:
     some = Transitions(data.transitions.x[rows], data.transitions.u[rows], data.transitions.x_next[rows])
     with single_threaded():
         learned = learn_covariance(model, some, data.folds[rows], _CENTRES)
-        residual = None if learned is None else learn_residual(learned, some, data.folds[rows], _CENTRES)
-        if learned is None or residual is None:
+        if learned is None:
             return np.zeros_like(data.residuals[held])
         x, u = data.transitions.x[held], data.transitions.u[held]
         # What is learned may be the steps of the system, without M.
-        return np.asarray(CorrectedModel(learned.model, residual).step(x, u) - model.step(x, u))
+        return np.asarray(CorrectedModel(learned.model, learned.residual).step(x, u) - model.step(x, u))
