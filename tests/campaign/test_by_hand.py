@@ -177,7 +177,11 @@ def test_asking_by_command_chooses_what_a_campaign_chooses(invoke: Any) -> None:
         (["a.sqlite", "--set", "goal"], "as name=value, got 'goal'"),
         (["a.sqlite", "--set", "goal=1", "--set", "goal=2"], "given once"),
         (["a.sqlite", "--set", "goal=one"], "goal must be a number, got 'one'"),
-        (["a.sqlite", "--set", "goal=1", "--draw"], "--set, --draw, --again and --trial cannot be combined"),
+        (["a.sqlite", "--set", "goal=1", "--draw"], "--set, --draw, --again, --trial and --until-decided cannot be combined"),
+        (["a.sqlite", "--until-decided", "--draw"], "--trial and --until-decided cannot be combined"),
+        (["a.sqlite", "--threshold", "1"], "--threshold and --budget need --until-decided"),
+        (["a.sqlite", "--until-decided", "--threshold", "nan"], "the threshold must be"),
+        (["a.sqlite", "--until-decided", "--budget", "0"], "budget must be a positive integer"),
         (["a.sqlite", "--trial", "9"], "there is no trial 9"),
         (["a.sqlite", "--seed", "3"], "is a store and keeps its own settings"),
         (["none.sqlite"], "there is no store at none.sqlite; `ctxval ask FILE.toml --store none.sqlite` creates one"),
@@ -663,3 +667,27 @@ def test_logs_of_earlier_runs_are_imported(invoke: Any) -> None:
     result = invoke("import", "a.sqlite", "runs.csv", "--json")
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["imported"][0]["distance"] == pytest.approx(0, abs=1e-12)
+
+
+def test_asking_until_decided_ends_with_the_verdict(invoke: Any) -> None:
+    first = asked(invoke, "my_rig:experiment", "--store", "a.sqlite", "--until-decided")
+    assert first["trial"] == 0
+    record(first["folder"])
+    told = invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv", "--json")
+    assert told.exit_code == 0, told.stderr
+    second = asked(invoke, "a.sqlite", "--until-decided", "--budget", "9")
+    assert second["trial"] == 1
+    assert invoke("tell", "a.sqlite", "1", "--distance", "2.5").exit_code == 0
+    ended = invoke("ask", "a.sqlite", "--until-decided", "--json")
+    report = json.loads(ended.stdout)
+    assert (ended.exit_code, report["trial"], report["verdict"]) == (1, None, "falsified")
+    shown = invoke("ask", "a.sqlite", "--until-decided", "--threshold", "2")
+    assert "falsified against 2: trial 1 was executed and its distance 2.5 exceeds 2" in " ".join(shown.stdout.split())
+    assert len(Store("a.sqlite").trials()) == 2
+
+
+def test_a_budget_that_is_spent_opens_no_trial(invoke: Any) -> None:
+    asked(invoke, "my_rig:experiment", "--store", "a.sqlite", "--until-decided", "--budget", "1")
+    assert invoke("tell", "a.sqlite", "0", "--distance", "0.5").exit_code == 0
+    ended = invoke("ask", "a.sqlite", "--until-decided", "--budget", "1", "--json")
+    assert (ended.exit_code, json.loads(ended.stdout)["verdict"]) == (0, "undecided")

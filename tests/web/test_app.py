@@ -338,23 +338,36 @@ def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
     assert stored[3].parameters == {"goal": 1.5}
 
 
-def test_the_choices_are_those_of_the_command_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("how", "options"), [("next", ()), ("decides", ("--until-decided",))])
+def test_the_choices_are_those_of_the_command_line(tmp_path: Path, how: str, options: tuple[str, ...]) -> None:
     by_hand, by_page = tmp_path / "hand", tmp_path / "page"
     for folder in (by_hand, by_page):
         folder.mkdir()
         new_store(folder)
     for number in range(2):
         ctxval("tell", "a.sqlite", str(number), "--distance", "0.25", folder=by_hand)
-        ctxval("ask", "a.sqlite", folder=by_hand)
+        ctxval("ask", "a.sqlite", *options, folder=by_hand)
     with serving(by_page) as server:
         page = server.request("GET", "/")
+        assert 'value="decides"' in page.text  # the experiment has a threshold
         for number in range(2):
             assert post(server, f"/trials/{number}/distance", page, {"distance": "0.25"}).status == 303
-            assert post(server, "/choose", page, {"how": "next", "seen": str(number + 1)}).status == 303
+            assert post(server, "/choose", page, {"how": how, "seen": str(number + 1)}).status == 303
             wait_for(server, f'id="trial-{number + 1}"', page)
     for one, other in zip(trials(by_hand), trials(by_page), strict=True):
         assert one.unit_point.tobytes() == other.unit_point.tobytes()
         assert one.note == other.note
+
+
+def test_no_task_is_opened_for_a_verdict_that_is_reached(tmp_path: Path) -> None:
+    new_store(tmp_path)
+    ctxval("tell", "a.sqlite", "0", "--distance", "2.5", folder=tmp_path)
+    with serving(tmp_path) as server:
+        page = server.request("GET", "/")
+        assert post(server, "/choose", page, {"how": "decides", "seen": "1"}).status == 303
+        found = wait_for(server, "No task was chosen", page)
+        assert "the verdict against 2 is reached, so no further execution is needed" in found
+    assert len(trials(tmp_path)) == 1
 
 
 def test_other_computers_need_the_token(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ SPACE = TaskSpace(goal=(-1.0, 1.0, "rad"), offset=([0, 0], [1, 2], "m"))
 def test_requests_of_every_kind() -> None:
     own = {"how": "own", "seen": "3", "parameter-0": "0.5", "parameter-1": "1", "parameter-2": " 1.5e0 "}
     assert task_request({"how": "next", "seen": "3"}, SPACE) == TaskRequest(trials=3)
+    assert task_request({"how": "decides", "seen": "3"}, SPACE) == TaskRequest(trials=3, decides=True)
     assert task_request({"how": "draw", "seen": "0"}, SPACE) == TaskRequest(draw=True, trials=0)
     assert task_request(own, SPACE) == TaskRequest({"goal": 0.5, "offset": [1.0, 1.5]}, trials=3)
     again = {"how": "again", "trial": "2", "because": " fuse replaced ", "seen": "3"}

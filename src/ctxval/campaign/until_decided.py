@@ -59,14 +59,7 @@ class UntilDecided:
 
     def __post_init__(self) -> None:
         require_threshold(self.threshold)
-        kind = self.options.kind
-        if not isinstance(kind, Automatic | Dynamics | Posterior | AnytimeAudit):
-            raise InputError(
-                "--until-decided needs one of the certificates auto, dynamics, posterior and anytime, "
-                f"got {kind.name!r}."
-            )
-        if isinstance(kind, AnytimeAudit) and not self.options.volume:
-            raise InputError("--until-decided with an anytime audit needs the volume that may exceed the threshold.")
+        require_decisive(self.options)
 
     @property
     def predicts(self) -> bool:
@@ -155,6 +148,21 @@ class UntilDecided:
 
     def __repr__(self) -> str:
         return record(self)
+
+
+def require_decisive(options: CertificateOptions) -> None:
+    """Check that executions can be chosen for a certificate.
+
+    Raises:
+        InputError: if they cannot, because of its kind, or because an anytime audit may leave out no volume.
+    """
+    kind = options.kind
+    if not isinstance(kind, Automatic | Dynamics | Posterior | AnytimeAudit):
+        raise InputError(
+            f"--until-decided needs one of the certificates auto, dynamics, posterior and anytime, got {kind.name!r}."
+        )
+    if isinstance(kind, AnytimeAudit) and not options.volume:
+        raise InputError("--until-decided with an anytime audit needs the volume that may exceed the threshold.")
 
 
 def next_task(

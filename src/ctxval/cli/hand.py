@@ -12,9 +12,10 @@ from ctxval.campaign.by_hand import KnownRun, parameters_from, read_runs, write_
 from ctxval.campaign.campaign import OpenTrial
 from ctxval.campaign.known import KnownExecution
 from ctxval.campaign.telling import Report, parameters_of_trial, require_tolerance, result_sentence, tell_report
-from ctxval.cli.base import app, command, out
-from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, named_values
-from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, open_store
+from ctxval.certificates.verdict import require_threshold
+from ctxval.cli.base import FALSIFIED, app, command, out, print_verdict
+from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, Threshold, named_values
+from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, limit_of, open_store
 from ctxval.config.settings import read_settings
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
@@ -56,6 +57,21 @@ Because = Annotated[
         "--again.",
     ),
 ]
+UntilDecided = Annotated[
+    bool,
+    typer.Option(
+        "--until-decided",
+        help="Choose the task that is expected to decide the verdict soonest, as `ctxval run --until-decided` does. If "
+        "the verdict is reached, no trial is opened and the verdict is printed.",
+    ),
+]
+Budget = Annotated[
+    int | None,
+    typer.Option(
+        help="Maximum number of executions that may be planned with --until-decided, including earlier ones (default: "
+        "the budget of the experiment)."
+    ),
+]
 Reopened = Annotated[int | None, typer.Option(help="Write the files of this open trial again.")]
 SearchName = Annotated[
     str | None, typer.Option(help=f"Search method of a new store: {SEARCH_METHODS} (default: auto).")
@@ -83,6 +99,9 @@ def ask(
     again: Again = None,
     because: Because = None,
     trial: Reopened = None,
+    until_decided: UntilDecided = False,
+    threshold: Threshold = None,
+    budget: Budget = None,
     search: SearchName = None,
     seed: Seed = None,
     experiment: Named = None,
@@ -92,14 +111,21 @@ def ask(
     option: PartOptions = None,
 ) -> Any:
     """Open the next trial of a system that people operate, and write its task and controller to files."""
-    if sum((bool(parameters), draw, again is not None, trial is not None)) > 1:
-        raise InputError("--set, --draw, --again and --trial cannot be combined.")
+    if sum((bool(parameters), draw, again is not None, trial is not None, until_decided)) > 1:
+        raise InputError("--set, --draw, --again, --trial and --until-decided cannot be combined.")
+    if not until_decided and (threshold is not None or budget is not None):
+        raise InputError("--threshold and --budget need --until-decided.")
     if because is not None and again is None:
         raise InputError("--because needs --again TRIAL: it states why the task is executed again.")
     overrides = {"store": store, "search": search, "seed": seed, "options": named_values(option) or None}
     opened = _opened(target, overrides, experiment, trust, accept_change)
+    found: OpenTrial | None
     if trial is not None:
         found = opened.campaign.reopen(trial)
+    elif until_decided:
+        found = _asked_until_decided(opened, threshold, budget)
+        if found is None:
+            return _decided(opened, threshold, as_json)
     else:
         space = opened.experiment.validation.space
         chosen = None if again is None else parameters_of_trial(opened.campaign, again)
@@ -234,6 +260,38 @@ def _opened(
     made = settings.load()
     where = settings.store_path(made.name)
     return Opened(settings, made, settings.campaign(made, where, accept_change=accept_change), where)
+
+
+def _asked_until_decided(opened: Opened, threshold: float | None, budget: int | None) -> OpenTrial | None:
+    settings, experiment = opened.settings, opened.experiment
+    total = next(one for one in (budget, settings.budget, experiment.budget) if one is not None)
+    options = settings.certificate_options
+    return opened.campaign.ask_until_decided(_limit(opened, threshold), total, certificate=options, wait=_WAIT)
+
+
+def _limit(opened: Opened, threshold: float | None) -> float:
+    """Return the threshold of the verdict: that of the option, or else of the experiment."""
+    limit = limit_of(opened.experiment, opened.settings) if threshold is None else require_threshold(threshold)
+    if limit is None:
+        raise InputError("--until-decided needs a threshold: give --threshold.")
+    return limit
+
+
+def _decided(opened: Opened, threshold: float | None, as_json: bool) -> tuple[dict[str, Any], int]:
+    """Return the verdict of a campaign that needs no further trial, and the exit status."""
+    limit = _limit(opened, threshold)
+    verdict = opened.campaign.verdict(limit, certificate=opened.settings.certificate_options)
+    if not as_json:
+        print_verdict(verdict)
+    report = {
+        "trial": None,
+        "executions": opened.campaign.executions,
+        "verdict": verdict.answer,
+        "reason": verdict.reason,
+        "threshold": limit,
+        "store": str(opened.path),
+    }
+    return report, FALSIFIED if verdict.answer == "falsified" else 0
 
 
 def _ended(trial: Trial, opened: Opened) -> dict[str, Any]:

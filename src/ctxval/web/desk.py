@@ -14,11 +14,12 @@ import numpy as np
 from ctxval._util.representation import call
 from ctxval._util.texts import reason_of
 from ctxval.campaign.telling import Report, tell_report
+from ctxval.campaign.until_decided import require_decisive
 from ctxval.core.labels import labels_of
 from ctxval.core.space import TaskSpace
 from ctxval.core.task import Task
 from ctxval.core.trial import Trial
-from ctxval.errors import CampaignError, CtxvalError, DistanceError
+from ctxval.errors import CampaignError, CtxvalError, DistanceError, InputError
 from ctxval.web.served import OpenCampaign, ServedCampaign
 
 Result = TypeVar("Result")
@@ -35,6 +36,7 @@ class Description:
         units: the units of the distance.
         threshold: tau; None if there is none.
         budget: the number of executions that are planned.
+        decides: whether executions can be chosen that decide the verdict.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Description:
     units: str
     threshold: float | None
     budget: int
+    decides: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +159,17 @@ class Desk:
             experiment.units,
             self._served.threshold,
             experiment.budget,
+            self._decides(),
         )
+
+    def _decides(self) -> bool:
+        if self._served.threshold is None:
+            return False
+        try:
+            require_decisive(self._served.certificate)
+        except InputError:
+            return False
+        return True
 
     def _snapshot(self) -> Snapshot:
         campaign = self._served.campaign

@@ -24,7 +24,7 @@ def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
     """Return what an operator asks for.
 
     Args:
-        fields: ``how`` is next, draw, own or again; ``seen`` is the number of trials on the operator's page.
+        fields: ``how`` is next, decides, draw, own or again; ``seen`` is the number of trials on the operator's page.
         space: the task space.
 
     Raises:
@@ -34,6 +34,8 @@ def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
     match fields.get("how"):
         case "next":
             return TaskRequest(trials=seen)
+        case "decides":
+            return TaskRequest(decides=True, trials=seen)
         case "draw":
             return TaskRequest(draw=True, trials=seen)
         case "own":

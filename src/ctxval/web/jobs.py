@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 _WAIT = 60.0
 """Seconds to wait for another process that chooses a task or runs the store."""
 
+_AHEAD = 100
+"""Number of executions that the posterior bound may plan with; a bound that needs more is not aimed at."""
+
 Files = dict[str, bytes]
 """The files of a trial by name."""
 
@@ -43,6 +46,7 @@ class TaskRequest:
         because: what was changed since that trial.
         draw: whether the task is an independent draw, for an audit.
         trials: the number of trials that the operator has seen; None to skip the check.
+        decides: whether the task is the one that is expected to decide the verdict soonest.
     """
 
     parameters: Mapping[str, Any] | None = None
@@ -50,6 +54,7 @@ class TaskRequest:
     because: str | None = None
     draw: bool = False
     trials: int | None = None
+    decides: bool = False
 
     def __repr__(self) -> str:
         return record(self)
@@ -117,10 +122,27 @@ def _ask(served: ServedCampaign, request: TaskRequest) -> OpenTrial:
                 f"another task was opened since this page was loaded, as trial {len(campaign.trials) - 1}. If you need "
                 "one more task, ask again."
             )
+        if request.decides:
+            return _ask_until_decided(served)
         parameters = request.parameters
         if request.again is not None:
             parameters = parameters_of_trial(campaign, request.again)
         return campaign.ask(parameters, draw=request.draw, because=request.because)
+
+
+def _ask_until_decided(served: ServedCampaign) -> OpenTrial:
+    campaign, threshold = served.campaign, served.threshold
+    if threshold is None:
+        raise InputError("there is no threshold, so no task decides a verdict: start the server with --threshold.")
+    # At a rig people decide when to stop, so the budget is never what ends the campaign.
+    budget = len(campaign.trials) + _AHEAD
+    opened = campaign.ask_until_decided(threshold, budget, certificate=served.certificate)
+    if opened is None:
+        raise InputError(
+            f"the verdict against {threshold:g} is reached, so no further execution is needed for it. For more "
+            "executions, choose a task in another way."
+        )
+    return opened
 
 
 def files_of(served: ServedCampaign, tell: TellStage, number: int) -> Files:
