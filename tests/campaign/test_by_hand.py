@@ -177,7 +177,10 @@ def test_asking_by_command_chooses_what_a_campaign_chooses(invoke: Any) -> None:
         (["a.sqlite", "--set", "goal"], "as name=value, got 'goal'"),
         (["a.sqlite", "--set", "goal=1", "--set", "goal=2"], "given once"),
         (["a.sqlite", "--set", "goal=one"], "goal must be a number, got 'one'"),
-        (["a.sqlite", "--set", "goal=1", "--draw"], "--set, --draw, --again, --trial and --until-decided cannot be combined"),
+        (
+            ["a.sqlite", "--set", "goal=1", "--draw"],
+            "--set, --draw, --again, --trial and --until-decided cannot be combined",
+        ),
         (["a.sqlite", "--until-decided", "--draw"], "--trial and --until-decided cannot be combined"),
         (["a.sqlite", "--threshold", "1"], "--threshold and --budget need --until-decided"),
         (["a.sqlite", "--until-decided", "--threshold", "nan"], "the threshold must be"),

@@ -10,7 +10,7 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, Experiment, Store, Validation, searches
-from ctxval.campaign.telling import Report, parameters_of_trial, require_tolerance, result_sentence, tell_report
+from ctxval.campaign.telling import ToldResult, parameters_of_trial, require_tolerance, result_sentence, tell_result
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 
@@ -25,10 +25,10 @@ def test_a_report_of_each_kind_is_stored(campaign: Campaign, tmp_path: Path) -> 
     by_file, by_distance, failed = (campaign.ask() for _ in range(3))
     run = campaign.validation.system.execute(by_file.plan.controller, by_file.plan.task)
     run.to_csv(tmp_path / "run.csv")
-    told = tell_report(campaign, made, by_file.number, Report(tmp_path / "run.csv"))
+    told = tell_result(campaign, made, by_file.number, ToldResult(tmp_path / "run.csv"))
     assert told.distance == pytest.approx(campaign.validation.accept(by_file.plan, run).distance)
-    assert tell_report(campaign, made, by_distance, Report(distance=0.25)).distance == 0.25
-    assert tell_report(campaign, made, failed.number, Report(failed="cut out")).failure == "cut out"
+    assert tell_result(campaign, made, by_distance, ToldResult(distance=0.25)).distance == 0.25
+    assert tell_result(campaign, made, failed.number, ToldResult(failed="cut out")).failure == "cut out"
     assert result_sentence(campaign.trials[1], "rad") == "trial 1 has the distance 0.25 rad"
     assert result_sentence(campaign.trials[2]) == "trial 2 failed: cut out"
 
@@ -43,7 +43,7 @@ def test_a_failure_needs_no_controller(tmp_path: Path) -> None:
 
     campaign.validation.synthesizer.design = refuse  # type: ignore[method-assign]
     made = Experiment("pendulum", campaign.validation)
-    assert tell_report(campaign, made, opened.number, Report(failed="cut out")).state == "failed"
+    assert tell_result(campaign, made, opened.number, ToldResult(failed="cut out")).state == "failed"
     store.close()
 
 

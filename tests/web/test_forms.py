@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import TaskSpace
-from ctxval.campaign.telling import Report
+from ctxval.campaign.telling import ToldResult
 from ctxval.errors import InputError
 from ctxval.web.desk import recording_in
 from ctxval.web.forms import result, task_request
@@ -52,10 +52,10 @@ def test_a_request_that_cannot_be_used_is_refused(fields: dict[str, str], senten
 
 def test_results_of_every_kind() -> None:
     path = Path("run.csv")
-    assert result("failure", {"reason": " cut out "}, None) == Report(failed="cut out")
-    assert result("distance", {"distance": "0.5"}, None) == Report(distance=0.5)
-    assert result("recording", {"tolerance": ""}, path) == Report(path)
-    assert result("recording", {"resample": "on", "tolerance": "0.2"}, path) == Report(
+    assert result("failure", {"reason": " cut out "}, None) == ToldResult(failed="cut out")
+    assert result("distance", {"distance": "0.5"}, None) == ToldResult(distance=0.5)
+    assert result("recording", {"tolerance": ""}, path) == ToldResult(path)
+    assert result("recording", {"resample": "on", "tolerance": "0.2"}, path) == ToldResult(
         path, resample=True, start_tolerance=0.2
     )
 
@@ -64,7 +64,7 @@ def test_results_of_every_kind() -> None:
 def test_no_form_is_too_odd(fields: dict[str, str]) -> None:
     for read in (lambda: task_request(fields, SPACE), lambda: result("distance", fields, None)):
         with contextlib.suppress(InputError):
-            assert isinstance(read(), TaskRequest | Report)
+            assert isinstance(read(), TaskRequest | ToldResult)
 
 
 @given(st.text())

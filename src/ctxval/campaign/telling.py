@@ -19,7 +19,7 @@ from ctxval.errors import InputError
 
 
 @dataclass(frozen=True)
-class Report:
+class ToldResult:
     """The result of an open trial, before it is checked. Exactly one of recording, distance and failed is given.
 
     Attributes:
@@ -58,29 +58,29 @@ def require_tolerance(given: float | None, name: str) -> None:
         raise InputError(f"{name} must be a finite number >= 0, got {given!r}.")
 
 
-def tell_report(campaign: Campaign, experiment: Experiment, trial: OpenTrial | int, report: Report) -> Trial:
+def tell_result(campaign: Campaign, experiment: Experiment, trial: OpenTrial | int, told: ToldResult) -> Trial:
     """Check and store the result of an open trial.
 
     Args:
         campaign: the campaign of the trial.
         experiment: gives the names of the columns of a recording.
         trial: the open trial, or its number. A controller is designed only if a number comes with a recording.
-        report: the result.
+        told: the result.
 
     Raises:
         InputError, ExecutionError, DistanceError: as in :meth:`ctxval.Campaign.tell`, and if the file cannot be read.
     """
     recording = None
-    if report.recording is not None:
+    if told.recording is not None:
         trial = trial if isinstance(trial, OpenTrial) else campaign.reopen(trial)
         recording = read_recording(
-            *(report.recording, experiment, trial.plan),
-            npz=report.npz,
-            resample=report.resample,
-            mapping=report.mapping,
+            *(told.recording, experiment, trial.plan),
+            npz=told.npz,
+            resample=told.resample,
+            mapping=told.mapping,
         )
     return campaign.tell(
-        trial, recording, distance=report.distance, failed=report.failed, start_tolerance=report.start_tolerance
+        trial, recording, distance=told.distance, failed=told.failed, start_tolerance=told.start_tolerance
     )
 
 

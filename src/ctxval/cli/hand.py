@@ -11,7 +11,7 @@ import typer
 from ctxval.campaign.by_hand import KnownRun, parameters_from, read_runs, write_files
 from ctxval.campaign.campaign import OpenTrial
 from ctxval.campaign.known import KnownExecution
-from ctxval.campaign.telling import Report, parameters_of_trial, require_tolerance, result_sentence, tell_report
+from ctxval.campaign.telling import ToldResult, parameters_of_trial, require_tolerance, result_sentence, tell_result
 from ctxval.certificates.verdict import require_threshold
 from ctxval.cli.base import FALSIFIED, app, command, out, print_verdict
 from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, Threshold, named_values
@@ -182,8 +182,8 @@ def tell(
     require_tolerance(start_tolerance, "--start-tolerance")
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
     mapping = opened.settings.log_mapping
-    told = Report(trajectory or npz, distance, failed, npz is not None, resample, start_tolerance, mapping)
-    ended = tell_report(opened.campaign, opened.experiment, trial, told)
+    told = ToldResult(trajectory or npz, distance, failed, npz is not None, resample, start_tolerance, mapping)
+    ended = tell_result(opened.campaign, opened.experiment, trial, told)
     report = _ended(ended, opened)
     if not as_json:
         out.say(result_sentence(ended, opened.experiment.units))

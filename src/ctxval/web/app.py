@@ -21,7 +21,7 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response, Stream
 from starlette.routing import Route
 
 from ctxval._util.texts import shortened, visible
-from ctxval.campaign.telling import Report
+from ctxval.campaign.telling import ToldResult
 from ctxval.errors import CampaignError, CtxvalError, InputError, StoreError
 from ctxval.web import forms
 from ctxval.web.access import Access
@@ -176,8 +176,8 @@ class OperatorPage:
                 path = recording_in(folder, upload.filename)
                 path.write_bytes(await upload.read())
             try:
-                report: Report = forms.result(kind, fields, path)
-                await self.service.tell(number, report, fields.get("submission", ""))
+                told: ToldResult = forms.result(kind, fields, path)
+                await self.service.tell(number, told, fields.get("submission", ""))
             except InputError as error:
                 # The operator knows the name of the file, not the folder in which it is read.
                 raise InputError(str(error).replace(f"{folder}/", "")) from error

@@ -13,7 +13,7 @@ import numpy as np
 
 from ctxval._util.representation import call
 from ctxval._util.texts import reason_of
-from ctxval.campaign.telling import Report, tell_report
+from ctxval.campaign.telling import ToldResult, tell_result
 from ctxval.campaign.until_decided import require_decisive
 from ctxval.core.labels import labels_of
 from ctxval.core.space import TaskSpace
@@ -128,14 +128,14 @@ class Desk:
         """Return what identifies the present state of the store."""
         return await self._in_thread(lambda: self._served.campaign.store.signature())
 
-    async def tell(self, number: int, report: Report) -> Trial:
+    async def tell(self, number: int, told: ToldResult) -> Trial:
         """Check and store the result of an open trial; return the trial, which may be unmeasured.
 
         Raises:
             InputError, ExecutionError, StoreError: as in :meth:`ctxval.Campaign.tell`.
             CampaignError: if users' code fails.
         """
-        return await self._in_thread(lambda: self._tell(number, report))
+        return await self._in_thread(lambda: self._tell(number, told))
 
     def close(self) -> None:
         """Close the store after the present work; a second call does nothing."""
@@ -187,10 +187,10 @@ class Desk:
         states, _ = self._served.experiment.names(start.size, 0)
         return OpenTask(tuple(zip(labels_of(states), start.tolist(), strict=True)), task.horizon, task.dt)
 
-    def _tell(self, number: int, report: Report) -> Trial:
+    def _tell(self, number: int, told: ToldResult) -> Trial:
         campaign = self._served.campaign
         try:
-            return tell_report(campaign, self._served.experiment, number, report)
+            return tell_result(campaign, self._served.experiment, number, told)
         except DistanceError:
             ended = campaign.trials[number]
             if ended.state != "unmeasured":

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ctxval.campaign.telling import Report, require_tolerance
+from ctxval.campaign.telling import ToldResult, require_tolerance
 from ctxval.core.space import TaskSpace
 from ctxval.errors import InputError
 from ctxval.web.jobs import TaskRequest
@@ -50,7 +50,7 @@ def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
     raise InputError("choose how the next task is to be found.")
 
 
-def result(kind: str, fields: Fields, recording: Path | None) -> Report:
+def result(kind: str, fields: Fields, recording: Path | None) -> ToldResult:
     """Return what an operator reports of a trial.
 
     Args:
@@ -65,14 +65,14 @@ def result(kind: str, fields: Fields, recording: Path | None) -> Report:
         reason = fields.get("reason", "").strip()
         if not reason:
             raise InputError('a failure needs a reason, such as "the motor cut out".')
-        return Report(failed=reason)
+        return ToldResult(failed=reason)
     if kind == "distance":
-        return Report(distance=_number(fields, "distance", "the distance"))
+        return ToldResult(distance=_number(fields, "distance", "the distance"))
     if recording is None:
         raise InputError("choose the file of the recording.")
     tolerance = _number(fields, "tolerance", "the start tolerance") if fields.get("tolerance", "").strip() else None
     require_tolerance(tolerance, "the start tolerance")
-    return Report(recording, resample="resample" in fields, start_tolerance=tolerance)
+    return ToldResult(recording, resample="resample" in fields, start_tolerance=tolerance)
 
 
 def _number(fields: Fields, field: str, name: str) -> float:

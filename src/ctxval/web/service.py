@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ctxval._util.representation import call, counted
-from ctxval.campaign.telling import Report
+from ctxval.campaign.telling import ToldResult
 from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError, InputError
 from ctxval.web import jobs
@@ -172,19 +172,19 @@ class CampaignService:
         self._update(choosing=Work.begun("choosing a task"), choice_error=None, chosen=None)
         self._spawn(self._choose(request))
 
-    async def tell(self, number: int, report: Report, submission: str) -> Trial:
+    async def tell(self, number: int, told: ToldResult, submission: str) -> Trial:
         """Record the result of an open trial, once for each submitted form.
 
         Args:
             number: the number of the trial.
-            report: the result.
+            told: the result.
             submission: identifies the form; a form that is sent twice is recorded once.
 
         Raises:
             InputError, ExecutionError, StoreError, CampaignError: as in :meth:`Desk.tell`; the trial stays as it was.
         """
         try:
-            ended = await self._desk.tell(number, report)
+            ended = await self._desk.tell(number, told)
         except InputError:
             if not submission or self._submitted.get(submission) != number:
                 raise
