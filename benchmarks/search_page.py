@@ -373,6 +373,9 @@ campaign ends within 1 % of d* or when its budget is spent.
 
 {heavy_tail}
 
+Seed 8 of `basin` has no definite maximum. At its worst corner the executed closed loop is unstable, so that rounding
+errors decide its distance. `auto` executes this corner, but the distance there need not be that of the large search.
+
 {more_seeds}
 
 ![Gap to the maximum against executions](search/regret.png)

@@ -107,7 +107,17 @@ def test_every_amount_has_a_text(done: float, expected: float | None, elapsed: f
     if expected is not None and done > expected:
         expected = None
     found = amount(Progress("s", done, expected, "designs"), elapsed)
-    assert ("left" in found) == (expected is not None and done > 0)
+    told = expected is not None and done > 0 and (done >= 0.1 * expected or elapsed >= 60.0)
+    assert ("left" in found) == told
+
+
+def test_the_time_that_is_left_is_told_once_some_work_is_done() -> None:
+    def shown(done: float, elapsed: float) -> str:
+        return amount(Progress("s", done, 200.0, "designs"), elapsed)
+
+    assert shown(12, 2.0) == "12/200 designs"
+    assert shown(50, 2.0) == "50/200 designs, 6 s left"
+    assert shown(12, 60.0) == "12/200 designs, 16 min left"
 
 
 @pytest.mark.parametrize(

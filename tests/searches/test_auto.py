@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from ctxval._util.arrays import Array
 from ctxval.errors import InputError
+from ctxval.gp.ascent import usual_effort
 from ctxval.searches import Auto, Costs, Prediction, by_name
 
 
@@ -57,6 +59,27 @@ def test_thinking_takes_no_longer_than_an_evaluation(prediction: float, evaluati
     assert note is not None
     assert note["designs"] == designs
     assert 0.4 * designs <= count <= designs + 8
+
+
+def test_rough_predictions_and_batches_have_prices_of_their_own() -> None:
+    search = by_name("auto")
+    search.reset(6, 0)
+    assert isinstance(search, Auto)
+    effort = usual_effort(6, 2000)
+    assert effort.rough > effort.exact > 0
+    seconds = search.thinking_seconds(Costs(1.0, None, rough=0.1, batch=0.5), 2000)
+    np.testing.assert_allclose(seconds, effort.exact + 0.1 * effort.rough + 0.5 * effort.batches)
+    np.testing.assert_allclose(search.thinking_seconds(Costs(1.0, None), 2000), effort.points)
+
+
+def test_a_choice_that_is_mostly_rough_predicts_more_points() -> None:
+    def designs(rough: float) -> int:
+        search = made()
+        search.reset(6, 0)
+        prediction = Prediction(lambda Z: (peak(Z), peak(Z)), lambda rows: np.empty(0), 2000)
+        return search.designs(replace(prediction, costs=lambda: Costs(0.01, 3.0, rough=rough)))
+
+    assert [designs(rough) for rough in (0.01, 0.003, 0.001)] == [300, 800, 2000]
 
 
 def test_the_number_is_fixed_once_an_evaluation_was_timed() -> None:

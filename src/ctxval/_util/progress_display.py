@@ -18,6 +18,12 @@ if TYPE_CHECKING:
 _DELAY = 0.4
 """Seconds before a stage is shown; most end sooner."""
 
+_TOLD = 0.1
+"""Share of the work from which on it is told how much time is left: the first parts may take longer than others."""
+
+_LONG = 60.0
+"""Seconds after which this is told in any case."""
+
 _SILENCE = 30.0
 """Seconds without a line in a log, after which a stage writes one."""
 
@@ -158,7 +164,8 @@ def amount(progress: Progress, elapsed: float) -> str:
     if progress.expected is None:
         return f"{progress.done:,.0f} {progress.unit}".strip() if progress.done else ""
     text = f"{progress.done:,.0f}/{progress.expected:,.0f} {progress.unit}".strip()
-    if not progress.done or progress.ended or progress.note:
+    early = progress.done < _TOLD * progress.expected and elapsed < _LONG
+    if early or not progress.done or progress.ended or progress.note:
         return text
     return f"{text}, {duration(elapsed * (progress.expected - progress.done) / progress.done)} left"
 

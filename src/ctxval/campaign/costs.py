@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.progress import stage
 from ctxval.core.plan import Plan
 from ctxval.core.rollout import rollout
 from ctxval.core.trajectory import Trajectory
@@ -22,10 +23,11 @@ from ctxval.searches import Auto, Costs, Prediction
 from ctxval.searches.auto import FAST
 
 _BATCHES = (1, 8, 64)
-"""Numbers of tasks that are predicted at once to measure the cost of one; the first is also a warm-up."""
+"""Numbers of tasks that may be predicted at once to measure what a task costs, and a batch besides its tasks."""
 
-_ENOUGH = 0.1
-"""Seconds: a batch that takes longer needs no larger one after it."""
+_QUICK, _ENOUGH = 0.02, 0.1
+"""Seconds of a single prediction up to which the large batch is timed if designs take batches, and up to which the
+medium one is timed if they do not."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +69,12 @@ class ThinkingCosts:
         if prediction is None:
             return cls(design, loop)
         learning = _cpu_now() - begun
-        each = _seconds_of_prediction(prediction, validation.space.dimension)
+        costs = costs_of(prediction, validation, ())
         search = Auto("thorough")
         search.reset(validation.space.dimension, 0)
         designs = search.designs(prediction)
-        fast = round(FAST * designs)
-        return cls(design, loop, learning + designs * each, designs, learning + fast * each)
+        thorough, fast = (search.thinking_seconds(costs, number) for number in (designs, round(FAST * designs)))
+        return cls(design, loop, learning + thorough, designs, learning + fast)
 
 
 def _unlike(plan: Plan) -> Trajectory:
@@ -106,23 +108,37 @@ def costs_of(prediction: Prediction, validation: Validation, trials: Sequence[Tr
         validation: contains the system. If people execute it, an execution costs more than all thinking.
         trials: the trials, which contain the seconds of their executions.
     """
-    predicting = _seconds_of_prediction(prediction, validation.space.dimension)
-    return Costs(predicting, _seconds_of_execution(validation, trials))
+    batched = bool(getattr(validation.synthesizer, "batched", False))
+    with stage("timing predictions", unit="designs"):
+        each, batch, more = _prices(prediction, validation.space.dimension, batched)
+    return Costs(each + more, _seconds_of_execution(validation, trials), each, batch)
 
 
-def _seconds_of_prediction(prediction: Prediction, dimension: int) -> float:
-    """Return the seconds of CPU time in which one task is predicted, in a batch if there can be one."""
-    # Elapsed time would make the choices depend on what else the machine does.
-    rng, seconds = np.random.default_rng(0), math.inf
-    for count in _BATCHES:
-        points = rng.random((count, dimension))
-        started = _cpu_now()
-        prediction.expected(points)
-        taken = _cpu_now() - started
-        seconds = min(seconds, taken / count)
-        if taken > _ENOUGH:
-            break
-    return seconds
+def _prices(prediction: Prediction, dimension: int, batched: bool) -> tuple[float, float, float]:
+    """Return the seconds of a rough prediction, of a batch besides its points, and what an exact prediction adds."""
+    predict, rng = prediction.rough or prediction.expected, np.random.default_rng(0)
+    single = _predicting_seconds(predict, rng.random((1, dimension)))
+    points = rng.random((_batch_to_time(single, batched), dimension))
+    seconds, count = _predicting_seconds(predict, points), len(points)
+    # What a batch costs besides its points follows from a batch of one point.
+    each = seconds if count == 1 else min(max(seconds - single, 0.0) / (count - 1), seconds / count)
+    # The controllers of these points are known now, so the exact prediction adds what its closed loops cost.
+    return each, seconds - count * each, _predicting_seconds(prediction.expected, points) / count
+
+
+def _batch_to_time(single: float, batched: bool) -> int:
+    """Return the number of points of the batch that is timed, for the seconds of a single point."""
+    small, medium, large = _BATCHES
+    if batched and single <= _QUICK:
+        return large
+    return medium if batched or single <= _ENOUGH else small
+
+
+def _predicting_seconds(predict: Callable[[Array], object], points: Array) -> float:
+    """Return the seconds of CPU time of a prediction; elapsed time would depend on what else the machine does."""
+    started = _cpu_now()
+    predict(points)
+    return _cpu_now() - started
 
 
 def _seconds_of_execution(validation: Validation, trials: Sequence[Trial]) -> float | None:

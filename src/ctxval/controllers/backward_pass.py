@@ -18,8 +18,10 @@ from ctxval.core.controller import Limits
 
 _STEP_LENGTHS = 0.5 ** np.arange(12)
 """Step lengths of projected Newton steps, the longest first."""
-_FEW = 200
+_FEW = 16
 """Number of entries below which LAPACK inverts matrices of two rows faster than the closed form."""
+_ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
+"""Signs of the entries of the adjugate of a matrix of two rows."""
 _NEWTON_STEPS = 50
 """Largest number of projected Newton steps for inputs with limits."""
 _NEWTON_DECREASE = 0.1
@@ -188,9 +190,9 @@ class _Stage:
         low, high = self.box[0][t], self.box[1][t]
         beyond = np.flatnonzero(((k <= low) | (k >= high)).any(axis=-1))
         if len(beyond):
-            N = len(k)
-            K, Q_uu, Q_ux = (np.broadcast_to(part, (N, *part.shape[-2:])) for part in (K, Q_uu, Q_ux))
-            K, box = K.copy(), (low[beyond], high[beyond])
+            parts = (part if part.ndim == 3 else np.repeat(part[None], len(k), axis=0) for part in (K, Q_uu, Q_ux))
+            K, Q_uu, Q_ux = parts
+            box = low[beyond], high[beyond]
             K[beyond], k[beyond] = _within(box, k[beyond], Q_uu[beyond], Q_u[beyond], Q_ux[beyond])
         return K, k
 
@@ -245,12 +247,10 @@ def _inverses(matrices: Array) -> Array:
         return 1.0 / matrices
     if m > 2 or matrices.size < _FEW:
         return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-    a, b, c, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 0], matrices[..., 1, 1]
-    share = 1.0 / (a * d - b * c)
-    found = np.empty(matrices.shape)
-    found[..., 0, 0], found[..., 0, 1] = d * share, -b * share
-    found[..., 1, 0], found[..., 1, 1] = -c * share, a * share
-    return found
+    determinants = matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0]
+    found = np.swapaxes(matrices[..., ::-1, ::-1], -1, -2) * _ADJUGATE
+    found *= (1.0 / determinants)[..., None, None]
+    return np.asarray(found)
 
 
 def times(rows: Array, matrix: np.ndarray[Any, np.dtype[np.floating[Any]]]) -> Array:

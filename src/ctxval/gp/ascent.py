@@ -6,6 +6,8 @@ maxima whose slopes the first samples have met. :mod:`ctxval.gp.global_search` l
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ctxval._util.arrays import Array
@@ -122,15 +124,47 @@ class Ascent:
             done.search_lines(_best(done, min(starts, allowed)), rounds)
 
 
-def usual_evaluations(dimension: int, budget: int) -> int:
-    """Return about how many evaluations a search takes, rather too many; one that goes on improving takes more."""
-    if dimension <= _FEW:
-        each = _ZOOMED + (_SAMPLES + 2 * _MOVED) * dimension
-        count = min(_POOL * dimension, budget // 3) + (2 * dimension - 1) * each
-    else:
-        lines = _STARTS * _ROUNDS + _FINALISTS[0] * _FINALISTS[1]
-        count = budget // 6 + _REFINED + lines * line_search_cost(dimension)
-    return min(budget, round(1.1 * count) + _STARTS)
+@dataclass(frozen=True)
+class Effort:
+    """What a search usually evaluates; one that goes on improving evaluates up to half as much again.
+
+    Attributes:
+        exact: number of points at which the function itself is evaluated.
+        rough: number of points at which its approximation is evaluated.
+        batches: number of calls in which all of these are evaluated.
+    """
+
+    exact: int
+    rough: int
+    batches: int
+
+    @property
+    def points(self) -> int:
+        """The number of all points."""
+        return self.exact + self.rough
+
+
+def usual_effort(dimension: int, budget: int) -> Effort:
+    """Return what a search with this budget usually evaluates, if the function has an approximation."""
+    return _effort_of_few(dimension, budget) if dimension <= _FEW else _effort_of_many(dimension, budget)
+
+
+def _effort_of_few(dimension: int, budget: int) -> Effort:
+    first, each = _STARTS + min(_POOL * dimension, budget // 3), _ZOOMED + (_SAMPLES + 2 * _MOVED) * dimension
+    exact = min(budget, first + (2 * dimension - 1) * each)
+    return Effort(exact, 0, 2 + -(-(exact - first) // each))
+
+
+def _effort_of_many(dimension: int, budget: int) -> Effort:
+    line, rounds = line_search_cost(dimension), _ROUNDS - 1  # most climbs end before their last round
+    rough = min(budget, _STARTS + max(8, budget // 6))
+    climbs = min(_STARTS, (budget - rough) // (_ROUNDS * line))
+    rough += rounds * line * climbs
+    exact = min(budget - rough, _STARTS + _REFINED)
+    finals = min(_FINALISTS[0], (budget - rough - exact) // (_FINALISTS[1] * line))
+    exact += line * finals
+    exact += min(budget - rough - exact, 4 * dimension)
+    return Effort(exact, rough, 3 + (2 * rounds if climbs else 0) + (3 if finals else 0))
 
 
 def _best(done: Evaluations, count: int, share: float = _SEPARATION) -> Array:

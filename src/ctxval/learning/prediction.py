@@ -124,7 +124,9 @@ class DistancePredictor:
         batched = bool(loops.batch_shape)
         in_parallel = not batched and seconds > _SLOW
         exact = _PredictedDistance(self._plans, *corrected, executed, in_parallel)
-        rough = replace(exact, residual=exact.residual.rough(_ROUGH_CENTRES))
+        fewer = exact.residual.rough(_ROUGH_CENTRES)
+        # If few centres do not suffice, both predictions are one, so that no task is predicted twice.
+        rough = exact if fewer is exact.residual else replace(exact, residual=fewer)
         return Prediction(exact, exact.left_out, _DESIGNS if batched else _SLOW_DESIGNS, rough=rough)
 
     def _corrected(self, executed: Executed, loops: Trajectory) -> tuple[Model, Residual] | None:

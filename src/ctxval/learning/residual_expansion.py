@@ -47,9 +47,10 @@ class ResidualExpansion:
     def __call__(self, rows: Array) -> Array:
         """Return the values ``(q, n)`` at standardised pairs ``(q, k)``."""
         q, k = rows.shape
-        extended = np.ones((q, 2 * k + 1))
+        extended = np.empty((q, 2 * k + 1))
         extended[:, :k] = rows
         np.multiply(rows, rows, out=extended[:, k : 2 * k])
+        extended[:, -1] = 1.0
         if self.weights.ndim == 3:
             covariances = self._covariances(extended)[:, None, :]
             found = np.matmul(covariances, self.weights) + np.matmul(extended[:, None, :], self.linear)

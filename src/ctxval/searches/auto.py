@@ -11,7 +11,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import expect
 from ctxval._util.registry import part
 from ctxval.errors import InputError
-from ctxval.gp.ascent import usual_evaluations
+from ctxval.gp.ascent import usual_effort
 from ctxval.searches.base import Costs, Prediction
 from ctxval.searches.trust_region import TrustRegion
 
@@ -57,7 +57,7 @@ class Auto(TrustRegion):
         self._fixed_now = None
         if prediction is not None:
             prediction = replace(prediction, budget=self.designs(prediction))
-            expect(usual_evaluations(self.dimension, prediction.budget) + self.predicted_besides)
+            expect(usual_effort(self.dimension, prediction.budget).points + self.predicted_besides)
         super().use_prediction(prediction)
 
     def propose(self, rng: np.random.Generator) -> Array:
@@ -85,9 +85,19 @@ class Auto(TrustRegion):
         if prediction.costs is None:
             return most
         costs = prediction.costs()
-        designs = _balanced(costs, most)
+        designs = self._balanced(costs, most)
         self._fixed_now = None if costs.evaluation is None else designs
         return designs
+
+    def thinking_seconds(self, costs: Costs, designs: int) -> float:
+        """Return the estimated seconds of CPU time of the predictions of a choice with so many designs."""
+        return costs.thinking(usual_effort(self.dimension, designs))
+
+    def _balanced(self, costs: Costs, most: int) -> int:
+        """Return the largest number of designs that takes no longer than one evaluation, or than is always short."""
+        seconds = max(_SHORT, _SUPPOSED if costs.evaluation is None else costs.evaluation)
+        numbers = [_designs(share, most) for share in _SHARES]
+        return next((number for number in numbers if self.thinking_seconds(costs, number) <= seconds), numbers[-1])
 
     def _noted_designs(self) -> int | None:
         """Return the number of designs that was fixed at an earlier choice; None if there was none."""
@@ -115,10 +125,3 @@ def _checked(thinking: Thinking | int) -> Thinking | int:
 
 def _designs(share: float, most: int) -> int:
     return max(1, round(share * most))
-
-
-def _balanced(costs: Costs, most: int) -> int:
-    """Return the largest number of designs that takes no longer than one evaluation, or than is always short."""
-    seconds = max(_SHORT, _SUPPOSED if costs.evaluation is None else costs.evaluation)
-    numbers = [_designs(share, most) for share in _SHARES]
-    return next((number for number in numbers if number * costs.prediction <= seconds), numbers[-1])

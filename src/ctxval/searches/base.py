@@ -13,6 +13,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, Rows, as_floats
 from ctxval._util.representation import call, options, record
 from ctxval.errors import InputError, ShapeError
+from ctxval.gp.ascent import Effort
 from ctxval.gp.surrogate import Surrogate
 
 Note = dict[str, Any]
@@ -21,15 +22,24 @@ Note = dict[str, Any]
 
 @dataclass(frozen=True)
 class Costs:
-    """What one prediction and one evaluation cost.
+    """What predictions and one evaluation cost.
 
     Attributes:
-        prediction: seconds of CPU time of the prediction of one point.
+        prediction: seconds of CPU time of the prediction of one point in a batch.
         evaluation: seconds of one evaluation; infinity if people make it, and None if none was timed.
+        rough: seconds of CPU time of the rough prediction of one point; that of the prediction if None.
+        batch: seconds of CPU time of each batch besides those of its points.
     """
 
     prediction: float
     evaluation: float | None
+    rough: float | None = None
+    batch: float = 0.0
+
+    def thinking(self, effort: Effort) -> float:
+        """Return the seconds of CPU time of so many predictions."""
+        rough = self.prediction if self.rough is None else self.rough
+        return effort.batches * self.batch + effort.exact * self.prediction + effort.rough * rough
 
 
 @dataclass(frozen=True, eq=False)
