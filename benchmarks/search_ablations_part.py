@@ -9,7 +9,7 @@ import numpy as np
 import misleading
 from calibration_page import table
 from search_cells import ENDS, cells, reached, results
-from study_ablations import ABLATIONS, BUDGET
+from study_ablations import ABLATIONS, BUDGET, ON_PLANTS
 from study_ablations import CASES as ABLATED
 from study_auto import WITHIN, Result, first_within, repeated, shown
 
@@ -20,15 +20,24 @@ SHOWN = {"no climbs": "no trust region"}
 
 def of_ablation(case: str, without: str) -> dict[int, Result]:
     """Return the campaigns without a part, or those of `auto` itself."""
-    if without != "auto":
+    if without != "auto" or case in ON_PLANTS:
         return results("ablations", case, without, ABLATION_SEEDS)
     return results("misleading" if case in misleading.CASES else "auto", case, "auto", ABLATION_SEEDS)
 
 
 def ablation_table() -> str:
-    """Return what is found without each part, on the seeds that all have."""
+    """Return what is found without each part on the cases, on the seeds that all have."""
+    return _each(ABLATED)
+
+
+def plant_ablation_table() -> str:
+    """Return the same for plants."""
+    return _each(ON_PLANTS)
+
+
+def _each(systems: Iterable[str]) -> str:
     rows = []
-    for case in ABLATED:
+    for case in systems:
         found = {without: of_ablation(case, without) for without in ("auto", *ABLATIONS)}
         found = {without: campaigns for without, campaigns in found.items() if campaigns}
         common = sorted(set.intersection(*map(set, found.values()))) if found else []

@@ -20,7 +20,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
 from peers import run
 from peers.page import first_within as within_of
-from search_ablations_part import ABLATION_SEEDS, ablation_table, new_ablation_table
+from search_ablations_part import ABLATION_SEEDS, ablation_table, new_ablation_table, plant_ablation_table
 from search_cells import ENDS, SEEDS, Counts, cells, largest, reached, results, spread
 from study_ablations import BUDGET as NEW_BUDGET
 from study_ablations import CHOSEN_BY, OTHERS
@@ -400,6 +400,10 @@ A campaign that ends sooner shows no effect of either.
 
 {ablations}
 
+The plants below that are executed quickly, {new_budget} executions for each campaign:
+
+{ablations_plants}
+
 Further systems with a mechanism that misleads, {new_budget} executions for each campaign, all systems together. The
 parts of the search were chosen by those in
 [dynamics_development_misleading.py](../benchmarks/dynamics_development_misleading.py). The share of d* is the mean,
@@ -514,6 +518,7 @@ def text() -> str:
         ablations=ablation_table(),
         new_budget=NEW_BUDGET,
         near=NEAR,
+        ablations_plants=plant_ablation_table(),
         ablations_chosen=new_ablation_table(CHOSEN_BY),
         ablations_others=new_ablation_table(OTHERS),
         misleading=misleading_table(),

@@ -20,6 +20,8 @@ from ctxval import Experiment, searches
 from ctxval._util.json_lines import JsonLines
 from ctxval.searches import BayesianOptimisation, TrustRegion, TrustRegionSettings
 from dynamics_development_misleading import MISLEADING
+from plants import PLANTS
+from plants.truths import truth as plant_truth
 from study_auto import Result, add_options, campaign, print_table, results_of, stored
 
 CASES = ("pendulum-no-data", "linear-5", "dubins-basin", "arm-fnn", *misleading.CASES)
@@ -27,8 +29,13 @@ CHOSEN_BY = {entry.name: entry for entry in MISLEADING}
 """Systems that mislead, by which the parts of the search were chosen."""
 OTHERS = {entry.name: entry for entry in dynamics_misleading.MISLEADING}
 """Systems that mislead, by which nothing was chosen."""
+ON_PLANTS = {name: PLANTS[name] for name in ("fuel-control", "cart-pole", "f16-pull-up", "magnetic-levitation")}
+"""Plants that are executed quickly: two of each kind. By the last two nothing was chosen."""
 BUDGET = 15
 """Executions in a campaign on one of these systems."""
+
+
+SYSTEMS = [*CASES, *ON_PLANTS, *CHOSEN_BY, *OTHERS]
 
 
 def trust_region(**settings: Any) -> TrustRegion:
@@ -54,6 +61,10 @@ def prepared(case: str, seed: int, truths: Path) -> tuple[Experiment, int, float
     if case in misleading.CASES:
         found = misleading.CASES[case](seed)
         return found, misleading.BUDGET, misleading.truth(found, truths)
+    if case in ON_PLANTS:
+        plant = ON_PLANTS[case]
+        on_plant = plant(seed)
+        return on_plant, BUDGET, float(plant_truth(plant, seed, on_plant)["distance"])
     if case in dynamics_truths.ENTRIES:
         entry = dynamics_truths.ENTRIES[case]
         return entry(seed), BUDGET, float(dynamics_truths.truth(entry, seed)["distance"])
@@ -83,9 +94,7 @@ def run(case: str, seed: int, without: str, results: JsonLines, truths: Path) ->
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "cases", nargs="*", default=[*CASES, *CHOSEN_BY, *OTHERS], help=f"of {', '.join([*CASES, *CHOSEN_BY, *OTHERS])}"
-    )
+    parser.add_argument("cases", nargs="*", default=SYSTEMS, help=f"of {', '.join(SYSTEMS)}")
     parser.add_argument("--search", nargs="+", default=["auto", *ABLATIONS], help="auto, or what is left out")
     add_options(parser, "ablations")
     parser.set_defaults(seeds=5)
