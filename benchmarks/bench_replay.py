@@ -1,7 +1,10 @@
 """From a folder of recordings to a report: `ctxval replay` in a fresh process, on recordings of three kinds.
 
 MuJoCo's pendulum is recorded to MCAP, to a MATLAB file of version 7.3 and to a LeRobot data set, each written by the
-library that users write it with. The times are those of whole processes, with all imports, on the processor.
+library that users write it with. The times are those of whole processes, with all imports, on the processor and on the
+clock. With ``--install`` the wheel of this package with its extra ``logs`` is first installed into a new virtual
+environment, from the package index and without a cache, and the command runs there, from install to report. The results
+are kept in ``benchmarks/results/replay.json``, and docs/how-to/replay.md states them.
 """
 
 from __future__ import annotations
@@ -23,6 +26,8 @@ from mcap.writer import Writer
 from ctxval import Transitions, models
 
 RUNS, STEPS, DT = 8, 300, 0.02
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results" / "replay.json"
 
 PENDULUM = """
 <mujoco><option timestep="0.002"/><worldbody><body>
@@ -90,30 +95,68 @@ def arguments(folder: Path, kind: str) -> list[str]:
     return []
 
 
-def main() -> None:
-    """Write the three data sets, and replay each in a process of its own."""
+def timed(command: list[str], folder: Path) -> tuple[str, dict[str, float]]:
+    """Run a command; return what it printed, and its seconds on the processor and on the clock."""
+    before = os.times()
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
+    after = os.times()
+    assert done.returncode == 0, done.stderr
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    return done.stdout, {"cpu": round(cpu, 2), "wall": round(after.elapsed - before.elapsed, 2)}
+
+
+def installed(folder: Path) -> tuple[list[str], dict[str, float]]:
+    """Install this package into a new virtual environment; return its command line, and what this took."""
+    wheels, environment = folder / "wheels", folder / "environment"
+    timed([sys.executable, "-m", "pip", "wheel", "--no-deps", "--wheel-dir", str(wheels), str(ROOT)], folder)
+    (wheel,) = wheels.glob("*.whl")
+    _, made = timed([sys.executable, "-m", "venv", str(environment)], folder)
+    pip = [str(environment / "bin" / "pip"), "install", "--quiet", "--no-cache-dir", f"{wheel}[logs]"]
+    _, taken = timed(pip, folder)
+    return [str(environment / "bin" / "ctxval")], {key: round(made[key] + taken[key], 2) for key in made}
+
+
+def write_data_sets(folder: Path) -> None:
+    """Write the three data sets, and the linear model that is learned from the first run."""
     runs = [record(seed) for seed in range(RUNS)]
     first = runs[0]
     learned = models.Linear.fit(Transitions(first[1][:-1], first[2][:-1], first[1][1:]))
+    np.savez(folder / "model.npz", A=learned.A, B=learned.B)
+    for kind, write in (("mcap", to_mcap), ("mat", to_mat)):
+        (folder / kind).mkdir()
+        for number, one in enumerate(runs):
+            write(folder / kind, number, *one)
+    to_lerobot(folder / "lerobot", runs)
+
+
+def main() -> None:
+    """Write the three data sets, and replay each in a process of its own."""
+    if "--install" in sys.argv:
+        os.environ.pop("PYTHONPATH", None)  # the new environment must have everything itself
     with tempfile.TemporaryDirectory() as name:
-        np.savez(Path(name, "model.npz"), A=learned.A, B=learned.B)
-        folders = {kind: Path(name, kind) for kind in ("mcap", "mat", "lerobot")}
-        for kind, write in (("mcap", to_mcap), ("mat", to_mat)):
-            folders[kind].mkdir()
-            for number, one in enumerate(runs):
-                write(folders[kind], number, *one)
-        to_lerobot(folders["lerobot"], runs)
-        for kind, folder in folders.items():
-            command = [sys.executable, "-m", "ctxval.cli", "replay", str(folder), "--model", f"{name}/model.npz"]
-            before = os.times()
-            done = subprocess.run([*command, *arguments(folder, kind), "--json"], capture_output=True, text=True)
-            after = os.times()
-            assert done.returncode == 0, done.stderr
-            report = json.loads(done.stdout)
-            seconds = after.children_user + after.children_system - before.children_user - before.children_system
-            data, rates = report["data"], [100 * one["relative"] for one in report["errors"] if one["steps"] == 1]
-            print(f"{kind}: {data['recordings']} recordings, {data['steps']} steps; {seconds:.1f} s of processor time,")
-            print(f"  {after.elapsed - before.elapsed:.1f} s in all; one-step error at most {max(rates):.2g} %")
+        folder = Path(name)
+        write_data_sets(folder)
+        program, found = [sys.executable, "-m", "ctxval.cli"], {}
+        if "--install" in sys.argv:
+            program, found["install"] = installed(folder)
+        for kind in ("mcap", "mat", "lerobot"):
+            command = [*program, "replay", kind, "--model", "model.npz", *arguments(folder, kind)]
+            printed, times = timed([*command, "--html", f"{kind}.html", "--json"], folder)
+            report = json.loads(printed)
+            data = report["data"]
+            found[kind] = {**times, "recordings": data["recordings"], "steps": data["steps"]}
+            error = max(one["relative"] for one in report["errors"] if one["steps"] == 1)
+            size = (folder / f"{kind}.html").stat().st_size
+            print(
+                f"{kind}: {data['recordings']} recordings, {data['steps']} steps, {times['cpu']} s of processor time,"
+            )
+            print(
+                f"  {times['wall']} s in all; one-step error at most {100 * error:.2g} %, page of {size / 1000:.0f} kB"
+            )
+        if "install" in found:
+            whole = {key: sum(one[key] for one in found.values()) for key in ("cpu", "wall")}
+            print(f"install: {found['install']}; from install to three reports: {whole}")
+            RESULTS.write_text(json.dumps(found, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ PAGES += sorted(DOCS.glob("reference/*.md"))
 NEEDS = {"gymnasium": ["gymnasium", "mujoco"], "mujoco": ["mujoco"], "fmu": ["fmpy", "pythonfmu"], "mpc": ["casadi"]}
 NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-space": ["control"]}
 NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
+NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}
 NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
 PROGRAMS: dict[str, list[str]] = {"python": [], "ctxval": ["-c", "from ctxval.cli import main; main()"]}
 

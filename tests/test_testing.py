@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -151,3 +153,23 @@ def test_the_rig_fails_where_it_is_told_to() -> None:
     assert rig.execute(plan.controller, plan.task).finite
     with pytest.raises(RuntimeError, match="motor cut out"):
         rig.execute(plan.controller, plan.task)
+
+
+class _Telling(controllers.LQR):
+    """LQR whose controllers tell something as ``converged``."""
+
+    told: object = True
+
+    def design(self, task: Task, model: object) -> controllers.AffineFeedback:
+        return dataclasses.replace(super().design(task, model), converged=self.told)  # type: ignore[arg-type]
+
+
+def test_convergence_is_told_by_booleans_that_are_the_same_in_a_batch() -> None:
+    batch = Task([np.ones(3), 0.0], goal=[np.arange(3.0), 0.0], horizon=5, dt=0.1)
+    model = models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]])
+    testing.check_synthesizer(controllers.ILQR([1, 1], [1]), batch, model)
+    synthesizer = _Telling([1, 1], [1])
+    for wrong in ("yes", np.array([1.0]), np.array([True, False])):
+        synthesizer.told = wrong
+        with pytest.raises(ConformanceError, match="converged of a controller must be booleans"):
+            testing.check_synthesizer(synthesizer, batch, model)

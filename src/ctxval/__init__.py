@@ -28,6 +28,7 @@ from ctxval.storage.store import Store
 from ctxval.version import VERSION
 
 if TYPE_CHECKING:
+    from ctxval import aspect1 as aspect1
     from ctxval import cases as cases
     from ctxval import certificates as certificates
     from ctxval import controllers as controllers
@@ -74,6 +75,7 @@ __all__ = [
 ]
 
 _SUBMODULES = (
+    "aspect1",
     "cases",
     "certificates",
     "controllers",

@@ -11,16 +11,16 @@ from typing import Literal
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import call
-from ctxval.core.controller import Controller, Synthesizer
+from ctxval.core.controller import Controller, Synthesizer, converged_of
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model, linearize
 from ctxval.core.rollout import rollout
 from ctxval.core.system import System
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
-from ctxval.errors import ConformanceError
+from ctxval.errors import ConformanceError, InputError
 from ctxval.searches import Search
 
 _TOLERANCE = 1e-10
@@ -101,6 +101,8 @@ def _check_batched_system(
 def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> None:
     """Check that a synthesizer designs the same controller in a batch as task by task.
 
+    If the controllers have the attribute ``converged``, it must be a boolean of each task, the same in a batch.
+
     Args:
         synthesizer: the synthesizer; it has ``design``.
         task: a batch of tasks ``(N,)``.
@@ -109,15 +111,28 @@ def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> Non
     Raises:
         ConformanceError: if the synthesizer breaks its contract.
     """
-    singles = []
+    singles, converged = [], []
     for index in range(task.batch_shape[0]):
         one = task[index]
-        singles.append(rollout(model.step, synthesizer.design(one, model), one))
+        controller = synthesizer.design(one, model)
+        converged.append(_converged(controller, ()))
+        singles.append(rollout(model.step, controller, one))
         _require(bool(singles[-1].finite), f"the closed loop on the model is not finite for task {index}")
     if getattr(synthesizer, "batched", False):
-        batch = rollout(model.step, synthesizer.design(task, model), task)
+        controller = synthesizer.design(task, model)
+        together, alone = _converged(controller, task.batch_shape), [one for one in converged if one is not None]
+        same = not alone if together is None else np.array_equal(together, alone)
+        _require(same, f"converged of a batch is {together}, and one by one it is {converged}")
+        batch = rollout(model.step, controller, task)
         states = np.stack([single.states for single in singles])
         _require_close("the closed loops of a batch", batch.states, "those one by one", states, 1e-8)
+
+
+def _converged(controller: Controller, batch_shape: tuple[int, ...]) -> Mask | None:
+    try:
+        return converged_of(controller, batch_shape)
+    except InputError as error:
+        raise ConformanceError(str(error)) from error
 
 
 def check_distance(distance: Distance, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> None:

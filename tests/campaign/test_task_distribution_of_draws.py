@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,21 @@ from typer.testing import CliRunner
 
 from conftest import make_validation
 from ctxval import Campaign, Normal, Validation, searches
-from ctxval.certificates import AnytimeAudit, Audit, CertificateKind, CertificateOptions, Region, Scenario
+from ctxval.certificates import (
+    AnytimeAudit,
+    Audit,
+    CertificateKind,
+    CertificateOptions,
+    Mean,
+    Region,
+    SamplingDiscarding,
+    Scenario,
+)
 from ctxval.cli import app
 from ctxval.config.settings import read_settings
+from ctxval.config.signatures import code_named
 from ctxval.core.space import DISTRIBUTION
+from ctxval.core.task_distribution import distribution_text
 from ctxval.errors import CtxvalError, InputError, StoreMismatchError, UnknownNameError
 
 NARROW = Normal(1.0, 0.05)
@@ -60,7 +72,7 @@ def test_a_store_keeps_it_and_refuses_another_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [Audit(), AnytimeAudit(), Scenario(), Region()])
+@pytest.mark.parametrize("kind", [Audit(), AnytimeAudit(), Scenario(), SamplingDiscarding(2), Region()])
 def test_every_text_says_that_a_volume_is_a_probability_under_it(kind: CertificateKind) -> None:
     campaign = Campaign(narrow(), search=searches.Random(), seed=2).run(40)
     accepted = campaign.verdict(1e3, certificate=CertificateOptions(kind, volume=0.4))
@@ -74,6 +86,19 @@ def test_every_text_says_that_a_volume_is_a_probability_under_it(kind: Certifica
     assert "follow the stated distribution of tasks (goal normal (mean 1.0, deviation 0.05), all else" in stated
     assert "uniform over the task space" not in stated
     assert accepted.certificate.to_json()["distribution"].startswith("goal normal")
+
+
+@pytest.mark.slow
+def test_the_expected_distance_is_that_under_it() -> None:
+    campaign = Campaign(narrow(), search=searches.Auto(), seed=2).run(6).audit(40)
+    found = campaign.verdict(1e3, certificate=CertificateOptions(Mean())).certificate
+    assert found is not None
+    assert found.to_json()["distribution"].startswith("goal normal")
+    expected = narrow().distances(narrow().space.iid(2000, np.random.default_rng(7))).mean()
+    uniform = make_validation().distances(make_validation().space.iid(2000, np.random.default_rng(7))).mean()
+    low, high = found.details["lower_limit"], found.details["upper_limit"]
+    assert low <= expected <= high
+    assert not low <= uniform <= high
 
 
 @pytest.mark.slow
@@ -131,6 +156,39 @@ def test_a_wrong_distribution_in_a_file_is_named(
     file.write_text(FILE.partition("goal")[0] + table)
     with pytest.raises(error, match=message):
         read_settings(str(file), {}).load()
+
+
+MODULE = """
+import numpy as np
+from scipy import stats
+
+loads = stats.triang(0.5, loc=-1.0, scale=2.0)
+
+def draw(rng, n):
+    return rng.choice([-0.5, 0.5], (n, 1)) + 0.01 * rng.uniform(size=(n, 1))
+"""
+
+
+@pytest.mark.parametrize(
+    ("table", "most", "text"),
+    [
+        ('goal = { ref = "drawn_tasks:loads" }', 1.0, "goal scipy.stats.triang"),
+        ('sampler = { ref = "drawn_tasks:draw" }', 0.51, "draw"),
+    ],
+)
+def test_a_file_names_any_distribution_of_scipy_or_a_function_that_draws_tasks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: str, most: float, text: str
+) -> None:
+    monkeypatch.delitem(sys.modules, "drawn_tasks", raising=False)
+    (tmp_path / "drawn_tasks.py").write_text(MODULE)
+    (tmp_path / "p.toml").write_text(FILE.partition("goal")[0] + table)
+    settings = read_settings(str(tmp_path / "p.toml"), {})
+    space = settings.load().validation.space
+    drawn = space.iid(300, np.random.default_rng(0))
+    assert np.abs(drawn).max() <= most
+    assert drawn.std() > 0.3
+    assert text in str(distribution_text(space.describe()[DISTRIBUTION]))
+    assert any("drawn_tasks" in one for one in code_named(settings.model_dump(mode="json")))
 
 
 def test_uniform_may_be_stated(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
 from conftest import make_validation
-from ctxval import Experiment, Store, Task, TaskSpace, Trajectory, systems
+from ctxval import Experiment, Store, Task, TaskSpace, Trajectory, distances, systems
 from ctxval.cli import app
 from ctxval.config.check import check_experiment
 from ctxval.config.parts import TaskTable, part, recorded
@@ -404,3 +404,30 @@ def test_a_model_is_learned_from_logs_with_a_mapping(tmp_path: Path) -> None:
         part("model", {"type": "Linear", "data": mapping}, tmp_path)
     with pytest.raises(InputError, match=r"has no states under a usual name"):
         part("model", {"type": "Linear", "data": "run.mcap"}, tmp_path)
+
+
+COMPARABLE = "components = [0, 1]\nweights = [1.0, 2.0]\nscales = [0.1, 0.5]\nangles = [0]\n"
+DISTANCES = {
+    **{f"{name} {norm}": f'type = "{name}"\nnorm = {norm}\n{COMPARABLE}'
+       for name in ("FinalState", "GoalError", "MaximumDeviation", "MeanDeviation", "WholeTrajectory", "TrackingError")
+       for norm in (1, 2, "inf")},
+    "relative": f'type = "RelativeDeviation"\nnorm = inf\nleast = [0.1, 0.2]\n{COMPARABLE}',
+    "times": f'type = "AtTimes"\ntimes = [0.1, 0.3]\n{COMPARABLE}',
+    "crossing": f'type = "AtCrossing"\nstate = 0\nlevel = 0.2\ndirection = "up"\ncrossings = 2\n{COMPARABLE}',
+    "time": 'type = "CrossingTime"\nstate = 0\nlevel = 0.2\nangle = true\n',
+    "average": f'type = "TrackingError"\nover = "mean"\n{COMPARABLE}',
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DISTANCES)
+def test_every_distance_is_written_in_a_file_as_in_python(name: str) -> None:
+    table = tomllib.loads(DISTANCES[name])
+    made = part("distance", dict(table))
+    in_python = getattr(distances, table.pop("type"))(**table)
+    found = make_validation(distance=made).outcome([0.5])
+    assert found.distance == make_validation(distance=in_python).outcome([0.5]).distance
+    assert np.isfinite(found.distance)
+    if "weights" in table and name != "relative":
+        assert made.mixed_units(["rad", "rad/s"]) == ()
+        del table["weights"], table["scales"]
+        assert getattr(distances, type(made).__name__)(**table).mixed_units(["rad", "rad/s"]) == ("rad", "rad/s")

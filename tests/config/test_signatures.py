@@ -21,8 +21,9 @@ from typer.testing import CliRunner, Result
 from ctxval import Store
 from ctxval.cli import app
 from ctxval.config import signatures as trust
-from ctxval.config.settings import read_settings, stored_settings, trusted_settings
+from ctxval.config.settings import read_settings
 from ctxval.config.signatures import SIGNATURES, code_named, key_path, signed, verifies
+from ctxval.config.stored_settings import stored_settings, trusted_settings
 from ctxval.errors import InputError
 from rig_packages import install
 

@@ -13,14 +13,17 @@ import pytest
 
 from ctxval import Trajectory
 from ctxval.data import LogMapping, Recordings, read_logs, read_recordings
+from ctxval.data.ros1 import ros1_decoder
 from ctxval.errors import InputError
 from rig_logs import (
     DT,
     run,
     write_bag,
+    write_bag1,
     write_lerobot,
     write_mat,
     write_mcap_json,
+    write_mcap_protobuf,
     write_mcap_ros2,
     write_parquet,
 )
@@ -34,6 +37,12 @@ CART = LogMapping.from_table(
 JOINTS = LogMapping.from_table(
     {
         "states": {"position": "/joints.position[0]", "speed": "/joints.velocity[0]"},
+        "inputs": {"force": "/joints.effort"},
+    }
+)
+PROTOBUF = LogMapping.from_table(
+    {
+        "states": {"position": "/joints.motion.position[0]", "speed": "/joints.motion.velocity"},
         "inputs": {"force": "/joints.effort"},
     }
 )
@@ -55,6 +64,9 @@ WRITTEN: dict[str, tuple[Callable[[Path, Trajectory], None], LogMapping | None]]
     "json.mcap": (write_mcap_json, CART),
     "ros2.mcap": (write_mcap_ros2, JOINTS),
     "bag": (write_bag, JOINTS),
+    "ros1.bag": (write_bag1, JOINTS),
+    "ros1.mcap": (lambda path, one: write_bag1(path, one, to_mcap=True), JOINTS),
+    "protobuf.mcap": (write_mcap_protobuf, PROTOBUF),
     "bag of mcap": (lambda path, one: write_bag(path, one, storage="mcap"), JOINTS),
     "level5.mat": (lambda path, one: write_mat(path, one, version="5"), MATLAB),
     "level73.mat": (lambda path, one: write_mat(path, one, version="7.3"), MATLAB),
@@ -184,8 +196,8 @@ def broken(tmp_path: Path, name: str, content: str | bytes) -> Path:
         ("a.mat", b"MATLAB", r"a\.mat cannot be read as a MATLAB file"),
         ("a.mcap", b"\x89MCAP0\r\n", r"a\.mcap cannot be read as an MCAP file"),
         ("a.parquet", b"PAR1", r"a\.parquet cannot be read as Parquet"),
-        ("a.db3", b"SQLite format 3", r"a\.db3 cannot be read as a ROS 2 bag"),
-        ("a.bag", b"", r"a\.bag is not a log that can be read: files must end in \.csv, \.npz, \.mat"),
+        ("a.db3", b"SQLite format 3", r"a\.db3 cannot be read as a bag of ROS 2"),
+        ("a.rrd", b"", r"a\.rrd is not a log that can be read: files must end in \.csv, \.npz, \.mat"),
     ],
 )
 def test_what_cannot_be_read_is_named_by_file_field_and_row(
@@ -228,12 +240,12 @@ def test_a_message_in_another_encoding_is_named(tmp_path: Path) -> None:
     with (tmp_path / "a.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
-        schema = writer.register_schema("cart", "protobuf", b"")
-        topic = writer.register_channel("/state", "protobuf", schema)
+        schema = writer.register_schema("cart", "flatbuffer", b"")
+        topic = writer.register_channel("/state", "flatbuffer", schema)
         writer.add_message(topic, log_time=0, publish_time=0, data=b"")
         writer.finish()
     with pytest.raises(
-        InputError, match="the messages of /state are in protobuf with a schema in protobuf; messages in"
+        InputError, match="the messages of /state are in flatbuffer with a schema in flatbuffer; messages in"
     ):
         read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/state.x"]}))
 
@@ -309,3 +321,86 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path: Path) -> None:
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.strip() == "Parquet files need pyarrow: pip install 'ctxval[logs]'."
+
+
+def test_the_stamps_in_messages_of_protobuf_and_of_ros_1_are_times_too(tmp_path: Path) -> None:
+    one = run(4)
+    write_mcap_protobuf(tmp_path / "a.mcap", one, late=0.25)
+    write_bag1(tmp_path / "b.bag", one)
+    for name in ("a.mcap", "b.bag"):
+        (log,) = read_logs([tmp_path / name])
+        clock = LogMapping.from_table({"states": ["x"], "stamp": "header"}).clock
+        times = log.signals(["/joints.effort"], clock)["/joints.effort"].times
+        np.testing.assert_allclose(times, one.times, atol=1e-9)
+
+
+def test_the_fields_of_protobuf_and_ros_1_are_listed_if_one_is_missing(tmp_path: Path) -> None:
+    write_mcap_protobuf(tmp_path / "a.mcap", run(4))
+    write_bag1(tmp_path / "b.bag", run(4))
+    wrong = LogMapping.from_table({"states": ["/joint.angle"]})
+    with pytest.raises(InputError, match=r"/joints.motion.position\[0\], /joints.motion.velocity, /joints.effort"):
+        read_recordings([tmp_path / "a.mcap"], wrong)
+    with pytest.raises(InputError, match=r"/joints.header.stamp.sec.*, /joints.position\[0\], /joints.velocity"):
+        read_recordings([tmp_path / "b.bag"], wrong)
+
+
+def test_a_damaged_message_is_named(tmp_path: Path) -> None:
+    write_bag1(tmp_path / "run.bag", run(4))
+    whole = (tmp_path / "run.bag").read_bytes()
+    length = b"\x04\x00\x00\x00cart\x01\x00\x00\x00"
+    assert whole.count(length) == 5
+    (tmp_path / "run.bag").write_bytes(whole.replace(length, length[:-4] + b"\xff\xff\xff\x7f", 1))
+    with pytest.raises(InputError, match=r"message 0, of /joints: it cannot be decoded \(ValueError: the message"):
+        read_recordings([tmp_path / "run.bag"], JOINTS)
+    (tmp_path / "cut.bag").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"cut.bag cannot be read as a bag of ROS 1"):
+        read_recordings([tmp_path / "cut.bag"], JOINTS)
+    (tmp_path / "text.bag").write_text("no bag")
+    with pytest.raises(InputError, match=r"text.bag cannot be read as a bag of ROS 1"):
+        read_recordings([tmp_path / "text.bag"], JOINTS)
+
+
+def test_every_type_of_ros_1_is_decoded_as_rosbags_encodes_it() -> None:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    definition = """bool a
+byte b
+char c
+int16 d
+uint64 e
+float32 f
+string g
+time h
+duration i
+float64[3] j
+string[] k
+Part[] l
+uint8[] m
+int32 CONSTANT=7
+================================================================================
+MSG: rig/Part
+int8 x
+float64[] y
+"""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(definition, "rig/msg/All"))
+    types = store.types
+    clock, lasting = types["builtin_interfaces/msg/Time"], types["builtin_interfaces/msg/Duration"]
+    parts = [types["rig/msg/Part"](x=-1, y=np.array([0.5])), types["rig/msg/Part"](x=2, y=np.array([]))]
+    message = types["rig/msg/All"](
+        *(True, -3, 200, -300, 2**63, 0.25, "caf\u00e9", clock(2_000_000_000, 5), lasting(-6, 7)),
+        *(np.array([1.0, 2.0, 3.0]), ["a", ""], parts, np.array([1, 2], dtype=np.uint8)),
+    )
+    data = bytes(store.serialize_ros1(message, "rig/msg/All"))
+    found = ros1_decoder("a.bag", "/t", "rig/msg/All", definition)(data)
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found.items()}
+    parts_found = [{"x": one["x"], "y": one["y"].tolist()} for one in plain.pop("l")]
+    assert parts_found == [{"x": -1, "y": [0.5]}, {"x": 2, "y": []}]
+    times = {"h": {"sec": 2_000_000_000, "nanosec": 5}, "i": {"sec": -6, "nanosec": 7}}
+    numbers = {"a": True, "b": -3, "c": 200, "d": -300, "e": 2**63, "f": 0.25, "g": "caf\u00e9"}
+    assert plain == {**numbers, **times, "j": [1, 2, 3], "k": ["a", ""], "m": [1, 2]}
+    for size in range(len(data)):
+        with pytest.raises(ValueError, match=r"shorter than its definition|longer than its message"):
+            ros1_decoder("a.bag", "/t", "rig/msg/All", definition)(data[:size])
+    with pytest.raises(InputError, match="the definition of the messages of /t, rig/msg/All, cannot be read"):
+        ros1_decoder("a.bag", "/t", "rig/msg/All", "float64[ broken")

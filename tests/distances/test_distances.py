@@ -22,6 +22,7 @@ from ctxval.distances import (
     MeanDeviation,
     RelativeDeviation,
     StateNorm,
+    TrackingError,
     WholeTrajectory,
 )
 from ctxval.errors import InputError, ShapeError, UnknownNameError
@@ -371,3 +372,15 @@ def test_a_description_names_only_what_changes_the_distance() -> None:
 )
 def test_a_distance_knows_which_units_it_mixes(distance: StateNorm, mixed: tuple[str, ...]) -> None:
     assert distance.mixed_units(["m", "rad", ""]) == mixed
+
+
+def test_a_tracking_error_is_that_between_s_and_its_reference() -> None:
+    reference = np.arange(5.0)[:, None] * np.array([1.0, 0.0, 0.0])
+    along = Task([0.0] * N, reference=reference, horizon=HORIZON, dt=0.1)
+    system = trajectory(reference + np.array([[9.0], [0.0], [3.0], [-1.0], [0.0]]) * np.array([0, 1, 0]))
+    elsewhere = trajectory(np.full((HORIZON + 1, N), 100.0))
+    assert TrackingError()(elsewhere, system, along) == 3.0
+    assert TrackingError(1, over="mean")(elsewhere, system, along) == 1.0
+    assert TrackingError(2, (1,), scales=[0.5])(elsewhere, system, along) == 6.0
+    with pytest.raises(UnknownNameError, match="did you mean 'maximum'"):
+        TrackingError(over="maximun")  # type: ignore[arg-type]

@@ -75,3 +75,9 @@ def guarded(text: str) -> str:
 def unguarded(cell: str) -> str:
     """Return the text of a cell that :func:`guarded` wrote."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell.lstrip("'")) else cell
+
+
+def parted(label: str) -> tuple[str, str]:
+    """Return the name and the unit of ``name [unit]``; a name without brackets has no unit."""
+    name, _, unit = label.partition("[")
+    return name.strip(), unit.rpartition("]")[0].strip()

@@ -14,6 +14,7 @@ from ctxval._util.texts import text_of
 from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.dynamics import CampaignDynamics
 from ctxval.campaign.fallback import error_with_fallback
+from ctxval.campaign.goals_of_model import GoalsOfModel
 from ctxval.campaign.history import history_of
 from ctxval.campaign.identity import identify
 from ctxval.campaign.independent_draws import IndependentDraws
@@ -59,6 +60,7 @@ class TrialRecorder:
         self.draws = IndependentDraws(store, validation, seed)
         self.dynamics = CampaignDynamics(validation, store, seed, description)
         self.predicts = False
+        self._goals_of_model = GoalsOfModel(validation)
         self._proposals = Proposals(validation, self.search, store)
         self._seed = seed
         self._executing: set[int] = set()
@@ -195,6 +197,7 @@ class TrialRecorder:
         self._trials.append(trial)
         if attempts:
             self._executing.add(trial.number)
+        self._goals_of_model.watch(plan)
         return OpenTrial(trial, plan)
 
     def _next_trial(self, choice: Choice, attempts: int) -> Trial:

@@ -20,6 +20,7 @@ from rich.table import Table
 from ctxval._util.describe import describe
 from ctxval._util.progress_display import progress_shown
 from ctxval._util.texts import reason_of, shortened
+from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.certificates.bounds import as_text
 from ctxval.certificates.verdict import Verdict
 from ctxval.cli.screen import Commands, Screen, line
@@ -132,7 +133,7 @@ def worker_options(workers: int | None, dask: str | None, timeout: float | None)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: Any, **_: Any) -> None:
-    if issubclass(category, StoreWarning | UnitsWarning):
+    if issubclass(category, StoreWarning | UnitsWarning | GoalWarning):
         err.say(("warning:", "bold yellow"), f" {message}")
     else:
         err.say(warnings.formatwarning(message, category, *place[:2]).rstrip("\n"))

@@ -20,7 +20,7 @@ from ctxval.cli.options import (
     named_values,
 )
 from ctxval.cli.trust import AcceptChange, Named, Trust, open_store, settings_of
-from ctxval.config.settings import planned_settings
+from ctxval.config.stored_settings import planned_settings
 from ctxval.errors import InputError
 from ctxval.storage.other_stores import other_stores
 from ctxval.storage.store import Store

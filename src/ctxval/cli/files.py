@@ -10,9 +10,10 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval.cli.base import BAD_INPUT, app, command, out
+from ctxval.aspect1 import TASKS
+from ctxval.cli.base import BAD_INPUT, FALSIFIED, app, command, out
 from ctxval.cli.options import TARGET, AsJson, PartOptions, named_values
-from ctxval.config.check import Finding, check_experiment
+from ctxval.config.check import Finding, aspect1_findings, check_experiment
 from ctxval.config.settings import read_settings
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import InputError
@@ -144,10 +145,30 @@ def check(
     execute: Annotated[
         bool, typer.Option("--execute", help="Also execute one task twice and compare the two executions.")
     ] = False,
+    aspect1: Annotated[
+        bool,
+        typer.Option(
+            "--aspect1",
+            help="Check whether the model itself completes the tasks (Aspect 1 of the paper): simulate tasks on the "
+            "model, search for the worst one, and look at the controllers. The system is not executed.",
+        ),
+    ] = False,
+    tasks: Annotated[
+        int | None, typer.Option(min=2, help=f"Number of simulated tasks (default: {TASKS}). Only with --aspect1.")
+    ] = None,
+    threshold: Annotated[
+        float | None,
+        typer.Option(
+            help="Largest error of the model with which a task counts as completed, in the units of its goal. Only "
+            "with --aspect1."
+        ),
+    ] = None,
     as_json: AsJson = False,
     option: PartOptions = None,
 ) -> Any:
     """Check that the parts of an experiment fit together. The system is executed only if --execute is given."""
+    if not aspect1 and (tasks is not None or threshold is not None):
+        raise InputError(f"{'--tasks' if tasks is not None else '--threshold'} needs --aspect1.")
     settings = read_settings(target, {"options": named_values(option)})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # it is one of the findings
@@ -155,11 +176,16 @@ def check(
     _ = settings.certificate_options  # which refuses a kind or an option that does not exist
     settings.search.build(settings.folder)
     findings = check_experiment(experiment, execute=execute, seed=settings.seed)
+    failed = any(finding.state == "failed" for finding in findings)
+    status = BAD_INPUT if failed else 0
+    found = settings.aspect1_of(experiment, tasks, threshold) if aspect1 and not failed else None
+    if found is not None:
+        findings += aspect1_findings(found)
+        status = FALSIFIED if found.exceeding and found.completes is False else 0
     if not as_json:
         _print_findings(findings)
-    failed = any(finding.state == "failed" for finding in findings)
-    report = {"case": experiment.name, "ok": not failed, "findings": [asdict(finding) for finding in findings]}
-    return report, BAD_INPUT if failed else 0
+    report = {"case": experiment.name, "ok": not status, "findings": [asdict(finding) for finding in findings]}
+    return {**report, **({"aspect1": None if found is None else found.to_json()} if aspect1 else {})}, status
 
 
 def _print_findings(findings: list[Finding]) -> None:

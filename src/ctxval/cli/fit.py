@@ -14,6 +14,7 @@ from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingF
 from ctxval.cli.options import AsJson, named_values
 from ctxval.cli.replay import numbers, print_titled
 from ctxval.cli.screen import line
+from ctxval.config.named_model import named_model
 from ctxval.config.references import reference, require_function
 from ctxval.errors import InputError
 from ctxval.fitting import FitReport, FittedModel, fit
@@ -47,6 +48,15 @@ Vectorized = Annotated[bool, typer.Option("--vectorized", help="State that --ste
 HoldOut = Annotated[
     float, typer.Option(help="Share of the recordings that is held out, from which no model is learned.")
 ]
+Given = Annotated[
+    str | None,
+    typer.Option(
+        "--given",
+        metavar="MODEL",
+        help="Model that exists already, whose errors stand beside those of the others: an MJCF file or the folder of "
+        "a result of mujoco.sysid, or any model that `ctxval replay --model` takes.",
+    ),
+]
 Steps = Annotated[
     str | None,
     typer.Option(help=f"Numbers of steps after which errors are computed (default: {','.join(map(str, STEPS))})."),
@@ -77,6 +87,7 @@ def fit_models(
     time: TimeField = None,
     dt: Dt = None,
     delay: Delay = None,
+    given: Given = None,
     hold_out: HoldOut = HOLD_OUT,
     steps: Steps = None,
     out_file: Out = None,
@@ -102,6 +113,7 @@ def fit_models(
         step=function,
         bounds=bounds,
         vectorized=vectorized,
+        given=None if given is None else named_model(given, {}, found.dt),
         hold_out=hold_out,
         steps=STEPS if steps is None else numbers(steps),
         seed=seed,
@@ -151,7 +163,7 @@ _SUFFIXES: dict[str, tuple[type, ...]] = {
 def _most_accurate(report: FitReport, path: Path) -> FittedModel:
     """Return the most accurate of the models that a file can hold."""
     for one in report.fitted:
-        if isinstance(one.model, _SUFFIXES[path.suffix]):
+        if one.kind != "given" and isinstance(one.model, _SUFFIXES[path.suffix]):
             return one
     kinds = ", ".join(one.kind for one in report.fitted)
     raise InputError(f"no model that was learned ({kinds}) can be written to a file that ends in {path.suffix}.")

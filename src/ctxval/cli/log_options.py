@@ -19,8 +19,8 @@ Logs = Annotated[
     list[Path],
     typer.Argument(
         metavar="LOGS...",
-        help="Recordings: CSV, NPZ, MATLAB (.mat), Parquet and MCAP files, ROS 2 bags, LeRobot data sets, or folders "
-        "of such files.",
+        help="Recordings: CSV, NPZ, MATLAB (.mat), Parquet and MCAP files, ROS bags, LeRobot data sets, or folders of "
+        "such files.",
     ),
 ]
 MappingFile = Annotated[

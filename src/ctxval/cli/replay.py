@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -14,18 +15,21 @@ from ctxval.cli.options import AsJson, named_values
 from ctxval.cli.screen import line
 from ctxval.config.named_model import named_model
 from ctxval.config.settings import read_settings
+from ctxval.core.experiment import Experiment
 from ctxval.data import Recordings
 from ctxval.errors import InputError
 from ctxval.replay import PredictedTask, ReplayReport
 from ctxval.replay import replay as compared
 from ctxval.replay.report import STEPS
+from ctxval.report.replay_page import write_replay_page
 
 ModelName = Annotated[
     str | None,
     typer.Option(
         "--model",
-        help="Model to compare: an ONNX file, an NPZ file with the matrices A and B, an experiment file, a reference "
-        "module:attr, or a name such as Linear (default: the model of the experiment).",
+        help="Model to compare: an ONNX file, an NPZ file with the matrices A and B, an MJCF file or a result of "
+        "mujoco.sysid, an experiment file, a reference module:attr, or a name such as Linear (default: the model of "
+        "the experiment).",
     ),
 ]
 ModelOption = Annotated[
@@ -47,6 +51,10 @@ Steps = Annotated[
     typer.Option(help=f"Numbers of steps after which errors are computed (default: {','.join(map(str, STEPS))})."),
 ]
 Executions = Annotated[int, typer.Option(min=1, help="Number of executions that are proposed with --experiment.")]
+Html = Annotated[
+    Path | None,
+    typer.Option("--html", help="Also write everything as one HTML page, which opens no connection, to this file."),
+]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
 
@@ -66,6 +74,7 @@ def replay(
     steps: Steps = None,
     executions: Executions = 10,
     seed: Seed = 0,
+    html: Html = None,
     as_json: AsJson = False,
 ) -> Any:
     """Compare a model with recordings of its system. Nothing is executed, and no experiment file is needed.
@@ -78,10 +87,11 @@ def replay(
     made = None if settings is None else settings.load()
     if model is None and made is None:
         raise InputError("a model is needed: give --model, or --experiment for the model of an experiment.")
-    chosen = (
-        made.validation.model if model is None and made is not None else named_model(str(model), named_values(option))
-    )
     found = LogOptions(mapping, state, input_, time, dt, delay).read(logs, settings, made)
+    if model is None and made is not None:
+        chosen = made.validation.model
+    else:
+        chosen = named_model(str(model), named_values(option), found.dt)
     report = compared(
         chosen,
         found,
@@ -90,9 +100,23 @@ def replay(
         executions=executions,
         seed=seed,
     )
+    units = "" if made is None else made.units
     if not as_json:
-        _print(report, found, "" if made is None else made.units)
-    return report.to_json()
+        _print(report, found, units)
+    if html is None:
+        return report.to_json()
+    written = write_replay_page(report, html, name=_name(model, made), units=units)
+    if not as_json:
+        out.say("")
+        out.say(f"report: {written}")
+    return {**report.to_json(), "report": str(written)}
+
+
+def _name(model: str | None, experiment: Experiment | None) -> str:
+    """Return the name of the model for the heading of the page: that of its file, or of the experiment."""
+    if model is not None:
+        return Path(model).name
+    return "" if experiment is None else experiment.name
 
 
 def numbers(text: str) -> list[int]:

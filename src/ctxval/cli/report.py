@@ -15,7 +15,8 @@ from ctxval.cli.base import FALSIFIED, app, command, out
 from ctxval.cli.certify import KindOptions, Volume
 from ctxval.cli.options import AsJson, Confidence, StoreArgument, Threshold, named_values
 from ctxval.cli.trust import Named, Trust, open_store
-from ctxval.config.settings import Settings, planned_settings
+from ctxval.config.settings import Settings
+from ctxval.config.stored_settings import planned_settings
 from ctxval.core.labels import Labels, labels_of
 from ctxval.errors import CtxvalError
 from ctxval.report.context import ReportContext, context_of_campaign, context_of_store

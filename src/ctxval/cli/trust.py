@@ -12,8 +12,9 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.certificates.verdict import require_threshold
 from ctxval.cli.base import err
 from ctxval.cli.options import TARGET
-from ctxval.config.settings import Settings, trusted_settings
+from ctxval.config.settings import Settings
 from ctxval.config.signatures import code_named, verifies, why_no_key
+from ctxval.config.stored_settings import trusted_settings
 from ctxval.core.experiment import Experiment
 from ctxval.errors import InputError
 from ctxval.storage.store import Store

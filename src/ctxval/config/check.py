@@ -11,10 +11,13 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
+from ctxval.aspect1 import Aspect1Report, SimulatedTask
 from ctxval.campaign.costs import ThinkingCosts
+from ctxval.certificates.bounds import of_tasks
 from ctxval.core.experiment import Experiment, mixed_units_sentence
 from ctxval.core.labels import labels_of
 from ctxval.core.plan import Plan
+from ctxval.core.soundness import MISSED, SATURATED, goal_misses
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
@@ -119,17 +122,32 @@ def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Fin
         "ok",
         f"{len(made)} tasks planned: {n} states, {m} inputs, {task.horizon} steps of {task.dt:g} s",
     )
-    errors = [np.abs(plan.model_trajectory.final_state - plan.task.goal).sum() for plan in made]
-    starts = [np.abs(plan.task.initial_state - plan.task.goal).sum() for plan in made]
-    worst = int(np.argmax(errors))
-    where = ", ".join(f"{k} = {_short(v)}" for k, v in space.describe_point(points[worst]).items())
-    reached = errors[worst] <= 0.1 * max(starts)
-    yield Finding(
-        "controller on the model",
-        "ok" if reached else "noted",
-        f"ends at most {errors[worst]:.3g} from the goal (1-norm of the states), at {where}"
-        + ("" if reached else "; a controller that fails on the model itself cannot be expected to work on the system"),
-    )
+    yield from _goals(validation, made)
+
+
+def _goals(validation: Validation, made: Sequence[Plan]) -> Iterator[Finding]:
+    """State how far M ends from its goals: in the worst state if it is known which are to reach them, or in all."""
+    if not made[0].task.has_goal:
+        return
+    on_model, goals = [plan.model_trajectory for plan in made], [plan.task.goal for plan in made]
+    found = goal_misses(validation, on_model, goals)
+    if found is None:
+        errors = [np.abs(one.final_state - goal).sum() for one, goal in zip(on_model, goals, strict=True)]
+        starts = [np.abs(plan.task.initial_state - plan.task.goal).sum() for plan in made]
+        row, reached = int(np.argmax(errors)), max(errors) <= MISSED * max(starts)
+        how = f"{errors[row]:.3g} from the goal (1-norm of the states)"
+    else:
+        (row, column), reached = found.worst, not found.missed.any()
+        names = labels_of(validation.names(on_model[0].states.shape[-1], on_model[0].inputs.shape[-1])[0])
+        how = f"{found.misses[row, column]:.3g} from the goal in {names[int(found.states[column])]}"
+    text = f"ends at most {how}, at {_where(validation.space.describe_point(made[row].parameters.points))}"
+    if not reached:
+        text += "; a controller that fails on the model itself cannot be expected to work on the system: see --aspect1"
+    yield Finding("controller on the model", "ok" if reached else "noted", text)
+
+
+def _where(parameters: dict[str, Any]) -> str:
+    return ", ".join(f"{name} = {_short(value)}" for name, value in parameters.items())
 
 
 def _cost(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]:
@@ -150,6 +168,82 @@ def _cost(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]:
 
 def _short(value: Any) -> str:
     return "[" + ", ".join(f"{v:.4g}" for v in value) + "]" if isinstance(value, list) else f"{value:.4g}"
+
+
+def aspect1_findings(report: Aspect1Report) -> list[Finding]:
+    """Return what simulations of M show of its tasks and controllers, as sentences."""
+    return [_completion(report), *_flips(report), *_saturated(report), *_unconverged(report)]
+
+
+def _completion(report: Aspect1Report) -> Finding:
+    count, worst = len(report.simulated), report.worst
+    if report.failed:
+        told = f"M has no closed loop in {len(report.failed)} of {count} tasks, for example at {_of(worst)}"
+        return Finding("tasks on the model", "failed", f"{told}: {worst.reason}")
+    ends = f"the worst of {count} tasks is {_of(worst)}, with an error of {_number(report, worst.error)}"
+    if report.threshold is None:
+        return Finding("tasks on the model", "noted", f"{ends}; give a threshold to judge it")
+    if report.exceeding:
+        many = f"M does not complete {report.exceeding} of {count} tasks within {_number(report, report.threshold)}"
+        return Finding("tasks on the model", "failed", f"{many}: {ends}")
+    bound = None if report.verdict is None else report.verdict.bound
+    held = f"; the error over all tasks is at most {_number(report, bound)}" if bound is not None else ""
+    share = f"; with confidence 0.95 it does not complete at most {100 * (report.share or 0):.3g} % {_of_all(report)}"
+    return Finding("tasks on the model", "ok", f"M completes all of them: {ends}{share}{held}")
+
+
+def _of_all(report: Aspect1Report) -> str:
+    return "of all tasks" if report.distribution is None else of_tasks(report.distribution)
+
+
+def _of(task: SimulatedTask) -> str:
+    return _where(task.parameters)
+
+
+def _number(report: Aspect1Report, value: float | None) -> str:
+    return f"{value:.4g} {report.units}".rstrip()
+
+
+def _flips(report: Aspect1Report) -> Iterator[Finding]:
+    found = report.flips
+    if found is None or report.flipped is None:
+        return
+    differ = f"by {100 * found.largest:.3g} % of the range of the inputs"
+    if not found.flipped:
+        text = f"the inputs on M of {found.pairs} pairs of neighbouring tasks differ by at most {differ[3:]}"
+        yield Finding("neighbouring tasks", "ok", text)
+        return
+    between = " and ".join(map(_where, report.flipped))
+    yield Finding(
+        "neighbouring tasks",
+        "noted",
+        f"{found.flipped} of {found.pairs} pairs of neighbouring tasks have controllers that differ abruptly, such as "
+        f"{between}, whose inputs on M differ {differ}",
+    )
+
+
+def _saturated(report: Aspect1Report) -> Iterator[Finding]:
+    if report.saturation is None:
+        return
+    at_limit = dict(zip(report.inputs, report.saturation.shares.tolist(), strict=True))
+    named = [f"{name} in {100 * share:.3g} %" for name, share in at_limit.items() if share >= SATURATED]
+    how = "" if report.saturation.known else "; the synthesizer states no limits, so repeated extreme values count"
+    if named:
+        yield Finding("limits of the inputs", "noted", f"at a limit: {', '.join(named)} of the steps on M{how}")
+    else:
+        yield Finding("limits of the inputs", "ok", "the inputs stay off their limits on M")
+
+
+def _unconverged(report: Aspect1Report) -> Iterator[Finding]:
+    count = len(report.not_converged)
+    if count:
+        examples = "; ".join(_where(one) for one in report.not_converged[:3])
+        text = f"{count} of {report.designs} designs did not converge, such as {examples}"
+        yield Finding("convergence of the designs", "noted", text)
+    elif report.designs:
+        yield Finding("convergence of the designs", "ok", f"all {report.designs} designs converged")
+    else:
+        yield Finding("convergence of the designs", "skipped", "the controllers do not tell whether they converged")
 
 
 def _names(experiment: Experiment, plan: Plan) -> Iterator[Finding]:

@@ -11,16 +11,19 @@ from ctxval.config.settings import read_settings
 from ctxval.core.model import Model, as_model
 from ctxval.errors import InputError
 from ctxval.models import REGISTRY, read_model
+from ctxval.models.mujoco import is_sysid_result
 
 
-def named_model(text: str, options: Mapping[str, Any]) -> Model:
+def named_model(text: str, options: Mapping[str, Any], dt: float | None = None) -> Model:
     """Return a model.
 
     Args:
-        text: an ONNX file; an NPZ file that ``ctxval fit`` wrote, or one with the matrices ``A`` and ``B`` of a
-            linear model; an experiment file, whose model is meant; ``module:attr`` of a model, or of a class or
-            function that makes one, whose code is run; or a name of the registry, such as ``Linear``.
+        text: an ONNX file; an MJCF file (.xml) or a folder with a result of ``mujoco.sysid``; an NPZ file that
+            ``ctxval fit`` wrote, or one with the matrices ``A`` and ``B`` of a linear model; an experiment file, whose
+            model is meant; ``module:attr`` of a model, or of a class or function that makes one, whose code is run; or
+            a name of the registry, such as ``Linear``.
         options: the arguments of the model.
+        dt: the time step of the recordings, seconds, for a model of MuJoCo whose options state none.
 
     Raises:
         InputError: if there is no such model, or it cannot be made.
@@ -31,13 +34,15 @@ def named_model(text: str, options: Mapping[str, Any]) -> Model:
         return read_settings(text, {}).load().validation.model
     if path.suffix == ".onnx":
         return as_model(part("model", {"type": "Onnx", "source": text, **options}))
+    if path.suffix == ".xml" or is_sysid_result(path):
+        return as_model(part("model", {"type": "MuJoCo", "mjcf": text, "dt": dt, **options}))
     if path.suffix == ".npz":
         _require_no(options, f"the model in {text}")
         return read_model(path)
     if ":" not in text and text not in REGISTRY.built_in and text not in REGISTRY.installed:
         raise InputError(
-            f"a model must be a file that ends in .onnx, .npz or .toml, module:attr, or one of "
-            f"{', '.join(REGISTRY.built_in)}, got {text!r}."
+            f"a model must be a file that ends in .onnx, .npz, .xml or .toml, a result of mujoco.sysid, module:attr, "
+            f"or one of {', '.join(REGISTRY.built_in)}, got {text!r}."
         )
     return as_model(part("model", {"type": text, **options}))
 

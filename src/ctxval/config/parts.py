@@ -292,24 +292,34 @@ def space_of(bounds: Mapping[str, Sequence[Any]]) -> TaskSpace:
     return TaskSpace(**{name: tuple(bound) for name, bound in bounds.items()})
 
 
-def with_distribution(space: TaskSpace, tables: Mapping[str, Mapping[str, Any]]) -> TaskSpace:
+def with_distribution(
+    space: TaskSpace, tables: Mapping[str, Mapping[str, Any]], folder: Path | None = None
+) -> TaskSpace:
     """Return a task space with the distribution of tasks of an experiment file.
 
     Args:
         space: the task space.
-        tables: for each parameter, ``{type = "normal", mean = ..., deviation = ...}`` or ``{type = "uniform"}``.
+        tables: for each parameter, ``{type = "normal", mean = ..., deviation = ...}``, ``{type = "uniform"}`` or
+            ``{ref = "module:attr"}`` of a frozen distribution of scipy.stats; or only ``sampler``, the reference of a
+            function ``(rng, n) -> tasks (n, d)``.
+        folder: the folder of the modules; the current folder by default.
 
     Raises:
         UnknownNameError: if there is no such parameter, no such distribution, or it takes no such argument.
         InputError: if an argument is missing or cannot be used.
     """
-    found = {name: _distribution(name, table) for name, table in tables.items() if table.get("type") != "uniform"}
+    if set(tables) == {"sampler"} and set(tables["sampler"]) == {"ref"} and "sampler" not in space.names:
+        return space.sampled(argument(tables["sampler"], folder))
     for name in tables:
         space.columns(name)
+    stated = {name: table for name, table in tables.items() if table.get("type") != "uniform"}
+    found = {name: _distribution(name, table, folder) for name, table in stated.items()}
     return space.distributed(**found) if found else space
 
 
-def _distribution(name: str, table: Mapping[str, Any]) -> Normal:
+def _distribution(name: str, table: Mapping[str, Any], folder: Path | None) -> Any:
+    if set(table) == {"ref"}:
+        return argument(table, folder)
     given = dict(table)
     kind = given.pop("type", None)
     if kind != "normal":

@@ -10,13 +10,16 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from ctxval.aspect1 import Aspect1Report
+from ctxval.aspect1 import check as check_aspect1
 from ctxval.campaign.campaign import Campaign
-from ctxval.certificates import KINDS, CertificateOptions
+from ctxval.certificates import CertificateOptions
 from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE
+from ctxval.config.aspect1_table import Aspect1Table
 from ctxval.config.certificate_table import CertificateTable
 from ctxval.config.experiments import named_experiment
 from ctxval.config.parts import argument, part, require_types, space_of, task_function, with_distribution
-from ctxval.config.signatures import code_named, signed, unsigned, verifies
+from ctxval.config.signatures import code_named, signed
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
 from ctxval.core.validation import Validation
@@ -25,7 +28,6 @@ from ctxval.errors import InputError, UnknownNameError
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH
 from ctxval.searches import REGISTRY as SEARCHES
 from ctxval.searches import Search, by_name
-from ctxval.searches.auto import present_options
 from ctxval.storage.store import Store
 
 
@@ -74,7 +76,8 @@ class Settings(BaseModel):
         name: the name of the experiment.
         space: ``name = [low, high, "unit"]`` for each task parameter.
         distribution: the distribution of a task parameter by its name, such as ``{type = "normal", mean = 0.0,
-            deviation = 0.3}``; all others are uniform. A named experiment may have one too.
+            deviation = 0.3}`` or ``{ref = "module:attr"}``; all others are uniform. Or ``sampler``, the reference of a
+            function that draws whole tasks. A named experiment may have one too.
         task: ``module:attr`` of a function, or a table with an initial state, a goal, a horizon and a time step.
         system, model, synthesizer, distance: ``module:attr``, or a table with a type and its arguments.
         states, inputs: the unit of each state and of each input, by name.
@@ -85,6 +88,7 @@ class Settings(BaseModel):
         confidence: the confidence level of the certificate.
         certificate: the certificate for the verdict.
         search: the search, and its options.
+        aspect1: when the model itself counts as completing a task.
         recordings: the mapping of logs to states and inputs, as :class:`ctxval.data.LogMapping` takes it.
         folder: the folder of modules and files, which is the folder of the experiment file. None means the current
             folder.
@@ -112,6 +116,7 @@ class Settings(BaseModel):
     seed: int = Field(default=0, ge=0)
     store: Path | None = None
     search: SearchTable = Field(default_factory=SearchTable)
+    aspect1: Aspect1Table = Field(default_factory=Aspect1Table)
     recordings: dict[str, Any] | None = None
     folder: Path | None = None
 
@@ -124,7 +129,7 @@ class Settings(BaseModel):
         made = self._made()
         if self.distribution is None:
             return made
-        space = with_distribution(made.validation.space, self.distribution)
+        space = with_distribution(made.validation.space, self.distribution, self.folder)
         return replace(made, validation=made.validation.with_space(space))
 
     def _made(self) -> Experiment:
@@ -199,7 +204,7 @@ class Settings(BaseModel):
             accept_change=accept_change,
             remeasure=remeasure,
         )
-        plain = self.model_dump(mode="json", exclude={"store"})
+        plain = self.model_dump(mode="json", exclude={"store", "aspect1"})
         if self.folder is None and code_named(plain):
             plain["folder"] = str(Path().resolve())  # the folder in which its code was found now
         campaign.store.keep_settings(signed(plain, campaign.store.settings()))
@@ -218,13 +223,32 @@ class Settings(BaseModel):
         try:
             table = CertificateTable.model_validate({**self.certificate.model_dump(), **given})
         except ValidationError as error:
-            raise InputError(_sentence("certificate", error)) from error
+            raise InputError(sentence_of("certificate", error)) from error
         return self.model_copy(update={"certificate": table})
 
     @property
     def certificate_options(self) -> CertificateOptions:
         """The kind, the options and the confidence of the certificate for the verdict."""
         return self.certificate.options(self.confidence)
+
+    def aspect1_of(self, experiment: Experiment, tasks: int | None, threshold: float | None) -> Aspect1Report:
+        """Return whether the model of an experiment completes its tasks; S is never executed.
+
+        Args:
+            experiment: the experiment that :meth:`load` returned.
+            tasks, threshold: the number of simulated tasks and the threshold; None for those of the file.
+
+        Raises:
+            InputError: if the tasks have no goal and no distance is given, or a value cannot be used.
+        """
+        table = self.aspect1
+        return check_aspect1(
+            experiment.validation,
+            threshold=table.threshold if threshold is None else threshold,
+            distance=None if table.distance is None else part("distance", table.distance, self.folder),
+            tasks=table.tasks if tasks is None else tasks,
+            seed=self.seed,
+        )
 
     @property
     def log_mapping(self) -> LogMapping | None:
@@ -279,103 +303,7 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
     try:
         return Settings.model_validate(whole)
     except ValidationError as error:
-        raise InputError(_sentence(target, error)) from error
-
-
-def stored_settings(store: Store) -> Settings:
-    """Return the settings in a store, whoever wrote them.
-
-    Do not build anything from them: :func:`trusted_settings` returns those that may be used.
-
-    Raises:
-        InputError: if the store has no settings, or they are not valid.
-    """
-    return _of_store(store.settings())
-
-
-def planned_settings(store: Store, kind: str | None = None) -> Settings:
-    """Return the settings in a store, as :func:`stored_settings` does; the defaults if no command made the store.
-
-    Args:
-        store: the store of the trials.
-        kind: the kind of certificate that the user asks for; None to use the kind in the store's settings.
-
-    Raises:
-        InputError: if the settings are not valid, or their certificate would run code that the user did not choose.
-    """
-    kept = store.settings()
-    if not kept:
-        return Settings()
-    settings = stored_settings(store)
-    planned = settings.certificate.kind
-    if kind is None and not KINDS.is_data(planned) and not verifies(kept):
-        raise InputError(
-            f"{store.name} names the certificate {planned!r}, which is code of another package, and you did not make "
-            f"the store. Give --kind {planned} if you trust that package, or give another kind."
-        )
-    return settings
-
-
-def _of_store(kept: dict[str, Any]) -> Settings:
-    if not kept:
-        raise InputError(
-            "the store does not name its experiment, because it was not made by a command: name the experiment with "
-            "--experiment FILE.toml."
-        )
-    plain, search = unsigned(kept), kept.get("search")
-    if isinstance(search, dict) and search.get("name") == "auto":
-        plain = {**plain, "search": present_options(search)}
-    try:
-        return Settings.model_validate(plain)
-    except ValidationError as error:
-        raise InputError(_sentence("the store's settings", error)) from error
-
-
-def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool = False) -> Settings:
-    """Return the settings from which a store's experiment may be built.
-
-    Args:
-        store: the store. If its settings name code, this user must have signed them.
-        experiment: a case, a file or ``module:attr`` that the user names instead. The seed of the store is used all the
-            same, and its search if the search names no code.
-        trust: accept the settings of the store, whoever wrote them.
-
-    Raises:
-        InputError: if the settings name code that the user has not allowed to run; the message shows the code.
-    """
-    kept = store.settings()
-    if experiment is not None:
-        return _named_again(kept, experiment)
-    settings, code = _of_store(kept), code_named(kept)
-    if not code or (settings.folder is not None and verifies(kept)):
-        return settings
-    folder = settings.folder or Path().resolve()
-    if trust:
-        return settings.model_copy(update={"folder": folder})
-    more = f" and {len(code) - _SHOWN} more" if len(code) > _SHOWN else ""
-    raise InputError(
-        f"{store.path} would import or run code: {'; '.join(code[:_SHOWN])}{more}, from the folder "
-        f"{ascii(str(folder))[:200]}. You did not make the store on this computer, or it was changed since, or an "
-        "older version made it. If you know its experiment, name it with --experiment FILE.toml (or module:attr). If "
-        "you trust the code that the store names, give --trust. The store then carries your signature, and the "
-        "question will not be asked again."
-    )
-
-
-_SHOWN = 8
-"""Largest number of pieces of code that the message shows."""
-
-
-def _named_again(kept: dict[str, Any], experiment: str) -> Settings:
-    settings = read_settings(experiment, {})
-    try:
-        stored = _of_store(kept)
-    except InputError:
-        return settings
-    same: dict[str, Any] = {"seed": stored.seed}
-    if not code_named({"search": kept.get("search", {})}):
-        same["search"] = stored.search
-    return settings.model_copy(update=same)
+        raise InputError(sentence_of(target, error)) from error
 
 
 def _table(content: dict[str, Any], key: str) -> dict[str, Any]:
@@ -398,7 +326,8 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 
-def _sentence(target: str, error: ValidationError) -> str:
+def sentence_of(target: str, error: ValidationError) -> str:
+    """Return what is wrong with a setting, in one sentence that names it."""
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
     if first["type"] == "use":

@@ -265,10 +265,6 @@ class _Descent:
             return np.moveaxis(array, 0, 1).reshape(*batch_shape, len(array), *array.shape[2:])
 
         parts = batch_first(self.K), batch_first(self.U), batch_first(self.X[:-1])
-        controller = AffineFeedback(*parts, self.limits)
-        return ILQRSolution(
-            controller,
-            self.J.reshape(batch_shape),
-            self.iterations.reshape(batch_shape),
-            self.converged.reshape(batch_shape),
-        )
+        converged = self.converged.reshape(batch_shape)
+        controller = AffineFeedback(*parts, self.limits, converged)
+        return ILQRSolution(controller, self.J.reshape(batch_shape), self.iterations.reshape(batch_shape), converged)

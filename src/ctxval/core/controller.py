@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, as_floats
+from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
 from ctxval._util.registry import part
 from ctxval._util.representation import call, record
 from ctxval.core.model import Model
@@ -26,6 +26,10 @@ class Synthesizer(Protocol):
     A synthesizer that can design for a batch of tasks in one call has an attribute ``batched = True``. If its
     controllers of a batch have ``__getitem__``, which returns the controller of one task, tasks are also designed in a
     batch if the system executes them one at a time.
+
+    A controller whose design is iterative may have an attribute ``converged``: whether the design converged, a boolean,
+    or booleans of the batch shape ``(...)``. Reports and ``ctxval check --aspect1`` name the tasks whose design did
+    not. :func:`converged_of` reads it, and :func:`ctxval.testing.check_synthesizer` checks it.
     """
 
     def design(self, task: Task, model: Model) -> Controller:
@@ -34,6 +38,25 @@ class Synthesizer(Protocol):
         Raises:
             DesignError: if no controller can be designed for the task.
         """
+
+
+def converged_of(controller: object, batch_shape: tuple[int, ...] = ()) -> Mask | None:
+    """Return whether the design of a controller converged, shape ``batch_shape``; None if the controller does not tell.
+
+    Args:
+        controller: a controller of one task or of a batch, with or without the attribute ``converged``.
+        batch_shape: the shape of the batch of tasks; ``()`` for one task.
+
+    Raises:
+        ShapeError: if the attribute is neither a boolean nor booleans of this shape.
+    """
+    told = getattr(controller, "converged", None)
+    if told is None:
+        return None
+    found = np.asarray(told)
+    if found.dtype != np.bool_ or found.shape not in ((), batch_shape):
+        raise ShapeError(f"converged of a controller must be booleans of shape {batch_shape}, got {told!r}.")
+    return np.broadcast_to(found, batch_shape)
 
 
 _SPELLINGS = (
@@ -186,12 +209,14 @@ class AffineFeedback:
         inputs: the inputs v, shape ``(..., H, m)``.
         states: the states x, shape ``(..., H, n)`` or with more times than H.
         limits: the limits of the inputs, shared by all tasks of the batch; None if there are none.
+        converged: whether the design converged, booleans of shape ``(...)``; None if the design is not iterative.
     """
 
     gains: Array
     inputs: Array
     states: Array
     limits: Limits | None = None
+    converged: Mask | None = None
 
     def __call__(self, t: int, x: Array) -> Array:
         """Return the input at step t, shape ``(..., m)``."""
@@ -202,7 +227,8 @@ class AffineFeedback:
     def __getitem__(self, index: int) -> AffineFeedback:
         """Return the controller of one task of the batch."""
         gains = self.gains[index] if self.gains.ndim > 3 else self.gains
-        return AffineFeedback(gains, self.inputs[index], self.states[index], self.limits)
+        converged = None if self.converged is None else np.asarray(self.converged[index])
+        return AffineFeedback(gains, self.inputs[index], self.states[index], self.limits, converged)
 
     def __repr__(self) -> str:
         return call(self, gains=self.gains, inputs=self.inputs, limits=self.limits)

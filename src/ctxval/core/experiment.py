@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from ctxval._util.representation import call, lines
-from ctxval.core.labels import Labels, parted
+from ctxval._util.texts import parted
+from ctxval.core.labels import Labels
 from ctxval.core.truth import Truth
 from ctxval.core.validation import Validation
 

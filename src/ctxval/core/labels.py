@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ctxval._util.representation import record
+from ctxval._util.texts import parted
 
 
 @dataclass(frozen=True)
@@ -52,9 +53,3 @@ def _named(labels: tuple[str, ...], own: object, letter: str, count: int) -> dic
     if isinstance(own, list | tuple) and len(set(map(str, own))) == count:
         return {str(name): "" for name in own}
     return {f"{letter}{i}": "" for i in range(count)}
-
-
-def parted(label: str) -> tuple[str, str]:
-    """Return the name and the unit of ``name [unit]``."""
-    name, _, unit = label.partition("[")
-    return name.strip(), unit.strip().removesuffix("]")

@@ -62,6 +62,8 @@ class Task:
         """Shape ``(..., n)``."""
         self.reference: Array = np.broadcast_to(target, (*self.batch_shape, self.horizon + 1, n))
         """Shape ``(..., H + 1, n)``; all zero if the task has neither goal nor reference."""
+        self.has_goal: bool = goal is not None or reference is not None
+        """Whether a goal or a reference was given."""
 
     @property
     def goal(self) -> Array:
@@ -75,7 +77,8 @@ class Task:
 
     def __getitem__(self, index: int) -> Task:
         """Return one task of the batch."""
-        return Task(self.initial_state[index], horizon=self.horizon, dt=self.dt, reference=self.reference[index])
+        reference = self.reference[index] if self.has_goal else None
+        return Task(self.initial_state[index], horizon=self.horizon, dt=self.dt, reference=reference)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies one task in a store."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -17,8 +18,10 @@ from ctxval.core.controller import Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels
 from ctxval.core.model import Model, Step, as_model
+from ctxval.core.parts import require_part, require_parts
 from ctxval.core.plan import Measurement, Outcome, Plan, executed_in, require_execution
 from ctxval.core.rollout import rollout
+from ctxval.core.simulated import Simulated
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.system import System
 from ctxval.core.task import Task
@@ -73,19 +76,7 @@ class Validation:
         start_tolerance: float = START,
         labels: Labels | None = None,
     ) -> None:
-        _require("space", space, isinstance(space, TaskSpace), "a TaskSpace")
-        _require("task", task, callable(task), "a function p -> Task")
-        _require("system", system, isinstance(system, System), "a System with execute(controller, task)")
-        _require(
-            "synthesizer", synthesizer, isinstance(synthesizer, Synthesizer), "a Synthesizer with design(task, model)"
-        )
-        _require(
-            "distance", distance, callable(distance), "a function (model_trajectory, system_trajectory, task) -> d"
-        )
-        _require("labels", labels, labels is None or isinstance(labels, Labels), "Labels(states, inputs, units)")
-        is_number = isinstance(start_tolerance, int | float) and not isinstance(start_tolerance, bool)
-        is_share = is_number and 0 <= start_tolerance < float("inf")
-        _require("start_tolerance", start_tolerance, is_share, "a finite number >= 0")
+        require_parts(space, task, system, synthesizer, distance, start_tolerance, labels)
         self.space = space
         self.task = task
         self.system = system
@@ -118,6 +109,20 @@ class Validation:
             InputError: if it is neither a model nor a function.
         """
         return self._with(model=model)
+
+    def on_model(self, distance: Distance, *, units: str | None = None) -> Validation:
+        """Return this validation with M itself in the place of S, which is never executed (the paper's Aspect 1).
+
+        Args:
+            distance: how far the trajectory of M is from completing its task, such as
+                :class:`ctxval.distances.GoalError`.
+            units: the units of this distance; None if they are those of the present distance.
+
+        Raises:
+            InputError: if the distance is not a function.
+        """
+        labels = self.labels if units is None else replace(self.labels, units=units)
+        return self._with(system=Simulated(self.model), distance=distance, labels=labels, start_tolerance=START)
 
     def with_space(self, space: TaskSpace) -> Validation:
         """Return this validation with another task space of the same parameters, for example with a distribution.
@@ -368,7 +373,7 @@ class Validation:
             raise
         except (Exception, SystemExit) as error:
             raise InputError(f"the task function failed: {reason_of(error)}.") from error
-        _require("the task function's result", task, isinstance(task, Task), "a Task")
+        require_part("the task function's result", task, isinstance(task, Task), "a Task")
         return task
 
     def _distance(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
@@ -392,8 +397,3 @@ class Validation:
             f"synthesizer: {shown(self.synthesizer)}",
             f"distance: {shown(self.distance)}, task: {shown(self.task)}",
         )
-
-
-def _require(name: str, value: object, valid: bool, wanted: str) -> None:
-    if not valid:
-        raise InputError(f"{name} must be {wanted}, got {value!r}.")

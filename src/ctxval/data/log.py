@@ -56,7 +56,7 @@ class Clock:
         unit: the unit of this column: s, ms, us or ns.
         period: seconds between two rows of a table that has no times; None if it has times.
         stamp: the time of a message: ``log``, when it was recorded; ``publish``, when it was sent; or ``header``, the
-            ``header.stamp`` in it.
+            ``header.stamp`` or the ``timestamp`` in it.
     """
 
     field: str | None = None
@@ -301,11 +301,12 @@ class TopicLog(Log):
             return message.logged
         if clock.stamp == "publish":
             return message.published
-        stamp = _resolved(message.content, ("header", "stamp"))
-        whole = _resolved(stamp, ("sec",))
-        part = next((p for p in (_resolved(stamp, (name,)) for name in ("nanosec", "nsec")) if p is not None), None)
+        stamp = _first(message.content, ("header", "stamp"), ("timestamp",))
+        whole, part = _first(stamp, ("sec",), ("seconds",)), _first(stamp, ("nanosec",), ("nsec",), ("nanos",))
         if whole is None or part is None:
-            raise InputError(f"{self.source}, message {number} of {message.topic}: it has no header.stamp.")
+            raise InputError(
+                f"{self.source}, message {number} of {message.topic}: it has no header.stamp or timestamp."
+            )
         return int(whole) * 10**9 + int(part)
 
     def _value(self, message: Message, number: int, path: tuple[str | int, ...]) -> Array:
@@ -348,6 +349,11 @@ def _resolved(content: Any, path: Sequence[str | int]) -> Any:
         if content is None:
             return None
     return content
+
+
+def _first(content: Any, *paths: Sequence[str | int]) -> Any:
+    """Return the first part of a message that exists; None if there is none."""
+    return next((found for path in paths if (found := _resolved(content, path)) is not None), None)
 
 
 def _leaves(content: Any, before: str = "", depth: int = 6) -> Iterator[str]:

@@ -1,7 +1,8 @@
-"""Logs of messages: MCAP files and ROS 2 bags. Needs mcap, mcap-ros2-support and rosbags (extra ``logs``), and no ROS.
+"""Logs of messages: MCAP files and bags of ROS 1 and 2. Needs the extra ``logs``, and no ROS.
 
-Messages are decoded by mcap-ros2-support, also those of bags: its decoder interprets the message definitions in a file,
-whereas that of rosbags compiles Python code from them.
+Messages of ROS 2 are decoded by mcap-ros2-support, also those of bags: its decoder interprets the message definitions
+in a file, whereas that of rosbags compiles Python code from them. Those of ROS 1 are decoded in the same way by
+``ros1.py``.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from typing import Any
 from ctxval._util.extras import require_extra
 from ctxval._util.files import open_regular
 from ctxval.data.log import Log, Message, TopicLog
+from ctxval.data.protobuf import protobuf_decoder
+from ctxval.data.ros1 import ros1_decoder
 from ctxval.errors import InputError
 
 _MOST_FILE = 64 * 2**30
@@ -24,7 +27,7 @@ _PURPOSE = "logs of messages"
 
 
 class McapLog(TopicLog):
-    """An MCAP file with messages in JSON or in ROS 2's CDR.
+    """An MCAP file with messages in JSON, in protobuf or of ROS 1 and 2.
 
     Args:
         path: the file.
@@ -87,15 +90,19 @@ class McapLog(TopicLog):
             return json.loads
         if channel.message_encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
             return ros2_decoder(self.source, channel.topic, schema.name, schema.data.decode("utf-8", "replace"))
+        if channel.message_encoding == "ros1" and schema is not None and schema.encoding == "ros1msg":
+            return ros1_decoder(self.source, channel.topic, schema.name, schema.data.decode("utf-8", "replace"))
+        if channel.message_encoding == "protobuf" and schema is not None and schema.encoding == "protobuf":
+            return protobuf_decoder(self.source, channel.topic, schema)
         of = f" with a schema in {schema.encoding}" if schema is not None else ""
         raise InputError(
-            f"{self.source}: the messages of {channel.topic} are in {channel.message_encoding}{of}; messages in json "
-            "and in cdr with ros2msg can be read."
+            f"{self.source}: the messages of {channel.topic} are in {channel.message_encoding}{of}; messages in json, "
+            "in protobuf, in cdr with ros2msg and in ros1 with ros1msg can be read."
         )
 
 
 class BagLog(TopicLog):
-    """A ROS 2 bag: a folder with ``metadata.yaml``, or one of its ``.db3`` files.
+    """A bag: one of ROS 2, a folder with ``metadata.yaml`` or one of its ``.db3`` files, or one of ROS 1, ``.bag``.
 
     Args:
         path: the folder or the file.
@@ -112,8 +119,10 @@ class BagLog(TopicLog):
 
     @contextmanager
     def _reader(self) -> Iterator[Any]:
-        library = require_extra("rosbags.rosbag2", "logs", _PURPOSE)
-        with _damage(self._path, "a ROS 2 bag"):
+        version = 1 if self._path.suffix.lower() == ".bag" and self._path.is_file() else 2
+        self._kind = f"a bag of ROS {version}"
+        library = require_extra(f"rosbags.rosbag{version}", "logs", _PURPOSE)
+        with _damage(self._path, self._kind):
             reader = library.Reader(self._path)
             reader.open()
         try:
@@ -132,7 +141,7 @@ class BagLog(TopicLog):
             found = reader.messages([one for one in reader.connections if one.topic in wanted])
             number = 0
             while True:
-                with _damage(self._path, "a ROS 2 bag"):
+                with _damage(self._path, self._kind):
                     one = next(found, None)
                 if one is None:
                     return
@@ -154,6 +163,8 @@ class BagLog(TopicLog):
 
     def _decoder(self, connection: Any) -> Callable[[bytes], Any]:
         definition = connection.msgdef
+        if self._kind.endswith("1"):
+            return ros1_decoder(self.source, connection.topic, connection.msgtype, definition.data)
         if definition.format.name == "MSG":
             return ros2_decoder(self.source, connection.topic, connection.msgtype, definition.data)
         # Bags before ROS 2 Iron do not hold the definitions of their messages.
@@ -193,7 +204,7 @@ def read_mcap(path: Path) -> list[Log]:
 
 
 def read_bag(path: Path) -> list[Log]:
-    """Return the log in a ROS 2 bag."""
+    """Return the log in a bag of ROS 1 or 2."""
     return [BagLog(path)]
 
 

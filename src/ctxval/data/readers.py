@@ -19,6 +19,7 @@ READERS: dict[str, Callable[[Path], list[Log]]] = {
     ".parquet": read_parquet,
     ".mcap": read_mcap,
     ".db3": read_bag,
+    ".bag": read_bag,
 }
 """The reader of each suffix."""
 
@@ -26,7 +27,7 @@ READERS: dict[str, Callable[[Path], list[Log]]] = {
 def read_logs(paths: Sequence[str | Path]) -> list[Log]:
     """Return the logs in files and folders; nothing in them is ever run.
 
-    A folder is a ROS 2 bag if it has a file ``metadata.yaml``, a LeRobot data set if it has ``meta/info.json``, and
+    A folder is a bag of ROS 2 if it has a file ``metadata.yaml``, a LeRobot data set if it has ``meta/info.json``, and
     otherwise all logs in it are read, in the order of their names.
 
     Raises:
@@ -69,5 +70,6 @@ def _logs(path: Path) -> list[Log]:
 
 
 _KINDS = (
-    f"files must end in {', '.join(READERS)}, and folders must be ROS 2 bags or LeRobot data sets or contain such files"
+    f"files must end in {', '.join(READERS)}, and folders must be bags of ROS 2 or LeRobot data sets, or contain such "
+    "files"
 )

@@ -81,7 +81,7 @@ def read_recordings(paths: Sequence[str | Path], mapping: LogMapping | None = No
     """Return the recordings in files and folders.
 
     Args:
-        paths: CSV, NPZ, MATLAB, Parquet and MCAP files, ROS 2 bags, LeRobot data sets, or folders of such files.
+        paths: CSV, NPZ, MATLAB, Parquet and MCAP files, ROS bags, LeRobot data sets, or folders of such files.
         mapping: which fields are states and inputs; by default, they are found by usual names.
         changes: other values of the mapping, such as ``dt`` and ``delay``.
 

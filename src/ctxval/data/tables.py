@@ -12,7 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.files import MOST_BYTES, csv_rows, read_bytes
 from ctxval._util.npz import Archive
-from ctxval._util.texts import unguarded
+from ctxval._util.texts import parted, unguarded
 from ctxval.data.log import Log, MemoryTable, Table
 from ctxval.errors import InputError
 
@@ -34,7 +34,7 @@ class CsvTable(Table):
 
     def __init__(self, path: Path) -> None:
         self.source, self._path = str(path), path
-        header = [unguarded(name).partition("[")[0].strip() for name in next(self._rows(), (0, []))[1]]
+        header = [parted(unguarded(name))[0] for name in next(self._rows(), (0, []))[1]]
         named = [name for name in header if name]
         if not named or len(set(named)) != len(named):
             wrong = "no header" if not named else f"two columns {max(named, key=named.count)!r}"

@@ -12,6 +12,7 @@ from ctxval.distances.goal_error import GoalError
 from ctxval.distances.maximum_deviation import MaximumDeviation
 from ctxval.distances.mean_deviation import MeanDeviation
 from ctxval.distances.relative_deviation import RelativeDeviation
+from ctxval.distances.tracking_error import TrackingError
 from ctxval.distances.whole_trajectory import WholeTrajectory
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "MeanDeviation",
     "RelativeDeviation",
     "StateNorm",
+    "TrackingError",
     "WholeTrajectory",
     "by_name",
 ]

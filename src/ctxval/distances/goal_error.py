@@ -16,6 +16,8 @@ from ctxval.distances.base import ErrorNorm
 class GoalError(ErrorNorm):
     """Norm of the difference between the system's final state and the goal: both aspects of Remark 1 in one distance.
 
+    With ``norm=1`` it is the formula of the paper's Remark 1, ``||xi_S(H; x_init, pi_p) - p||_1``.
+
     Attributes:
         norm: order of the norm: 1, 2 or infinity.
         components: indices of the states that are compared; all states by default.

@@ -13,15 +13,15 @@ from ctxval._util.representation import call, counted, record
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.recordings import Recording, Recordings
-from ctxval.errors import InputError, UnknownNameError
+from ctxval.errors import InputError, ModelError, UnknownNameError
 from ctxval.fitting.least_squares import FittedParameter, as_bounds, fit_parameters
 from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear
 from ctxval.models.parametric import ParametricStep
 from ctxval.replay.accuracy import StepError, step_errors
 from ctxval.replay.steps import RecordedSteps
 
-Kind = Literal["linear", "network", "gaussian-process", "parameters"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
+KINDS: tuple[Kind, ...] = get_args(Kind)[:4]
 STEPS = (1, 20)
 """Numbers of steps after which the held-out errors are computed, unless others are given."""
 HOLD_OUT = 0.25
@@ -40,7 +40,7 @@ class FittedModel:
     """A model that was learned from recordings.
 
     Attributes:
-        kind: its kind.
+        kind: its kind; ``given`` for a model that existed before.
         model: the model, with the transitions that it was learned from.
         errors: its errors on the held-out recordings.
         parameters: the parameters of the user's function; none for other kinds.
@@ -121,6 +121,7 @@ def fit(
     step: ParametricStep | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     vectorized: bool = False,
+    given: Model | None = None,
     hold_out: float = HOLD_OUT,
     steps: Sequence[int] = STEPS,
     seed: int = 0,
@@ -133,6 +134,8 @@ def fit(
         step: the user's function ``(x, u, theta) -> x_next``, for the kind ``parameters``.
         bounds: the bounds of its parameters by name.
         vectorized: whether this function takes whole batches.
+        given: a model that exists already, such as one that ``mujoco.sysid`` identified; its errors stand beside those
+            of the others. It may have been learned from the recordings that are held out here.
         hold_out: the share of the recordings that is held out; of a single recording, its last part.
         steps: numbers of steps after which errors are computed.
         seed: seed of all random numbers.
@@ -141,15 +144,7 @@ def fit(
         UnknownNameError: if there is no such kind.
         InputError: if no kind is given, if too little is recorded, or if ``step`` or ``bounds`` is missing.
     """
-    for kind in kinds:
-        if kind not in KINDS:
-            raise UnknownNameError.among("kind of model", str(kind), KINDS)
-    if not kinds:
-        raise InputError(f"at least one kind of model is needed: {', '.join(KINDS)}.")
-    if "parameters" in kinds:
-        if step is None or not bounds:
-            raise InputError("the kind 'parameters' needs a function (x, u, theta) -> x_next and the bounds of theta.")
-        as_bounds(bounds)
+    _require_kinds(kinds, step, bounds)
     learned_from, held_out = split(recordings, hold_out, seed)
     data, _ = learned_from.transitions()
 
@@ -163,19 +158,43 @@ def fit(
         "gaussian-process": lambda: (GaussianProcessModel.fit(data, _POINTS, seed=seed), (), ()),
         "parameters": parameters,
     }
+    if given is not None:
+        makers["given"] = lambda: (_with_step(given, recordings.dt), (), ())
     fitted: list[FittedModel] = []
     failed: list[FailedFit] = []
     recorded = RecordedSteps(held_out, range(len(held_out.runs)))
-    for kind in dict.fromkeys(kinds):
+    for kind in dict.fromkeys((*kinds, *(name for name in makers if name == "given"))):
         try:
             with single_threaded():
                 model, found, notes = makers[kind]()
                 errors = step_errors(model, recorded, sorted(set(steps)))
-        except InputError as error:
+        except (InputError, ModelError) as error:
             failed.append(FailedFit(kind, str(error)))
             continue
         fitted.append(FittedModel(kind, model, errors, found, notes))
     return FitReport(tuple(sorted(fitted, key=_rank)), tuple(failed), learned_from, held_out)
+
+
+def _require_kinds(
+    kinds: Sequence[Kind], step: ParametricStep | None, bounds: Mapping[str, tuple[float, float]] | None
+) -> None:
+    for kind in kinds:
+        if kind not in KINDS:
+            raise UnknownNameError.among("kind of model", str(kind), KINDS)
+    if not kinds:
+        raise InputError(f"at least one kind of model is needed: {', '.join(KINDS)}.")
+    if "parameters" in kinds:
+        if step is None or not bounds:
+            raise InputError("the kind 'parameters' needs a function (x, u, theta) -> x_next and the bounds of theta.")
+        as_bounds(bounds)
+
+
+def _with_step(model: Model, dt: float) -> Model:
+    """Return a model that exists already, if it has no other time step than the recordings."""
+    own = getattr(model, "dt", None)
+    if isinstance(own, int | float) and not np.isclose(own, dt, rtol=1e-3, atol=0):
+        raise InputError(f"the given model has steps of {own:g} s and the recordings have steps of {dt:g} s.")
+    return model
 
 
 def _rank(one: FittedModel) -> float:

@@ -16,12 +16,13 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.progress import advance
 from ctxval._util.representation import call
-from ctxval.core.controller import Controller
+from ctxval.core.controller import converged_of
 from ctxval.core.model import Model
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
+from ctxval.errors import InputError
 from ctxval.learning.dynamics import Residual, ResidualsWithout, learn_covariance
 from ctxval.learning.error_vectors import Executed, executions_of
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
@@ -107,9 +108,13 @@ def _replayed(validation: Validation, model: _OneCorrected | None, point: Array)
     space = validation.space
     try:
         task = validation.task(space.parameters(space.from_unit(point)))
-        controller, converged = _designed(validation, task)
+        controller = validation.synthesizer.design(task, validation.model)
     except Exception:  # the user's own parts
         return None
+    converged = None
+    with contextlib.suppress(InputError):  # an attribute of this name that is something else
+        told = converged_of(controller)
+        converged = None if told is None else bool(told)
     nothing = Replay(task, None, np.nan, converged)
     if model is None:
         return nothing
@@ -123,15 +128,3 @@ def _replayed(validation: Validation, model: _OneCorrected | None, point: Array)
         return nothing
     finite = bool(predicted.finite.all()) and np.isfinite(distance)
     return Replay(task, predicted, distance, converged) if finite else nothing
-
-
-def _designed(validation: Validation, task: Task) -> tuple[Controller, bool | None]:
-    """Return the controller of a task, and whether its design converged, if the synthesizer tells."""
-    solve = getattr(validation.synthesizer, "solve", None)
-    if callable(solve):
-        with contextlib.suppress(Exception):  # a user's synthesizer may have another method of this name
-            solution = solve(task, validation.model)
-            controller, converged = getattr(solution, "controller", None), getattr(solution, "converged", None)
-            if callable(controller) and converged is not None:
-                return controller, bool(np.all(converged))
-    return validation.synthesizer.design(task, validation.model), None

@@ -6,6 +6,7 @@ from ctxval._util.registry import Registry
 from ctxval.core.model import Function, Model, linearize
 from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
 from ctxval.models.linear import Linear
+from ctxval.models.mujoco import MuJoCo
 from ctxval.models.neural_network import FeedforwardReLU
 from ctxval.models.onnx import Onnx
 from ctxval.models.parametric import Parametric
@@ -22,6 +23,7 @@ __all__ = [
     "IncrementScaling",
     "Linear",
     "Model",
+    "MuJoCo",
     "Onnx",
     "Parametric",
     "ScikitLearn",

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
-from scipy.spatial import KDTree
 
-from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import counted
-from ctxval.core.controller import Limits
+from ctxval.core import soundness
 from ctxval.core.distance import ComposedDistance
-from ctxval.core.trajectory import Trajectory
 from ctxval.report.context import Recording, ReportContext
 from ctxval.report.findings import Finding
 from ctxval.report.markup import number, percent
@@ -19,23 +14,8 @@ from ctxval.report.markup import number, percent
 _WORST = 5
 """Number of trials with the largest distances that these insights look at."""
 
-_NEAR = 0.1
-"""Two tasks are neighbours if they are nearer than this, in diagonals of the task space."""
-
-_FLIPPED = 0.5
-"""Controllers of neighbours flip if their inputs on M differ by more than this share of the range of the inputs."""
-
 _UNUSUAL = 3.0
 """A state of M is unusual if it is this many times as large as in the median trial."""
-
-_MISSED = 0.1
-"""M misses its goal if it ends farther away than this, as a share of the range of a state."""
-
-_SEVERAL = 3
-"""Number of steps of one execution at an extreme value from which this value is taken to be a limit."""
-
-_SATURATED = 0.01
-"""Least share of steps at a limit that is worth a note."""
 
 
 def components(context: ReportContext) -> Finding | None:
@@ -43,7 +23,7 @@ def components(context: ReportContext) -> Finding | None:
     if not context.recordings:
         return None
     worst = list(context.recordings.values())[:_WORST]
-    spans = _spans(one.system.states for one in context.recordings.values())
+    spans = soundness.ranges([one.system.states for one in context.recordings.values()])
     errors = [np.abs(one.system.states - one.model.states) / spans for one in worst]
     peaks = np.mean([one.max(axis=0) for one in errors], axis=0)
     j = int(peaks.argmax())
@@ -89,30 +69,22 @@ def flips(context: ReportContext) -> Finding | None:
         return None
     by_number = {trial.number: trial for trial in context.completed}
     numbers = list(context.recordings)
-    points = np.array([by_number[k].unit_point for k in numbers]) / np.sqrt(context.space.dimension)
-    pairs = sorted(KDTree(points).query_pairs(_NEAR))
-    inputs = [context.recordings[k].model.inputs for k in numbers]
-    spans = _spans(inputs)
-    changes = [
-        (float((np.abs(inputs[i] - inputs[j]) / spans).max()), i, j)
-        for i, j in pairs
-        if inputs[i].shape == inputs[j].shape and inputs[i].size
-    ]
-    if not changes:
+    points = np.array([by_number[k].unit_point for k in numbers])
+    found = soundness.flips(points, [one.model.inputs for one in context.recordings.values()])
+    if found is None:
         return None
-    size, i, j = max(changes)
-    flipped = sum(change > _FLIPPED for change, _, _ in changes)
-    values = {"neighbours": len(changes), "flipped": flipped, "largest_change": size}
-    if not flipped:
+    i, j = found.example
+    values = {"neighbours": found.pairs, "flipped": found.flipped, "largest_change": found.largest}
+    if not found.flipped:
         text = (
-            f"The controllers of the {len(changes)} pairs of neighbouring tasks are alike: their inputs on M differ by "
-            f"at most {percent(size)} of the range of the inputs."
+            f"The controllers of the {found.pairs} pairs of neighbouring tasks are alike: their inputs on M differ by "
+            f"at most {percent(found.largest)} of the range of the inputs."
         )
         return Finding("Controllers of neighbouring tasks", "good", text, values)
     text = (
-        f"{flipped} of {len(changes)} pairs of neighbouring tasks have controllers that differ abruptly, for example "
-        f"trials {numbers[i]} and {numbers[j]}: their inputs on M differ by {percent(size)} of the range of the "
-        "inputs. A planner that jumps between solutions makes the distance jump, too."
+        f"{found.flipped} of {found.pairs} pairs of neighbouring tasks have controllers that differ abruptly, for "
+        f"example trials {numbers[i]} and {numbers[j]}: their inputs on M differ by {percent(found.largest)} of the "
+        "range of the inputs. A planner that jumps between solutions makes the distance jump, too."
     )
     return Finding("Controllers of neighbouring tasks", "attention", text, values)
 
@@ -142,15 +114,15 @@ def unusual_motion(context: ReportContext) -> Finding | None:
 
 def saturation(context: ReportContext) -> Finding | None:
     """Whether inputs stay at their limits."""
-    executed = [one.system.inputs for one in context.recordings.values() if one.system.inputs.size]
-    if not executed:
+    synthesizer = None if context.validation is None else context.validation.synthesizer
+    found = soundness.saturation([one.system.inputs for one in context.recordings.values()], synthesizer)
+    if found is None:
         return None
-    at_limit, known = _at_limit(context, executed)
-    share = at_limit.mean(axis=0)
+    share, known = found.shares, found.known
     j = int(share.argmax())
     label = context.signals[1][j]
     values = {"input": label, "share_of_steps": float(share[j]), "limits_known": known}
-    if share[j] < _SATURATED:
+    if share[j] < soundness.SATURATED:
         return Finding(
             "Inputs and their limits", "good", f"The inputs stay off their limits in {_rest(share[j])}.", values
         )
@@ -162,26 +134,6 @@ def saturation(context: ReportContext) -> Finding | None:
 
 def _rest(share: float) -> str:
     return "all steps" if not share else f"{percent(1 - float(share), 4)} of the steps"
-
-
-def _at_limit(context: ReportContext, executed: list[Array]) -> tuple[Mask, bool]:
-    """Return which inputs of all executions ``(N, m)`` are at a limit, and whether the synthesizer states the limits.
-
-    If it states none, the extreme values of all executions are limits in those executions that stay there for several
-    steps.
-    """
-    together = np.concatenate(executed)
-    spans = np.maximum(np.ptp(together, axis=0), 1e-300)
-    given = None if context.validation is None else getattr(context.validation.synthesizer, "limits", None)
-    if given is not None:
-        limits = Limits.of(given, together.shape[-1])
-        return (together <= limits.low + 1e-6 * spans) | (together >= limits.high - 1e-6 * spans), True
-    low, high = together.min(axis=0) + 1e-9 * spans, together.max(axis=0) - 1e-9 * spans
-    parts = []
-    for inputs in executed:
-        at_ends = inputs <= low, inputs >= high
-        parts.append(np.logical_or(*(at & (at.sum(axis=0) >= _SEVERAL) for at in at_ends)) & (low < high))
-    return np.concatenate(parts), False
 
 
 def converged(context: ReportContext) -> Finding | None:
@@ -208,43 +160,22 @@ def goals(context: ReportContext) -> Finding | None:
         return Finding("Goals of M", "unknown", "Not known: it needs the experiment, which is not loaded.")
     if not context.replays:
         return None
-    weighed = _weighed(context)
-    if not len(weighed):
+    if not any(one.task.has_goal for one in context.replays.values()):
+        return Finding("Goals of M", "unknown", "Not known: the tasks have neither a goal nor a reference.")
+    numbers = list(context.replays)
+    on_model = [context.recordings[k].model for k in numbers]
+    found = soundness.goal_misses(context.validation, on_model, [context.replays[k].task.goal for k in numbers])
+    if found is None:
         text = "Not known: the synthesizer does not tell which states it brings to a goal."
         return Finding("Goals of M", "unknown", text)
-    spans = _spans(one.model.states for one in context.recordings.values())[weighed]
-    numbers = list(context.replays)
-    misses = np.array([_miss(context.recordings[k].model, context.replays[k].task.goal)[weighed] for k in numbers])
-    shares = misses / spans
-    missed = shares.max(axis=1) > _MISSED
-    row, j = (int(k) for k in np.unravel_index(int(shares.argmax()), shares.shape))
-    label, size = context.signals[0][int(weighed[j])], float(misses[row, j])
+    missed, (row, j) = found.missed, found.worst
+    label, size = context.signals[0][int(found.states[j])], float(found.misses[row, j])
     values = {"missed": int(missed.sum()), "trials": len(numbers), "largest_miss": size, "state": label}
     text = (
-        f"M ends within {percent(_MISSED)} of the range of each weighted state from its goal in "
+        f"M ends within {percent(soundness.MISSED)} of the range of each weighted state from its goal in "
         f"{len(numbers) - int(missed.sum())} of {len(numbers)} trials; it misses most in {label}, by {number(size)}, "
         f"in trial {numbers[row]}."
     )
     if missed.any():
         text += " A controller that fails on M cannot be expected to work on S."
     return Finding("Goals of M", "attention" if missed.any() else "good", text, values)
-
-
-def _miss(trajectory: Trajectory, goal: Array) -> Array:
-    return np.abs(trajectory.final_state - goal)
-
-
-def _weighed(context: ReportContext) -> Rows:
-    """Return the indices of the states that the controller brings to their goals; none if it does not tell."""
-    n = len(context.signals[0])
-    cost = None if context.validation is None else getattr(context.validation.synthesizer, "cost", None)
-    weights = getattr(cost, "Q_final", getattr(cost, "Q", None))
-    if weights is None or np.shape(weights) != (n, n):
-        return np.empty(0, dtype=np.intp)
-    return np.flatnonzero(np.diag(weights) > 0)
-
-
-def _spans(parts: Iterator[Array] | list[Array]) -> Array:
-    """Return the range of each column over all trajectories, which is never 0."""
-    ends = np.array([[part.min(axis=0), part.max(axis=0)] for part in parts if part.size])
-    return np.asarray(np.maximum(ends[:, 1].max(axis=0) - ends[:, 0].min(axis=0), 1e-300))

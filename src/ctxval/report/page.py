@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 from markupsafe import Markup
 
+from ctxval._util.representation import call
 from ctxval._util.texts import reason_of, visible
 from ctxval.errors import InputError
 from ctxval.report.context import ReportContext
@@ -27,12 +28,34 @@ if TYPE_CHECKING:
     import jinja2
 
 
+Context = TypeVar("Context", contravariant=True)
+
+
+class SectionOf(Protocol[Context]):
+    """A section that is made from something: its heading, and its content."""
+
+    @property
+    def title(self) -> str:
+        """The heading."""
+
+    def render(self, context: Context) -> str:
+        """Return the content."""
+
+
 @dataclass(frozen=True, eq=False)
-class _Rendered:
-    """A section with its content."""
+class Rendered:
+    """A section with its content.
+
+    Attributes:
+        title: the heading.
+        content: the content.
+    """
 
     title: str
     content: Markup
+
+    def __repr__(self) -> str:
+        return call(self, self.title)
 
 
 def page(context: ReportContext, sections: Sequence[Section] = ()) -> str:
@@ -46,19 +69,28 @@ def page(context: ReportContext, sections: Sequence[Section] = ()) -> str:
         InputError: if a section is none.
     """
     with np.errstate(all="ignore"):  # a store may have any numbers
-        rendered = [_rendered(section, context) for section in sections_of(SECTIONS, sections)]
+        rendered = [rendered_section(section, context) for section in sections_of(SECTIONS, sections)]
     name = visible(context.name) or "campaign"
+    return framed(f"Validation of {name}", f"Store {context.store.name}; report made {now()}.", rendered)
+
+
+def framed(title: str, subtitle: str, sections: Sequence[Rendered]) -> str:
+    """Return sections in the frame of every page: headings, navigation, style, script and content security policy."""
     style, script = _asset("report.css"), _asset("report.js")
-    made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     return _template().render(
-        title=text(f"Validation of {name}", 200),
-        subtitle=text(f"Store {context.store.name}; report made {made}.", 600),
+        title=text(title, 200),
+        subtitle=text(subtitle, 600),
         policy=_policy(style, script),
         style=Markup(style),
         script=Markup(script),
-        sections=rendered,
+        sections=sections,
         version=VERSION,
     )
+
+
+def now() -> str:
+    """Return the present time in UTC, for the subtitle of a page."""
+    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def write_page(context: ReportContext, path: str | Path, sections: Sequence[Section] = ()) -> Path:
@@ -67,7 +99,15 @@ def write_page(context: ReportContext, path: str | Path, sections: Sequence[Sect
     Raises:
         InputError: if the file cannot be written or is a store, or a section is none.
     """
-    content = page(context, sections)
+    return write_content(page(context, sections), path)
+
+
+def write_content(content: str, path: str | Path) -> Path:
+    """Write a page as one HTML file, in a new folder if there is none.
+
+    Raises:
+        InputError: if the file cannot be written or is a store.
+    """
     try:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -75,15 +115,15 @@ def write_page(context: ReportContext, path: str | Path, sections: Sequence[Sect
     return write_text(path, content)
 
 
-def _rendered(section: Section, context: ReportContext) -> _Rendered:
+def rendered_section(section: SectionOf[Context], context: Context) -> Rendered:
     """Return a section with its content; one that fails says why, and the others are shown."""
     title = text(section.title, 200)
     try:
         content = section.render(context)
     except Exception as error:  # a user's own section, or odd data
-        return _Rendered(title, paragraph(f"This section cannot be shown: {reason_of(error)}."))
+        return Rendered(title, paragraph(f"This section cannot be shown: {reason_of(error)}."))
     whole = content.__html__() if hasattr(content, "__html__") else None
-    return _Rendered(title, Markup(whole) if whole is not None else paragraph(str(content)))
+    return Rendered(title, Markup(whole) if whole is not None else paragraph(str(content)))
 
 
 def _policy(style: str, script: str) -> str:

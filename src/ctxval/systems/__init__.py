@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ctxval._util.registry import Registry
+from ctxval.core.simulated import Simulated
 from ctxval.core.system import System
 from ctxval.systems.fmu import FMU
 from ctxval.systems.function import Function
@@ -10,7 +11,6 @@ from ctxval.systems.gymnasium import Gymnasium
 from ctxval.systems.integrate import rk4
 from ctxval.systems.manual import Manual
 from ctxval.systems.mujoco import MuJoCo
-from ctxval.systems.simulated import Simulated
 from ctxval.systems.subprocess import Subprocess
 
 __all__ = [

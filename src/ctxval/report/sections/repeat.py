@@ -129,7 +129,7 @@ def python_snippet(context: ReportContext, trial: Trial) -> str:
     made = "validation = ...  # the Validation of the campaign"
     if context.settings:
         made = (
-            "from ctxval import Store\nfrom ctxval.config.settings import trusted_settings\n\n"
+            "from ctxval import Store\nfrom ctxval.config.stored_settings import trusted_settings\n\n"
             f"store = Store.existing({str(_path(context))!r})\n"
             "validation = trusted_settings(store).load().validation"
         )

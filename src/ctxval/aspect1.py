@@ -1,0 +1,312 @@
+"""Aspect 1 of the paper's Remark 1: whether the model itself completes the tasks, by simulation only.
+
+>>> from ctxval import aspect1  # doctest: +SKIP
+>>> print(aspect1.check(experiment.validation, threshold=0.05))  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+from ctxval._util.arrays import Array
+from ctxval._util.progress import advance, stage
+from ctxval._util.representation import call, record
+from ctxval._util.texts import text_of
+from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.goals_of_model import GoalWarning
+from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates.options import CONFIDENCE
+from ctxval.certificates.verdict import Verdict, require_threshold
+from ctxval.core.controller import converged_of
+from ctxval.core.distance import Distance
+from ctxval.core.plan import Plan
+from ctxval.core.soundness import Flips, Saturation, aimed_states, flips, saturation
+from ctxval.core.task import Task
+from ctxval.core.validation import Validation
+from ctxval.distances import GoalError, MeanDeviation, StateNorm, TrackingError
+from ctxval.errors import CtxvalError, DesignError, InputError, ModelError
+from ctxval.searches import Search, by_name
+
+__all__ = ["Aspect1Report", "SimulatedTask", "check", "completion"]
+
+TASKS = 100
+"""Number of simulated tasks, unless another one is given."""
+SEARCH = "bayesian-optimisation"
+"""The search, unless another one is given. Learned dynamics could not teach it anything, because M is known."""
+
+_NEIGHBOURS = 20
+"""Number of tasks beside which another one is planned: the worst ones and spread ones, half of each."""
+_BESIDE = 0.03
+"""Distance of such a neighbour, in diagonals of the task space."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedTask:
+    """A task on M.
+
+    Attributes:
+        parameters: the task parameters.
+        error: how far M is from completing it; None if no controller could be designed, or if M diverges.
+        reason: why there is no error; empty if there is one.
+    """
+
+    parameters: dict[str, Any]
+    error: float | None
+    reason: str = ""
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Aspect1Report:
+    """What simulations of M show of its tasks and controllers. The system is never executed.
+
+    Attributes:
+        distance: the distance between the trajectory of M and its task.
+        units: its units; empty if they are not known.
+        threshold: the largest error with which a task counts as completed; None if there is none.
+        simulated: all tasks, the worst first; tasks without an error come before those with one.
+        verdict: the verdict on M against the threshold, with a bound over all tasks; None if there is no threshold.
+        share: the share of all tasks that M does not complete is at most this with confidence 0.95, because so many of
+            the independent draws among the simulated tasks exceed the threshold; None if there is no threshold.
+        distribution: the distribution of tasks as a text, under which the share is a probability; None if it is
+            uniform.
+        flips: how much the controllers of neighbouring tasks differ; None if no tasks are neighbours.
+        flipped: the parameters of two such tasks.
+        saturation: the share of the steps at which each input is at a limit; None if there are no inputs.
+        inputs: the labels of the inputs.
+        not_converged: the tasks whose design did not converge.
+        designs: the number of designs that tell whether they converged.
+    """
+
+    distance: Distance
+    units: str
+    threshold: float | None
+    simulated: tuple[SimulatedTask, ...]
+    verdict: Verdict | None
+    share: float | None
+    distribution: str | None
+    flips: Flips | None
+    flipped: tuple[dict[str, Any], dict[str, Any]] | None
+    saturation: Saturation | None
+    inputs: tuple[str, ...]
+    not_converged: tuple[dict[str, Any], ...]
+    designs: int
+
+    @property
+    def worst(self) -> SimulatedTask:
+        """The task that M completes worst."""
+        return self.simulated[0]
+
+    @property
+    def failed(self) -> tuple[SimulatedTask, ...]:
+        """The tasks without an error."""
+        return tuple(one for one in self.simulated if one.error is None)
+
+    @property
+    def exceeding(self) -> int:
+        """The number of simulated tasks that M does not complete: those above the threshold, and those that failed."""
+        limit = np.inf if self.threshold is None else self.threshold
+        return sum(one.error is None or one.error > limit for one in self.simulated)
+
+    @property
+    def completes(self) -> bool | None:
+        """Whether M completed all simulated tasks; None without a threshold, unless a task failed."""
+        return None if self.threshold is None and not self.failed else not self.exceeding
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all results as plain values."""
+        saturated = None if self.saturation is None else dict(zip(self.inputs, self.saturation.shares, strict=False))
+        return {
+            "distance": repr(self.distance),
+            "units": self.units,
+            "threshold": self.threshold,
+            "tasks": len(self.simulated),
+            "worst": asdict(self.worst),
+            "exceeding": self.exceeding if self.threshold is not None or self.failed else None,
+            "completes": self.completes,
+            "failed": [asdict(one) for one in self.failed],
+            "verdict": None if self.verdict is None else self.verdict.answer,
+            "bound": None if self.verdict is None else self.verdict.bound,
+            "share_at_most": self.share,
+            "distribution": self.distribution,
+            "flips": None if self.flips is None else {**asdict(self.flips), "example": self.flipped},
+            "saturation": {name: float(share) for name, share in saturated.items()} if saturated is not None else None,
+            "not_converged": list(self.not_converged),
+            "designs": self.designs,
+        }
+
+    def __repr__(self) -> str:
+        worst = self.worst.error if self.worst.error is not None else self.worst.reason
+        return call(self, tasks=len(self.simulated), worst=worst, threshold=self.threshold, completes=self.completes)
+
+
+def check(
+    validation: Validation,
+    *,
+    threshold: float | None = None,
+    distance: Distance | None = None,
+    tasks: int = TASKS,
+    search: Search | None = None,
+    seed: int = 0,
+) -> Aspect1Report:
+    """Search for the task that M itself completes worst, and look at the controllers. S is never executed.
+
+    Half of the tasks are independent draws from the distribution of tasks, and the search chooses the others.
+
+    Args:
+        validation: the map p -> d(p).
+        threshold: the largest error with which a task counts as completed, in the units of ``distance``.
+        distance: how far the trajectory of M is from completing its task; that of :func:`completion` by default.
+        tasks: number of simulated tasks.
+        search: chooses the tasks; Bayesian optimisation by default.
+        seed: seed of the search.
+
+    Raises:
+        InputError: if the tasks have neither a goal nor a reference and no distance is given, or if a number cannot be
+            used.
+        DistanceError: if the distance fails.
+    """
+    if not isinstance(tasks, int | np.integer) or isinstance(tasks, bool) or tasks < 2:
+        raise InputError(f"tasks must be an integer >= 2, got {tasks!r}.")
+    if threshold is not None:
+        require_threshold(threshold)
+    measured = completion(validation) if distance is None else distance
+    on_model = validation.on_model(measured, units=None if distance is None else "")
+    campaign = Campaign(on_model, search=by_name(SEARCH) if search is None else search, seed=seed)
+    with stage("simulating tasks on the model", tasks, "tasks"):
+        _simulate(campaign, int(tasks))
+    verdict = None
+    if threshold is not None and campaign.completed:
+        verdict = campaign.verdict(threshold, certificate=CertificateOptions(Posterior()))
+    return _report(campaign, measured, threshold, verdict, seed)
+
+
+def completion(validation: Validation) -> Distance:
+    """Return the distance of M from completing its task that belongs to the distance of a validation.
+
+    It has the norm, the states, the weights and the scales of that distance. For tasks with a goal it is
+    :class:`ctxval.distances.GoalError`, and for tasks with a changing reference
+    :class:`ctxval.distances.TrackingError`. If the distance compares all states, those are left out that the
+    synthesizer does not bring to a goal.
+
+    Raises:
+        InputError: if the tasks have neither a goal nor a reference.
+    """
+    space, own = validation.space, validation.distance
+    task = validation.task(space.parameters(0.5 * (space.low + space.high)))
+    if not isinstance(task, Task) or not task.has_goal:
+        raise InputError(
+            "the tasks have neither a goal nor a reference, so the model has nothing to complete: give a goal, or a "
+            "distance that measures how far a trajectory is from completing its task."
+        )
+    if isinstance(own, GoalError | TrackingError):
+        return own
+    shared: dict[str, Any] = {"norm": 2}
+    if isinstance(own, StateNorm):
+        shared = {name: getattr(own, name) for name in ("norm", "components", "weights", "scales", "angles")}
+    n = task.initial_state.shape[-1]
+    aimed = aimed_states(validation, n)
+    if shared.get("components") is None and shared.get("weights") is None and shared.get("scales") is None:
+        shared["components"] = tuple(aimed.tolist()) if 0 < len(aimed) < n else None
+    if (task.reference == task.goal[..., None, :]).all():
+        return GoalError(**shared)
+    return TrackingError(**shared, over="mean" if isinstance(own, MeanDeviation) else "maximum")
+
+
+def _simulate(campaign: Campaign, tasks: int) -> None:
+    """Run a campaign on M until so many tasks are simulated; a task without a closed loop counts, too."""
+    while (done := len(campaign.trials)) < tasks:
+        with warnings.catch_warnings(), contextlib.suppress(DesignError, ModelError):  # they are stored with the reason
+            warnings.simplefilter("ignore", GoalWarning)  # which is what the report says in detail
+            if done < tasks // 2:
+                campaign.audit(tasks // 2, lambda _: advance(), progress=False)
+            campaign.run(campaign.executions + tasks - len(campaign.trials), lambda _: advance(), progress=False)
+
+
+def _share(campaign: Campaign, threshold: float | None) -> float | None:
+    """Return the exact upper bound of Clopper and Pearson (1934) for the share of tasks that M does not complete."""
+    if threshold is None:
+        return None
+    drawn = [trial for trial in campaign.trials if trial.origin == "iid"]
+    missed = sum(trial.distance is None or trial.distance > threshold for trial in drawn)
+    return float(beta.ppf(CONFIDENCE, missed + 1, len(drawn) - missed)) if missed < len(drawn) else 1.0
+
+
+def _report(
+    campaign: Campaign, distance: Distance, threshold: float | None, verdict: Verdict | None, seed: int
+) -> Aspect1Report:
+    validation = campaign.validation
+    ordered = sorted(campaign.trials, key=lambda trial: -np.inf if trial.distance is None else -trial.distance)
+    simulated = tuple(
+        SimulatedTask(trial.parameters, trial.distance, text_of(trial.failure or "")) for trial in ordered
+    )
+    done = np.array([trial.unit_point for trial in ordered if trial.distance is not None])
+    points = _with_neighbours(done.reshape(-1, validation.space.dimension), np.random.default_rng([seed, 1]))
+    plans = _planned(validation, points, bool(getattr(validation.synthesizer, "batched", False)))
+    inputs = [plan.model_trajectory.inputs for plan in plans.values()]
+    kept = list(plans)
+    found = flips(points[kept], inputs) if len(kept) > 1 else None
+    where = [validation.space.describe_point(validation.space.from_unit(points[row])) for row in kept]
+    told = [converged_of(plan.controller) for plan in plans.values()]
+    return Aspect1Report(
+        distance=distance,
+        units=validation.labels.units,
+        threshold=threshold,
+        simulated=simulated,
+        verdict=verdict,
+        share=_share(campaign, threshold),
+        distribution=campaign.provenance.distribution,
+        flips=found,
+        flipped=None if found is None else (where[found.example[0]], where[found.example[1]]),
+        saturation=saturation(inputs, validation.synthesizer),
+        inputs=_input_labels(validation, list(plans.values())),
+        not_converged=tuple(one for one, ok in zip(where, told, strict=True) if ok is not None and not ok),
+        designs=sum(ok is not None for ok in told),
+    )
+
+
+def _with_neighbours(points: Array, rng: np.random.Generator) -> Array:
+    """Return points of the unit cube ``(N, d)``, the worst first, after neighbours of the worst and of spread ones."""
+    if not len(points):
+        return points
+    half = _NEIGHBOURS // 2
+    chosen = np.concatenate([points[:half], points[:: max(1, len(points) // half)][:half]])
+    directions = rng.normal(size=chosen.shape)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    # A step that would leave the cube goes the other way.
+    step = _BESIDE * np.sqrt(points.shape[1]) * directions
+    beside = np.where((chosen + step < 0) | (chosen + step > 1), chosen - step, chosen + step)
+    return np.concatenate([beside.clip(0, 1), chosen, points])
+
+
+def _planned(validation: Validation, points: Array, batched: bool) -> dict[int, Plan]:
+    """Return the plans of points by row, without those that fail; only the chosen ones if designs are slow."""
+    rows = list(range(len(points) if batched else min(len(points), 2 * _NEIGHBOURS)))
+    space = validation.space
+    try:
+        return dict(zip(rows, validation.plans(space.from_unit(points[rows])), strict=True)) if rows else {}
+    except CtxvalError:
+        pass
+    found = dict[int, Plan]()
+    for row in rows:
+        try:
+            found[row] = validation.plan(space.from_unit(points[row]))
+        except (DesignError, ModelError):
+            continue
+    return found
+
+
+def _input_labels(validation: Validation, plans: Sequence[Plan]) -> tuple[str, ...]:
+    if not plans:
+        return ()
+    one = plans[0].model_trajectory
+    return tuple(validation.names(one.states.shape[-1], one.inputs.shape[-1])[1])

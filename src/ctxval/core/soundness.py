@@ -1,0 +1,206 @@
+"""Whether controllers are sound on the model: whether they flip, saturate, and bring M to its goals.
+
+Reports ask this of executed tasks, and ``ctxval check --aspect1`` of simulated ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.representation import record
+from ctxval.core.controller import Limits, Synthesizer
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.validation import Validation
+
+NEAR = 0.1
+"""Two tasks are neighbours if they are nearer than this, in diagonals of the task space."""
+
+MISSED = 0.1
+"""M misses its goal if it ends farther away than this, as a share of the range of a state."""
+
+SATURATED = 0.01
+"""Least share of steps at a limit that is worth a note."""
+
+_FLIPPED = 0.5
+"""Controllers of neighbours flip if their inputs on M differ by more than this share of the range of the inputs, and as
+signals by more than this share of their size."""
+
+_SEVERAL = 3
+"""Number of steps of one execution at an extreme value from which this value is taken to be a limit."""
+
+
+@dataclass(frozen=True)
+class Flips:
+    """How much the controllers of neighbouring tasks differ.
+
+    Attributes:
+        pairs: number of pairs of neighbouring tasks.
+        flipped: number of pairs whose controllers differ abruptly.
+        largest: the largest difference between their inputs on M, as a share of the range of the inputs.
+        example: the tasks of the pair with the largest difference; of a flipped pair, if there is one.
+    """
+
+    pairs: int
+    flipped: int
+    largest: float
+    example: tuple[int, int]
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def flips(points: Array, inputs: Sequence[Array]) -> Flips | None:
+    """Return how much the controllers of neighbouring tasks differ; None if no tasks are neighbours.
+
+    A pair flips if the inputs differ at some time by more than half of their range, and as signals by more than half of
+    the sum of their norms. Two controllers that only leave a limit at another time are alike.
+
+    Args:
+        points: tasks, points of the unit cube ``(N, d)``.
+        inputs: the inputs on M of each task, shape ``(H, m)``.
+    """
+    near = KDTree(points / np.sqrt(points.shape[1])).query_pairs(NEAR)
+    pairs = [(i, j) for i, j in sorted(near) if inputs[i].shape == inputs[j].shape and inputs[i].size]
+    if not pairs:
+        return None
+    spans = ranges(inputs)
+    changes = [float((np.abs(inputs[i] - inputs[j]) / spans).max()) for i, j in pairs]
+    flipped = [
+        change > _FLIPPED and _contrast(inputs[i] / spans, inputs[j] / spans) > _FLIPPED
+        for change, (i, j) in zip(changes, pairs, strict=True)
+    ]
+    largest = max(range(len(pairs)), key=lambda k: (flipped[k], changes[k]))
+    return Flips(len(pairs), sum(flipped), changes[largest], pairs[largest])
+
+
+def _contrast(first: Array, second: Array) -> float:
+    """Return the norm of the difference of two signals, as a share of the sum of their norms."""
+    whole = float(np.linalg.norm(first) + np.linalg.norm(second))
+    return float(np.linalg.norm(first - second)) / whole if whole > 0 else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Saturation:
+    """How often inputs are at their limits.
+
+    Attributes:
+        shares: the share of the steps in which each input is at a limit, shape ``(m,)``.
+        known: whether the synthesizer states the limits; otherwise they are taken from the inputs themselves.
+    """
+
+    shares: Array
+    known: bool
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> Saturation | None:
+    """Return how often inputs are at their limits; None if there are no inputs.
+
+    If the synthesizer has no attribute ``limits``, the extreme values of all tasks are taken to be limits in those
+    tasks that stay there for several steps.
+
+    Args:
+        inputs: the inputs of each task, shape ``(H, m)``.
+        synthesizer: the synthesizer; None if it is not known.
+    """
+    executed = [one for one in inputs if one.size]
+    if not executed:
+        return None
+    together = np.concatenate(executed)
+    given = getattr(synthesizer, "limits", None)
+    if given is None:
+        return Saturation(_at_ends(executed, together).mean(axis=0), False)
+    spans, limits = np.maximum(np.ptp(together, axis=0), 1e-300), Limits.of(given, together.shape[-1])
+    at_limit = (together <= limits.low + 1e-6 * spans) | (together >= limits.high - 1e-6 * spans)
+    return Saturation(at_limit.mean(axis=0), True)
+
+
+def _at_ends(executed: Sequence[Array], together: Array) -> Mask:
+    """Return which inputs ``(N, m)`` are at an extreme value for several steps of one task."""
+    spans = np.maximum(np.ptp(together, axis=0), 1e-300)
+    low, high = together.min(axis=0) + 1e-9 * spans, together.max(axis=0) - 1e-9 * spans
+    parts = []
+    for inputs in executed:
+        at_ends = inputs <= low, inputs >= high
+        parts.append(np.logical_or(*(at & (at.sum(axis=0) >= _SEVERAL) for at in at_ends)) & (low < high))
+    return np.concatenate(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class GoalMisses:
+    """How far M ends from the goals of tasks, in the states that its controllers bring to a goal and d compares.
+
+    Attributes:
+        states: the indices of these states, shape ``(k,)``.
+        misses: the errors of the final states, shape ``(N, k)``.
+        shares: the errors as shares of the range of each state over all tasks, shape ``(N, k)``.
+    """
+
+    states: Rows
+    misses: Array
+    shares: Array
+
+    @property
+    def missed(self) -> Mask:
+        """The tasks in which M misses its goal, shape ``(N,)``."""
+        return np.asarray(self.shares.max(axis=1) > MISSED)
+
+    @property
+    def worst(self) -> tuple[int, int]:
+        """The task and the index in ``states`` with the largest share."""
+        row, column = np.unravel_index(int(self.shares.argmax()), self.shares.shape)
+        return int(row), int(column)
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def goal_misses(validation: Validation, on_model: Sequence[Trajectory], goals: Sequence[Array]) -> GoalMisses | None:
+    """Return how far M ends from its goals; None if it is not known which states are to reach a goal.
+
+    Args:
+        validation: the map p -> d(p), which is not executed.
+        on_model: the trajectories of M, at least one.
+        goals: the goal of each task, shape ``(n,)``.
+    """
+    aimed = aimed_states(validation, on_model[0].states.shape[-1])
+    if not len(aimed):
+        return None
+    spans = ranges([one.states for one in on_model])[aimed]
+    ends = np.array([one.final_state for one in on_model])
+    misses = np.abs(ends - np.array(goals))[:, aimed]
+    return GoalMisses(aimed, misses, misses / spans)
+
+
+def aimed_states(validation: Validation, count: int) -> Rows:
+    """Return the indices of the states that controllers bring to their goals; none if the synthesizer does not tell.
+
+    The attribute ``cost`` of the synthesizer tells them by the weights ``Q_final`` or ``Q``. If the distance compares
+    some states only (``components``), the others are left out.
+
+    Args:
+        validation: the map p -> d(p), which is not executed.
+        count: the number of states n.
+    """
+    cost = getattr(validation.synthesizer, "cost", None)
+    weights = getattr(cost, "Q_final", getattr(cost, "Q", None))
+    if weights is None or np.shape(weights) != (count, count):
+        return np.empty(0, dtype=np.intp)
+    compared = getattr(validation.distance, "components", None)
+    aimed = np.diag(weights) > 0
+    if compared is not None:
+        aimed = aimed & np.isin(np.arange(count), np.arange(count)[list(compared)])
+    return np.flatnonzero(aimed)
+
+
+def ranges(parts: Sequence[Array]) -> Array:
+    """Return the range of each column over arrays ``(H, k)``, shape ``(k,)``; it is never 0."""
+    ends = np.array([[part.min(axis=0), part.max(axis=0)] for part in parts if part.size])
+    return np.asarray(np.maximum(ends[:, 1].max(axis=0) - ends[:, 0].min(axis=0), 1e-300))

@@ -1,0 +1,143 @@
+"""A MuJoCo model as the model M, such as one that ``mujoco.sysid`` identified."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.extras import require_extra
+from ctxval._util.files import read_bytes
+from ctxval._util.registry import part
+from ctxval._util.representation import call
+from ctxval.core.trajectory import Transitions
+from ctxval.errors import InputError, ShapeError
+
+_SYSID = "params_x_hat.yaml"
+"""A file that ``mujoco.sysid.save_results`` writes beside the identified models."""
+
+_WHOLE = 1e-6
+"""Largest difference between a time step and a multiple of the timestep of MuJoCo, as a share of the latter."""
+
+
+@part(files=("mjcf",))
+class MuJoCo:
+    """An MJCF model as the model M. The state is ``(qpos, qvel)``, and the input is MuJoCo's ``ctrl``.
+
+    A step is a function of state and input alone: it starts without activations and without a warm start of the
+    constraint solver. A state at which MuJoCo warns (unstable state or acceleration) has no next state; it is NaN.
+
+    Args:
+        mjcf: the model as XML text, the path of its file, or the folder in which ``mujoco.sysid.save_results`` wrote
+            one identified model. Its pickle files are never read.
+        dt: length of a step in seconds, a multiple of the model's timestep; the timestep by default.
+        data: the transitions that the model was identified from, if they are known.
+
+    Raises:
+        InputError: if MuJoCo is not installed, the model cannot be read or compiled or has activations, or dt is not a
+            multiple of its timestep.
+    """
+
+    def __init__(self, mjcf: str | Path, *, dt: float | None = None, data: Transitions | None = None) -> None:
+        self._mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo")
+        self._mjcf, self._model = self._compiled(mjcf)
+        self.substeps = _substeps(float(self._model.opt.timestep), dt)
+        self.data = data
+        if self._model.na:
+            raise InputError(
+                f"the model has {self._model.na} activations, which are no part of the state (qpos, qvel)."
+            )
+
+    @property
+    def dt(self) -> float:
+        """Length of a step, seconds."""
+        return float(self._model.opt.timestep) * self.substeps
+
+    def _compiled(self, mjcf: str | Path) -> tuple[str, Any]:
+        path = None if isinstance(mjcf, str) and "<" in mjcf else identified_in(Path(mjcf))
+        try:
+            text = str(mjcf) if path is None else read_bytes(path).decode("utf-8")
+        except (InputError, UnicodeDecodeError) as error:
+            raise InputError(f"the MuJoCo model {str(mjcf)!r} cannot be read: {error}.") from error
+        loader = self._mujoco.MjModel
+        try:
+            return text, loader.from_xml_string(text) if path is None else loader.from_xml_path(str(path))
+        except ValueError as error:
+            raise InputError(f"MuJoCo cannot compile the model: {error}") from error
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
+
+        Raises:
+            ShapeError: if the number of states or inputs differs from the model's.
+        """
+        model, nq = self._model, self._model.nq
+        if (x.shape[-1], u.shape[-1]) != (nq + model.nv, model.nu):
+            raise ShapeError(
+                f"the model has {nq} qpos, {model.nv} qvel and {model.nu} inputs, "
+                f"got {x.shape[-1]} states and {u.shape[-1]} inputs."
+            )
+        batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+        states = np.broadcast_to(x, (*batch, x.shape[-1])).reshape(-1, x.shape[-1])
+        inputs = np.broadcast_to(u, (*batch, u.shape[-1])).reshape(-1, u.shape[-1])
+        reached = np.full(states.shape, np.nan)
+        data = self._mujoco.MjData(model)
+        for k in np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1)).tolist():
+            self._mujoco.mj_resetData(model, data)
+            data.qpos, data.qvel, data.ctrl = states[k, :nq], states[k, nq:], inputs[k]
+            self._mujoco.mj_step(model, data, self.substeps)
+            if not data.warning.number.any():
+                reached[k] = np.concatenate([data.qpos, data.qvel])
+        return reached.reshape(*batch, -1)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this model in a store."""
+        digest = hashlib.sha256(self._mjcf.encode()).hexdigest()[:16]
+        return {"mjcf": digest, "mass": self._model.body_mass.tolist(), "substeps": self.substeps}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the module, which another process imports itself."""
+        return {name: value for name, value in vars(self).items() if name != "_mujoco"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ = {**state, "_mujoco": require_extra("mujoco", "mujoco", "models of MuJoCo")}
+
+    def __repr__(self) -> str:
+        sizes = {name: int(getattr(self._model, name)) for name in ("nq", "nv", "nu")}
+        return call(self, **sizes, dt=self.dt, transitions=None if self.data is None else len(self.data))
+
+
+def identified_in(path: Path) -> Path:
+    """Return the file of a model: the path itself, or the only identified model in a folder of ``mujoco.sysid``.
+
+    Raises:
+        InputError: if the folder is none of ``mujoco.sysid``, or has several models.
+    """
+    if not path.is_dir():
+        return path
+    found = sorted(path.glob("*.xml"))
+    if not (path / _SYSID).is_file() or not found:
+        raise InputError(f"the folder {path} has no result of mujoco.sysid: {_SYSID} and an XML file are needed.")
+    if len(found) > 1:
+        names = ", ".join(one.name for one in found)
+        raise InputError(f"the folder {path} has several identified models, {names}: name one of the files.")
+    return found[0]
+
+
+def is_sysid_result(path: Path) -> bool:
+    """Return whether a path is a folder that ``mujoco.sysid.save_results`` wrote."""
+    return path.is_dir() and (path / _SYSID).is_file()
+
+
+def _substeps(timestep: float, dt: float | None) -> int:
+    if dt is None:
+        return 1
+    if not isinstance(dt, int | float) or isinstance(dt, bool) or not dt > 0:
+        raise InputError(f"dt must be a positive number of seconds, got {dt!r}.")
+    ratio = dt / timestep
+    if round(ratio) < 1 or abs(ratio - round(ratio)) > _WHOLE * max(1.0, ratio):
+        raise InputError(f"dt must be a multiple of the model's timestep, {timestep:g} s, got {dt:g} s.")
+    return round(ratio)

@@ -1,0 +1,186 @@
+"""MuJoCo models as M, and results of ``mujoco.sysid``, written by that library itself."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, systems, testing
+from ctxval.cli import app
+from ctxval.config.parts import part
+from ctxval.data import recordings_of
+from ctxval.data.log import MemoryTable
+from ctxval.errors import InputError, ShapeError
+from ctxval.fitting import fit
+
+mujoco = pytest.importorskip("mujoco")
+
+DT = 0.02
+
+
+def mjcf(damping: float) -> str:
+    """A pendulum with a torque motor; the damping is what is to be identified."""
+    return f"""<mujoco><option timestep="0.005"/><worldbody><body>
+      <joint name="hinge" type="hinge" axis="0 1 0" damping="{damping}"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.5"/>
+    </body></worldbody><actuator><motor name="motor" joint="hinge"/></actuator>
+    <sensor><jointpos name="angle" joint="hinge"/></sensor></mujoco>"""
+
+
+def recorded(seed: int = 0, steps: int = 150, damping: float = 0.08) -> Trajectory:
+    """Return a run of the true pendulum, recorded every 0.02 s."""
+    model = mujoco.MjModel.from_xml_string(mjcf(damping))
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+    data.qpos[0] = rng.uniform(-1, 1)
+    inputs, states = np.repeat(0.3 * rng.normal(size=(steps // 10, 1)), 10, axis=0), []
+    for u in inputs:
+        states.append([data.qpos[0], data.qvel[0]])
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data, 4)
+    states.append([data.qpos[0], data.qvel[0]])
+    return Trajectory(DT * np.arange(steps + 1), np.array(states), inputs)
+
+
+def identified(folder: Path, one: Trajectory, start: float = 0.02) -> None:
+    """Identify the damping with mujoco.sysid, and let it save its results."""
+    pytest.importorskip("absl")
+    from mujoco import sysid
+
+    spec = mujoco.MjSpec.from_string(mjcf(start))
+    model = spec.compile()
+
+    def modify(spec: Any, parameter: Any) -> None:
+        spec.joint("hinge").damping[0] = float(parameter.value[0])
+
+    damping = sysid.Parameter("damping", start, 0.0, 1.0, modifier=modify)
+    times = one.times[:-1]
+    group = sysid.ModelSequences(
+        "pendulum",
+        spec,
+        "run",
+        sysid.create_initial_state(model, one.states[0, :1], one.states[0, 1:]),
+        sysid.TimeSeries.from_control_names(times, one.inputs, model),
+        sysid.TimeSeries.from_names(times, one.states[:-1, :1], model),
+    )
+    initial = sysid.ParameterDict({"damping": damping})
+    residual = sysid.build_residual_fn(models_sequences=[group])
+    found, result = sysid.optimize(initial, residual, optimizer="scipy", verbose=False)
+    found["damping"].apply_modifier(group.spec)
+    sysid.save_results(folder, [group], initial, found, result, residual)
+
+
+def test_a_step_is_that_of_mujoco_in_any_batch() -> None:
+    model, one = models.MuJoCo(mjcf(0.08), dt=DT), recorded()
+    assert model.dt == pytest.approx(DT)
+    moves = one.transitions()
+    np.testing.assert_allclose(model.step(moves.x, moves.u), moves.x_next, atol=1e-12)
+    testing.check_model(model, states=2, inputs=1)
+    assert model.step(np.zeros((3, 1, 2)), np.zeros((1, 4, 1))).shape == (3, 4, 2)
+
+
+def test_a_state_that_is_not_finite_or_at_which_mujoco_warns_has_no_next_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings into the working directory
+    model = models.MuJoCo(mjcf(0.0), dt=DT)
+    states = np.array([[0.1, 0.0], [np.nan, 0.0], [0.0, 1e12]])
+    reached = model.step(states, np.zeros((3, 1)))
+    assert np.isfinite(reached).all(axis=1).tolist() == [True, False, False]
+
+
+def test_it_is_the_model_of_a_campaign_and_repeats_itself_in_a_store(tmp_path: Path) -> None:
+    validation = Validation(
+        space=TaskSpace(goal=(-1.0, 1.0, "rad")),
+        task=lambda p: Task([0.0, 0.0], goal=[p.goal, 0.0], horizon=20, dt=DT),
+        system=systems.MuJoCo(mjcf(0.08), substeps=4),
+        model=models.MuJoCo(mjcf(0.02), dt=DT),
+        synthesizer=controllers.LQR([1.0, 0.1], [0.1]),
+        distance=distances.FinalState(components=[0]),
+    )
+    assert Campaign(validation, store=tmp_path / "a.sqlite").run(2).worst is not None
+    assert len(Campaign(validation, store=tmp_path / "a.sqlite").run(3).completed) == 3
+    exact = validation.with_model(models.MuJoCo(mjcf(0.08), dt=DT))
+    assert exact.outcome([0.7]).distance == pytest.approx(0, abs=1e-9)
+    again = pickle.loads(pickle.dumps(validation.model))
+    np.testing.assert_array_equal(again.step(np.ones(2), np.ones(1)), validation.model.step(np.ones(2), np.ones(1)))
+
+
+@pytest.mark.parametrize(
+    ("given", "options", "said"),
+    [
+        ("<mujoco>", {}, "MuJoCo cannot compile the model"),
+        (mjcf(0.1), {"dt": 0.0125}, "dt must be a multiple of the model's timestep, 0.005 s, got 0.0125 s"),
+        (mjcf(0.1), {"dt": -1}, "dt must be a positive number"),
+        ("missing.xml", {}, "missing.xml"),
+        (
+            mjcf(0.1).replace("<motor name", '<general dyntype="integrator" name'),
+            {},
+            "the model has 1 activations, which are no part of the state",
+        ),
+    ],
+)
+def test_what_cannot_be_a_model_is_refused(given: str, options: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        models.MuJoCo(given, **options)
+
+
+def test_states_and_inputs_have_the_numbers_of_the_model() -> None:
+    with pytest.raises(ShapeError, match="1 qpos, 1 qvel and 1 inputs, got 3 states and 1 inputs"):
+        models.MuJoCo(mjcf(0.1)).step(np.zeros(3), np.zeros(1))
+
+
+@pytest.mark.slow
+def test_the_result_of_mujoco_sysid_is_a_model_with_its_held_out_error(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    runs = [recorded(seed) for seed in range(4)]
+    identified(tmp_path / "result", runs[0])
+    assert (tmp_path / "result" / "params_x_hat.yaml").exists()
+    model = models.MuJoCo(tmp_path / "result", dt=DT)
+    moves = runs[1].transitions()
+    assert np.abs(model.step(moves.x, moves.u) - moves.x_next).max() < 1e-3
+    assert np.abs(models.MuJoCo(mjcf(0.02), dt=DT).step(moves.x, moves.u) - moves.x_next).max() > 1e-2
+    # The pickles that mujoco.sysid writes beside it are never read.
+    (tmp_path / "result" / "results.pkl").write_bytes(b"cos\nsystem\n(S'false'\ntR.")
+    logs = [
+        MemoryTable(str(k), {"t": one.times, "x": one.states, "u": np.append(one.inputs, [[np.nan]], axis=0)})
+        for k, one in enumerate(runs)
+    ]
+    report = fit(recordings_of(logs), ["linear"], given=model)
+    assert [one.kind for one in report.fitted] == ["given", "linear"]
+    assert report.fitted[0].relative < 0.01 < report.fitted[1].relative
+    for k, one in enumerate(runs):
+        one.to_csv(f"run{k}.csv")
+    files = [f"run{k}.csv" for k in range(4)]
+    done = CliRunner().invoke(app, ["fit", *files, "--kind", "linear", "--given", "result", "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["fitted"][0]["kind"] == "given"
+    shown = CliRunner().invoke(app, ["replay", *files, "--model", "result", "--json"])
+    assert shown.exit_code == 0, shown.output
+    assert max(one["relative"] for one in json.loads(shown.stdout)["errors"] if one["steps"] == 1) < 0.01
+    assert part("model", {"type": "MuJoCo", "mjcf": "result", "dt": DT}, tmp_path).dt == pytest.approx(DT)
+
+
+def test_a_given_model_with_another_time_step_or_size_is_a_failed_fit() -> None:
+    one = recorded()
+    log = MemoryTable("a", {"t": one.times, "x": one.states, "u": np.append(one.inputs, [[np.nan]], axis=0)})
+    report = fit(recordings_of([log]), ["linear"], given=models.MuJoCo(mjcf(0.1)))
+    assert [one.kind for one in report.fitted] == ["linear"]
+    assert report.failed[0].reason == "the given model has steps of 0.005 s and the recordings have steps of 0.02 s."
+    wrong = fit(recordings_of([log]), ["linear"], given=models.Linear(np.eye(3), np.zeros((3, 1))))
+    assert [one.kind for one in wrong.failed] == ["given"]
+
+
+def test_a_folder_must_have_one_identified_model(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"has no result of mujoco.sysid: params_x_hat.yaml and an XML file"):
+        models.MuJoCo(tmp_path)
+    (tmp_path / "params_x_hat.yaml").write_text("{}")
+    for name in ("a.xml", "b.xml"):
+        (tmp_path / name).write_text(mjcf(0.1))
+    with pytest.raises(InputError, match=r"several identified models, a.xml, b.xml: name one of the files"):
+        models.MuJoCo(tmp_path)
