@@ -63,6 +63,10 @@ calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/
 	$(BIN)/python benchmarks/study_retrain.py
 	$(BIN)/python benchmarks/calibration_page.py
 
+compare-study: .venv/.test  ## how many executions comparisons need; writes docs/comparison.md, and resumes
+	$(BIN)/python benchmarks/study_compare.py
+	$(BIN)/python benchmarks/compare_page.py
+
 posterior-ranks: .venv/.test  ## are draws of the learned dynamics as uncertain as they should be? Resumes
 	$(BIN)/python benchmarks/study_posterior_ranks.py
 

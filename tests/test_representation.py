@@ -20,6 +20,7 @@ import ctxval
 from conftest import make_validation
 from ctxval import (
     Campaign,
+    Comparison,
     Experiment,
     Labels,
     Normal,
@@ -33,6 +34,7 @@ from ctxval import (
     Validation,
     Verdict,
     certificates,
+    comparison,
     controllers,
     data,
     distances,
@@ -64,6 +66,7 @@ PACKAGES = (
     ".certificates",
     ".data",
     ".fitting",
+    ".comparison",
     ".replay",
     ".testing",
     ".report",
@@ -228,6 +231,14 @@ def recordings() -> data.Recordings:
 
 
 @functools.cache
+def compared() -> Comparison:
+    one, other = (
+        comparison.CandidateResult(name, 9, 2, 0, 0.1, {"goal": 0.5}, 0.12, 4, 0.05) for name in ("gp", "linear")
+    )
+    pair = comparison.PairResult("mean", "gp", "linear", "gp", "the interval excludes 0", -0.1, -0.2, -0.05, 9, 0.1)
+    return Comparison((one, other), (pair,), 0.95, 18, 100, "m", ("the system does not change",))
+
+
 def replayed() -> replay.ReplayReport:
     return replay.replay(LINEAR, recordings(), steps=[1])
 
@@ -241,6 +252,7 @@ def fitted() -> fitting.FitReport:
 
 EXAMPLES: dict[str, Callable[[], object]] = {
     "Campaign": campaign,
+    "Comparison": compared,
     "Experiment": lambda: Experiment("pendulum", make_validation(), threshold=0.5, units="rad"),
     "Labels": lambda: Labels(("angle [rad]", "rate [rad/s]"), ("torque [N m]",), "rad"),
     "OpenTrial": lambda: Campaign(make_validation()).ask({"goal": 0.5}),
@@ -376,6 +388,9 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "fitting.FitReport": fitted,
     "fitting.FittedModel": lambda: fitted().fitted[0],
     "fitting.FittedParameter": lambda: fitting.FittedParameter("mass", 1.2, 1.1, 1.3, "at its upper bound"),
+    "comparison.CandidateResult": lambda: compared().candidates[0],
+    "comparison.Comparison": compared,
+    "comparison.PairResult": lambda: compared().pairs[0],
     "replay.PredictedTask": lambda: replay.PredictedTask({"goal": 1.5}, 0.4, 0.3, 0.6, 0.9),
     "replay.PredictedTasks": lambda: replay.PredictedTasks((), 0.4, 0.6, (), 64, 0.0, 0.1, 1),
     "replay.RecordedData": lambda: replayed().data,

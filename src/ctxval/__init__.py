@@ -13,6 +13,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.registry import part
 from ctxval.campaign import Campaign, OpenTrial
 from ctxval.certificates.verdict import Verdict
+from ctxval.comparison import Comparison, compare
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import Labels
 from ctxval.core.plan import Outcome, Plan
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from ctxval import aspect1 as aspect1
     from ctxval import cases as cases
     from ctxval import certificates as certificates
+    from ctxval import comparison as comparison
     from ctxval import controllers as controllers
     from ctxval import data as data
     from ctxval import distances as distances
@@ -51,6 +53,7 @@ __version__ = VERSION
 __all__ = [
     "Array",
     "Campaign",
+    "Comparison",
     "Experiment",
     "Labels",
     "Normal",
@@ -68,6 +71,7 @@ __all__ = [
     "Validation",
     "Verdict",
     "cached_truth",
+    "compare",
     "grid_truth",
     "part",
     "rollout",
@@ -78,6 +82,7 @@ _SUBMODULES = (
     "aspect1",
     "cases",
     "certificates",
+    "comparison",
     "controllers",
     "data",
     "distances",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -60,6 +60,8 @@ class CampaignDynamics:
 
     Attributes:
         experiment: a digest of the description; a stored prediction belongs to one experiment.
+        elsewhere: returns recordings of the same system that belong to no trial of this campaign. They teach the
+            dynamics, and they are no executions of this model's controllers.
     """
 
     def __init__(self, validation: Validation, store: Store, seed: int, description: Mapping[str, Any]) -> None:
@@ -67,23 +69,36 @@ class CampaignDynamics:
         self.experiment = hashlib.sha256(text.encode()).hexdigest()[:16]
         self._study = DynamicsStudy(validation, seed)
         self._store = store
-        self._learned: dict[tuple[int, ...], LearnedDynamics | None] = {}
+        self.elsewhere: Callable[[], Sequence[Trajectory]] = tuple
+        self._learned: dict[tuple[int, ...], tuple[Sequence[Trajectory], LearnedDynamics | None]] = {}
 
-    def learned(self, trials: Sequence[Trial]) -> LearnedDynamics | None:
-        """Return what the completed trials teach; None if they teach nothing."""
-        executed = executed_trials(self._store, trials)
-        key = tuple(trial.number for trial, _ in executed)
+    def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
+        """Return what the completed trials teach; None if they teach nothing.
+
+        Args:
+            trials: the trials.
+            alone: leave out the recordings from elsewhere, which may be later than these trials.
+        """
+        executed, others = executed_trials(self._store, trials), () if alone else self.elsewhere()
+        # The recordings are kept with what they taught, so that their identities stay theirs.
+        key = (*(trial.number for trial, _ in executed), -1, *map(id, others))
         if key not in self._learned:
             if len(self._learned) == _REMEMBERED:
                 del self._learned[next(iter(self._learned))]
-            self._learned[key] = self._learn(executed)
-        return self._learned[key]
+            self._learned[key] = others, self._learn(executed, others)
+        return self._learned[key][1]
 
-    def predict(self, trials: Sequence[Trial], point: Array) -> ExecutionPrediction | None:
-        """Return the prediction of the execution of a task from completed trials; None if nothing can be predicted."""
+    def predict(self, trials: Sequence[Trial], point: Array, *, alone: bool = False) -> ExecutionPrediction | None:
+        """Return the prediction of the execution of a task from completed trials; None if nothing can be predicted.
+
+        Args:
+            trials: the trials.
+            point: the task, a point of the unit cube ``(d,)``.
+            alone: as in :meth:`learned`.
+        """
         try:
             with stage("predicting the execution", unit="closed loops"):
-                learned = self.learned(trials)
+                learned = self.learned(trials, alone=alone)
                 return None if learned is None else learned.predict(point)
         except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
             return None
@@ -141,9 +156,11 @@ class CampaignDynamics:
             number if label == none else label for number, none, label in zip(numbered, unnamed, labels, strict=True)
         )
 
-    def _learn(self, executed: Sequence[tuple[Trial, Trajectory]]) -> LearnedDynamics | None:
+    def _learn(
+        self, executed: Sequence[tuple[Trial, Trajectory]], others: Sequence[Trajectory]
+    ) -> LearnedDynamics | None:
         try:
-            return self._study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed])
+            return self._study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed], others)
         except Exception:  # the same
             return None
 
@@ -159,9 +176,9 @@ class CampaignDynamics:
             stored = self._stored(trial)
             prediction = stored
             if stored is None and place >= len(completed) - _RECOMPUTED:
-                if self.learned(before) is None:
+                if self.learned(before, alone=True) is None:
                     continue
-                prediction = self.predict(before, trial.unit_point)
+                prediction = self.predict(before, trial.unit_point, alone=True)
             elif stored is None:
                 continue
             found.append(self._compared(trial, prediction, before, stored is not None))

@@ -38,16 +38,16 @@ class IndependentDraws:
 
     def search_seed(self, trials: Sequence[Trial]) -> int:
         """Return the seed of a search whose points are all independent draws."""
-        entropy = [self._seed, *self._of_model(trials)]
+        entropy = [self._seed, *self.of_model(trials)]
         return self._seed if len(entropy) == 1 else int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     def point(self, trials: Sequence[Trial]) -> Array:
         """Return the next draw from the distribution of tasks, a point of the unit cube ``(d,)``."""
-        entropy = [self._seed, len(trials), _AUDIT, *self._of_model(trials)]
+        entropy = [self._seed, len(trials), _AUDIT, *self.of_model(trials)]
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
         return np.asarray(self._validation.space.unit_draws(1, rng)[0])
 
-    def _of_model(self, trials: Sequence[Trial]) -> list[int]:
+    def of_model(self, trials: Sequence[Trial]) -> list[int]:
         """Return the number of the model in a list; empty for stores of version 0.1.0 that have draws without it."""
         kept = self._store.draws()
         if kept is None and not any(trial.origin == "iid" for trial in trials):

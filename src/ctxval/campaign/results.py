@@ -38,6 +38,11 @@ class CampaignResults:
         self._recorder = recorder
 
     @property
+    def recorder(self) -> TrialRecorder:
+        """The recorder of the trials, for code that chooses the tasks of several campaigns."""
+        return self._recorder
+
+    @property
     def validation(self) -> Validation:
         """The map p -> d(p), with the present distance function."""
         return self._recorder.validation

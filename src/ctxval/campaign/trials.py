@@ -139,7 +139,9 @@ class TrialRecorder:
     def redefine(self, validation: Validation, description: dict[str, Any]) -> None:
         """Continue with another distance, after its values were stored."""
         self.validation, self.description = validation, description
+        elsewhere = self.dynamics.elsewhere
         self.dynamics = CampaignDynamics(validation, self.store, self._seed, description)
+        self.dynamics.elsewhere = elsewhere
         self._proposals = Proposals(validation, self.search, self.store)
         self.replay()
 
@@ -209,6 +211,7 @@ class TrialRecorder:
         if choice.unit_point is None:
             origin = self._origin()
             unit_point, note = self._proposals.next(self._trials)
+            note = {**(note or {}), **choice.note} if choice.note else note
         else:
             unit_point, origin, note = choice.unit_point, choice.origin, choice.note
             self.search.tell(unit_point[None], [np.nan])

@@ -1,6 +1,6 @@
 """The command line: a thin skin over the public interface."""
 
-from ctxval.cli import certify, collect, files, fit, hand, paper, remeasure, replay, report, run, serve, stores
+from ctxval.cli import certify, collect, compare, files, fit, hand, paper, remeasure, replay, report, run, serve, stores
 from ctxval.cli.base import app
 from ctxval.cli.screen import print_anything
 
@@ -8,6 +8,7 @@ __all__ = [
     "app",
     "certify",
     "collect",
+    "compare",
     "files",
     "fit",
     "hand",

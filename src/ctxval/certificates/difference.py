@@ -1,0 +1,245 @@
+r"""The sign of an expected difference of two distances, by a test that may stop at any time.
+
+Independent tasks are executed with both candidates, one after the other. Let D_i be the difference of the two
+distances of task i, h_i a prediction of it that was fixed before the task was drawn, and mu_i the mean of h_i over
+tasks that were drawn for this purpose only. Then
+
+    X_i = D_i - w_i (h_i - mu_i)
+
+has the expected difference as its mean given all earlier tasks, whatever the prediction is, if the weight w_i follows
+from earlier tasks. So the predictions may improve from task to task. This is prediction-powered inference
+(Angelopoulos et al. 2023, Science 382) in a sequential form; Kilian, Cortinovis and Caron (arXiv 2505.18000) have
+another one.
+
+The mean m is rejected if the wealth of bets against it reaches 2 / beta, on either side (Ville's inequality). All bets
+follow from earlier tasks. There are two kinds:
+
+- If no distance can exceed a stated number, X_i is bounded, and the bets are linear (Waudby-Smith and Ramdas 2024,
+  JRSS B 86). The wealth is then a nonnegative supermartingale, and the test is valid for any distribution.
+- Otherwise no test of a mean is valid for every distribution in finite samples (Bahadur and Savage 1956). A bet
+  multiplies the wealth by 1 + k tanh(b_i (X_i - m) / k), with b_i of the order of 1 / sqrt(i log i) standard
+  deviations. This is exact if X_i is symmetric about its mean, as a sign test is. As b_i decreases, asymmetry adds only
+  a convergent sum of third moments to the logarithm of the wealth, so that it matters less and less, as in asymptotic
+  confidence sequences (Waudby-Smith et al. 2024, Annals of Statistics 52).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Mask
+from ctxval._util.representation import record
+
+_CAUTION = 0.75
+"""Largest bet on bounded differences, as a share of that with which one task could lose everything."""
+
+_LARGEST = 0.9
+"""Largest gain or loss of one bet on unbounded differences, as a share of the wealth."""
+
+_REFINED = 60
+"""Number of bisections of the end of an interval."""
+
+_FEW = 4
+"""If there are fewer earlier tasks, all of them count as recent."""
+
+_FARTHEST = 1e6
+"""The ends of an interval are searched within this many standard deviations of the estimate."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairedDifferences:
+    """Differences of two distances at independent tasks, in the order of drawing.
+
+    Attributes:
+        values: differences D_i, shape ``(N,)``.
+        predicted: what was predicted for each of them before its task was drawn, minus the mean of this prediction over
+            other tasks, shape ``(N,)``; 0 if nothing was predicted.
+        most: a number that no distance can exceed, so that differences and predictions lie within +- most; None if none
+            is known.
+    """
+
+    values: Array
+    predicted: Array
+    most: float | None = None
+
+    @property
+    def corrected(self) -> Array:
+        """The differences X_i with the prediction as control variate, shape ``(N,)``."""
+        return np.asarray(self.values - self._weights * self.predicted)
+
+    @property
+    def _weights(self) -> Array:
+        """The slope of differences against predictions among the recent earlier tasks, from 0 to 1, ``(N,)``."""
+        d, h = self.values, self.predicted
+        sums = [_recent_sum(part) for part in (d, h, d * h, h**2)]
+        count = _recent_sum(np.ones(len(d)))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            slope = (sums[2] - sums[0] * sums[1] / count) / (sums[3] - sums[1] ** 2 / count)
+        return np.asarray(np.where(np.isfinite(slope) & (count >= 3), np.clip(slope, 0.0, 1.0), 1.0))
+
+    def log_wealth(self, mean: Array, *, above: bool) -> Array:
+        """Return the logarithm of the largest wealth so far, of bets that the mean is not the given one.
+
+        Args:
+            mean: means that are bet against, shape ``(...)``.
+            above: bet that the true mean is above; else below.
+
+        Returns:
+            shape ``(..., N)``; it never decreases along the last axis.
+        """
+        sign = 1.0 if above else -1.0
+        against = sign * np.asarray(mean, dtype=np.float64)[..., None]
+        if self.most is None:
+            # Predictions improve from task to task; without any, all earlier tasks show the scale.
+            wealth = _by_symmetry(sign * self.corrected - against, recent=bool(np.any(self.predicted)))
+        else:
+            centred = self._weights * self.predicted
+            plain = _by_bound(sign * self.values, against, -self.most * np.ones(len(self.values)), self.most)
+            # The prediction minus its mean lies within +- 2 most, whatever the mean is.
+            lowest = -self.most * (1 + 2 * self._weights)
+            powered = _by_bound(sign * (self.values - centred), against, lowest, self.most)
+            wealth = np.logaddexp(plain, powered) - np.log(2)
+        return np.asarray(np.maximum.accumulate(np.maximum(wealth, 0.0), axis=-1))
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True)
+class MeanDifference:
+    """The expected difference of two distances, as far as the tasks so far tell.
+
+    Attributes:
+        estimate: the estimate; None if there is no task.
+        low, high: the ends of the confidence sequence; infinite if nothing is known.
+        sign: 1 if the expected difference is above 0, -1 if it is below, 0 if this is not decided.
+        decided_after: the number of tasks after which the sign was decided; None if it is not.
+        tasks: the number of tasks.
+        variance_left: the variance of the later half of the corrected differences, as a share of the variance of the
+            differences; 1 if the predictions do not help, None if there are too few tasks.
+    """
+
+    estimate: float | None
+    low: float
+    high: float
+    sign: int
+    decided_after: int | None
+    tasks: int
+    variance_left: float | None
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def mean_difference(differences: PairedDifferences, beta: float) -> MeanDifference:
+    """Return the expected difference, with an interval and a decision that hold together at all numbers of tasks.
+
+    Args:
+        differences: the differences.
+        beta: the probability with which the interval may ever be wrong.
+    """
+    count = len(differences.values)
+    if not count:
+        return MeanDifference(None, -np.inf, np.inf, 0, None, 0, None)
+    level, corrected = float(np.log(2 / beta)), differences.corrected
+    crossed = [_first(differences.log_wealth(np.array(0.0), above=above) >= level) for above in (True, False)]
+    sign, after = _decision(*crossed)
+    centre = _centre(corrected)
+    low, high = (_end(differences, centre, level, above=above) for above in (True, False))
+    spread = float(differences.values.var())
+    recent = corrected[count // 2 :]
+    left = min(1.0, float(recent.var()) / spread) if count > _FEW and spread > 0 else None
+    estimate = float(np.clip(centre, low, high))
+    return MeanDifference(estimate, low, high, sign, after, count, left)
+
+
+def _centre(corrected: Array) -> float:
+    """Return the mean of the corrected differences, each weighted by the inverse size of the earlier deviations."""
+    middle = np.concatenate([[corrected[0]], (np.cumsum(corrected) / np.arange(1, len(corrected) + 1))[:-1]])
+    size = _recent_size(corrected - middle)
+    weights = np.where(np.isfinite(size) & (size > 0), 1 / np.where(size > 0, size, 1.0), 0.0)
+    weights[:2] = 0.0  # nothing is known of the deviations yet
+    return float(np.average(corrected, weights=weights) if weights.any() else corrected.mean())
+
+
+def _decision(above: int | None, below: int | None) -> tuple[int, int | None]:
+    """Return the sign that was decided first, and after how many tasks."""
+    if above is None and below is None:
+        return 0, None
+    if below is None or (above is not None and above < below):
+        return 1, above
+    return -1, below
+
+
+def _first(reached: Mask) -> int | None:
+    """Return how many tasks there were when a condition was first true; None if it never was."""
+    found = np.flatnonzero(reached)
+    return int(found[0]) + 1 if len(found) else None
+
+
+def _by_symmetry(centred: Array, *, recent: bool) -> Array:
+    """Return the log wealth of bets on values that are symmetric about 0 or lower, ``(..., N)``.
+
+    A bet is measured in root mean squares of the earlier values, or of the recent ones among them. The first value only
+    sets this scale.
+    """
+    before = np.arange(centred.shape[-1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        of_all = np.sqrt((np.cumsum(centred**2, axis=-1) - centred**2) / before)
+        scale = _recent_size(centred) if recent else of_all
+        bets = np.sqrt(2 * np.log(20.0) / (np.maximum(before, 1) * np.log1p(np.maximum(before, 1)))) / scale
+    gain = np.where(np.isfinite(bets), bets, 0.0) * centred
+    return np.asarray(np.cumsum(np.log1p(_LARGEST * np.tanh(gain / _LARGEST)), axis=-1))
+
+
+def _recent_sum(values: Array) -> Array:
+    """Return for each task the sum over the later half of the earlier tasks, ``(..., N)``; over all if they are few.
+
+    Predictions improve from task to task, so the latest tasks show best what the next one will be like.
+    """
+    ends = np.arange(values.shape[-1])
+    starts = np.where(ends >= _FEW, ends // 2, 0)
+    sums = np.concatenate([np.zeros((*values.shape[:-1], 1)), np.cumsum(values, axis=-1)], axis=-1)
+    return np.asarray(sums[..., ends] - sums[..., starts])
+
+
+def _recent_size(values: Array) -> Array:
+    """Return for each task the root mean square of the recent earlier values, ``(..., N)``; NaN for the first task."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean_square = _recent_sum(values**2) / _recent_sum(np.ones(values.shape[-1]))
+    return np.sqrt(np.maximum(mean_square, 0.0))
+
+
+def _by_bound(values: Array, mean: Array, lowest: Array, most: float) -> Array:
+    """Return the log wealth of bets that values above ``lowest`` have a mean above the given one, ``(..., N)``."""
+    count = np.arange(1, len(values) + 1)
+    deviations = (values - np.cumsum(values) / (count + 1)) ** 2
+    spread = (most**2 / 16 + np.cumsum(deviations) - deviations) / count
+    wanted = np.sqrt(2 * np.log(20.0) / (spread * count * np.log1p(count)))
+    room = np.maximum(mean - lowest, 1e-300)
+    gain = np.minimum(wanted, _CAUTION / room) * (values - mean)
+    return np.asarray(np.cumsum(np.log1p(np.maximum(gain, -_CAUTION)), axis=-1))
+
+
+def _end(differences: PairedDifferences, centre: float, level: float, *, above: bool) -> float:
+    """Return the lower end (bets above) or the upper end of the interval: the outermost mean that is not rejected."""
+    sign = 1.0 if above else -1.0
+    size = float(np.abs(differences.corrected - centre).mean()) or abs(centre) or 1.0
+    outermost = _FARTHEST * size if differences.most is None else differences.most + sign * centre
+    steps = outermost * np.concatenate([np.geomspace(1, 1e-9, 400), [0.0]])
+
+    def kept(means: Array) -> Array:
+        return np.asarray(differences.log_wealth(means, above=above)[..., -1] < level)
+
+    inside = np.flatnonzero(kept(centre - sign * steps))
+    if not len(inside):
+        return centre
+    if not inside[0]:
+        return -sign * np.inf if differences.most is None else -sign * differences.most
+    outer, inner = centre - sign * steps[inside[0] - 1], centre - sign * steps[inside[0]]
+    for _ in range(_REFINED):
+        middle = 0.5 * (outer + inner)
+        outer, inner = (outer, middle) if kept(np.array(middle)) else (middle, inner)
+    return float(outer)

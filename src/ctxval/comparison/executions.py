@@ -1,0 +1,210 @@
+"""The executions of a comparison: one at a time, and shared by all candidates whose controllers agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import call
+from ctxval.campaign.choices import Choice
+from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
+from ctxval.comparison.candidates import Candidate, TrialNote
+from ctxval.core.plan import Plan
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Trial
+from ctxval.errors import CtxvalError, DistanceError
+
+OnTrial = Callable[[str, Trial], None]
+"""Called with the name of a candidate and each of its trials that has ended."""
+
+_AGREE = 1e-9
+"""Largest difference of two inputs that are the same, as a share of the largest input."""
+
+NoteFor = Callable[[Candidate, Trial, TrialNote], TrialNote]
+"""Returns the note of a shared trial, from the trial that was executed and its note."""
+
+
+@dataclass(eq=False)
+class Executions:
+    """Executes tasks for candidates, and records each execution for all candidates whose controllers agree.
+
+    Attributes:
+        candidates: all candidates.
+        note_for: returns the note of a shared trial.
+        on_trial: called with each trial that has ended; None if nobody listens.
+        kept: returns the decisions so far, which are stored with each trial.
+    """
+
+    candidates: Sequence[Candidate]
+    note_for: NoteFor
+    on_trial: OnTrial | None = None
+    kept: Callable[[], tuple[dict[str, Any], ...]] = tuple
+    _examined: set[tuple[str, int, str]] = field(default_factory=set, init=False)
+    _hidden: Array | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        for candidate in self.candidates:
+            candidate.recorder.dynamics.elsewhere = _Elsewhere(self, candidate)
+
+    @property
+    def count(self) -> int:
+        """The number of executions of S that have ended; a shared execution counts once."""
+        return sum(len(candidate.executed) for candidate in self.candidates)
+
+    @property
+    def steps(self) -> int:
+        """The number of executions that this comparison has started."""
+        notes = [TrialNote.of(trial) for candidate in self.candidates for trial in candidate.trials]
+        return max((note.step + 1 for note in notes if note is not None), default=0)
+
+    def history(self, without: Array | None = None) -> list[tuple[Trial, Trajectory]]:
+        """Return all executions in the order in which they were made, each one once.
+
+        Args:
+            without: a task that is left out, a point of the unit cube ``(d,)``.
+        """
+        found = [
+            (note.step if note is not None else -1, row, trial, trajectory)
+            for row, candidate in enumerate(self.candidates)
+            for trial, trajectory in candidate.trajectories()
+            if (note := TrialNote.of(trial)) is None or note.shared is None
+            if without is None or not np.array_equal(trial.unit_point, without)
+        ]
+        ordered = sorted(found, key=lambda one: (one[0], one[1], one[2].number))
+        return [(trial, trajectory) for _, _, trial, trajectory in ordered]
+
+    def execute(self, candidate: Candidate, choice: Choice, note: TrialNote, *, predicts: bool) -> None:
+        """Execute one task, and record the execution for the others.
+
+        Args:
+            candidate: the candidate whose controller is used.
+            choice: the task.
+            note: what is stored with the trial.
+            predicts: whether the execution is predicted, and the prediction stored, before it is made.
+
+        Raises:
+            ModelError, DesignError, DistanceError: as in :meth:`ctxval.Campaign.run`.
+        """
+        stored = replace(note, decided=self.kept()).to_note()
+        whole = replace(choice, note={**(choice.note or {}), **stored}, planned_draws=0)
+        self._run(candidate, whole, predicts)
+        self.share()
+
+    def resume(self) -> None:
+        """End what was interrupted: repeat interrupted executions, and record those that are shared."""
+        for candidate in self.candidates:
+            candidate.campaign.refresh()
+            if candidate.recorder.interrupted is not None:
+                self._run(candidate, None, False)
+        self.share()
+
+    def _run(self, candidate: Candidate, choice: Choice | None, predicts: bool) -> None:
+        waiting = [] if choice is None else [choice]
+        schedule = Schedule(candidate.recorder, lambda: waiting.pop() if waiting else None, expected=None)
+        with candidate.recorder.predicting(predicts), self.hiding(None if choice is None else choice.unit_point):
+            execute_schedule(schedule, None, lambda trial: self._ended(candidate, trial), RetryPolicy())
+
+    def _ended(self, candidate: Candidate, trial: Trial) -> None:
+        if self.on_trial is not None:
+            self.on_trial(candidate.name, trial)
+
+    # Sharing
+
+    def share(self) -> None:
+        """Record executions for the candidates that would have given the system the same inputs."""
+        for candidate in self.candidates:
+            for trial, trajectory in list(candidate.trajectories()):
+                note = TrialNote.of(trial)
+                if note is None or note.shared is not None:
+                    continue
+                for other in self.candidates:
+                    key = (candidate.name, trial.number, other.name)
+                    if other is not candidate and key not in self._examined:
+                        self._examined.add(key)
+                        self._share(candidate, trial, trajectory, note, other)
+
+    def _share(
+        self, candidate: Candidate, trial: Trial, trajectory: Trajectory, note: TrialNote, other: Candidate
+    ) -> None:
+        known = other.trial_at(trial.unit_point)
+        if known is not None and (known.state != "open" or known.attempts):
+            return
+        try:
+            plan = other.recorder.validation.plan(other.recorder.validation.space.from_unit(trial.unit_point))
+        except CtxvalError:  # this candidate has no controller for the task
+            return
+        if not agrees(plan, trajectory):
+            return
+        with other.campaign.store.sole_writer(), self.hiding(trial.unit_point):
+            if known is None:
+                own = replace(
+                    self.note_for(other, trial, note), shared=(candidate.name, trial.number), decided=self.kept()
+                )
+                choice = Choice(trial.unit_point, trial.origin, planned_draws=0, note=own.to_note())
+                with other.recorder.predicting(note.question == "worst"):
+                    known = other.recorder.open(choice).trial
+            try:
+                ended = other.recorder.complete(known, other.recorder.validation.accept(plan, trajectory), trajectory)
+            except DistanceError:  # it is stored as unmeasured
+                return
+        self._ended(other, ended)
+
+    @contextmanager
+    def hiding(self, point: Array | None) -> Iterator[None]:
+        """Leave out the executions of a task from what predictions of its execution are learned from."""
+        before, self._hidden = self._hidden, point
+        try:
+            yield
+        finally:
+            self._hidden = before
+
+    def elsewhere(self, candidate: Candidate) -> list[Trajectory]:
+        """Return the executions that are in no trial of a candidate."""
+        own = {(note.shared) for trial in candidate.trials if (note := TrialNote.of(trial)) is not None and note.shared}
+        return [
+            trajectory
+            for other in self.candidates
+            if other is not candidate
+            for trial, trajectory in other.trajectories()
+            if ((note := TrialNote.of(trial)) is None or note.shared is None)
+            and (other.name, trial.number) not in own
+            and (self._hidden is None or not np.array_equal(trial.unit_point, self._hidden))
+        ]
+
+    def __repr__(self) -> str:
+        return call(self, executions=self.count, candidates=[one.name for one in self.candidates])
+
+
+@dataclass(frozen=True, eq=False)
+class _Elsewhere:
+    """The executions that teach the dynamics to a candidate although they are none of its trials."""
+
+    executions: Executions
+    candidate: Candidate
+
+    def __call__(self) -> Sequence[Trajectory]:
+        return self.executions.elsewhere(self.candidate)
+
+
+def agrees(plan: Plan, trajectory: Trajectory) -> bool:
+    """Return whether the controller of a plan gives the inputs that were executed, along the executed states.
+
+    The execution is then also one of this controller: the system cannot tell the two apart.
+    """
+    states, inputs = trajectory.states, trajectory.inputs
+    if plan.model_trajectory.states.shape != states.shape or plan.model_trajectory.inputs.shape != inputs.shape:
+        return False
+    nearest = _AGREE * max(float(np.abs(inputs).max(initial=0.0)), 1e-300)
+    try:
+        with np.errstate(all="ignore"):
+            return all(
+                bool((np.abs(np.asarray(plan.controller(t, states[t])) - inputs[t]) <= nearest).all())
+                for t in range(len(inputs))
+            )
+    except Exception:  # the user's controller, at states that it never reached by itself
+        return False

@@ -1,0 +1,102 @@
+"""Distances that all executions of a comparison together predict for each candidate; nothing is executed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.progress import stage
+from ctxval._util.representation import call
+from ctxval.comparison.candidates import Candidate
+from ctxval.core.trajectory import Trajectory
+from ctxval.learning import DistancePredictor
+from ctxval.searches import Prediction
+
+_POOL = (400, 48)
+"""Number of tasks whose largest predicted distance is looked for, if controllers are designed in batches or not."""
+
+_CENTRE = (200, 24)
+"""Number of tasks over which the prediction of a draw is averaged, likewise."""
+
+_HEADROOM = 2.0
+"""A predicted distance counts as at most this multiple of the largest executed one: learned dynamics may diverge."""
+
+_POOL_STREAM, _CENTRE_STREAM = 0x706F, 0x6365
+"""Identify random streams of tasks that are only predicted; they are none of the streams of trials."""
+
+Known = Sequence[tuple[Array, Trajectory]]
+"""Executed tasks, points of the unit cube ``(d,)``, with the system's trajectories."""
+
+
+class Predictions:
+    """Predicts the distances of one candidate, from the executions of all.
+
+    The system is the same for all candidates, so each execution teaches the residual of each model, whatever controller
+    was used.
+
+    Args:
+        candidate: the candidate.
+        seed: the seed of the tasks that are predicted.
+    """
+
+    def __init__(self, candidate: Candidate, seed: int) -> None:
+        self.candidate, self._seed = candidate, seed
+        self._space = candidate.campaign.validation.space
+        self._predictor = DistancePredictor(candidate.campaign.validation)
+        self._batched = bool(getattr(candidate.campaign.validation.synthesizer, "batched", False))
+        self._last: tuple[tuple[int, ...], Prediction | None] | None = None
+
+    def highest(self, known: Known) -> tuple[float, Array] | None:
+        """Return the largest predicted distance and its task ``(d,)``; None if nothing can be predicted."""
+        prediction = self._from(known)
+        if prediction is None:
+            return None
+        rng, count = np.random.default_rng([self._seed, _POOL_STREAM]), _POOL[not self._batched]
+        points = rng.random((count, self._space.dimension))
+        snapped = rng.random(points.shape) < 0.5 * (np.arange(count) % 2)[:, None]  # maxima often lie at bounds
+        points = np.where(snapped, np.round(points), points)
+        with stage("predicting distances", count, "designs"):
+            expected = prediction.expected(points)[0]
+        if not np.isfinite(expected).any():
+            return None
+        best = int(np.nanargmax(np.where(np.isfinite(expected), expected, np.nan)))
+        return float(expected[best]), points[best]
+
+    def of_draw(self, known: Known, point: Array, draw: int, most: float | None) -> tuple[float, float] | None:
+        """Return the prediction of a draw and its mean over other tasks; None if nothing can be predicted.
+
+        The mean is over new independent tasks for each draw, so that its error has the expectation 0.
+
+        Args:
+            known: executions before the draw.
+            point: the draw, a point of the unit cube ``(d,)``.
+            draw: the number of the draw.
+            most: a number that no distance can exceed; None if none is known.
+        """
+        prediction = self._from(known)
+        if prediction is None:
+            return None
+        rng = np.random.default_rng([self._seed, draw, _CENTRE_STREAM])
+        others = self._space.unit_draws(_CENTRE[not self._batched], rng)
+        with stage("predicting distances", len(others) + 1, "designs"):
+            expected = prediction.expected(np.concatenate([others, point[None]]))[0]
+        largest = max(self.candidate.largest, 0.0)
+        limit = most if most is not None else (_HEADROOM * largest if largest > 0 else np.inf)
+        usual = 0.5 * limit if np.isfinite(limit) else 0.0
+        values = np.clip(np.where(np.isfinite(expected), expected, usual), 0.0, limit)
+        return float(values[-1]), float(values[:-1].mean())
+
+    def _from(self, known: Known) -> Prediction | None:
+        key = tuple(id(trajectory) for _, trajectory in known)
+        if self._last is None or self._last[0] != key:
+            try:
+                found = self._predictor.predict(list(known))
+            except Exception:  # the user's parts, at states that no execution has reached, must not end a comparison
+                found = None
+            self._last = key, found
+        return self._last[1]
+
+    def __repr__(self) -> str:
+        return call(self, self.candidate)

@@ -1,0 +1,193 @@
+"""The loop of a comparison: it executes the task that is expected to decide most, until all is decided."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from ctxval._util.progress import advance, stage
+from ctxval.comparison.candidates import Candidate, Question, TrialNote, require_comparable
+from ctxval.comparison.executions import Executions, OnTrial
+from ctxval.comparison.expected import MeanQuestion
+from ctxval.comparison.predictions import Predictions
+from ctxval.comparison.result import CandidateResult, Comparison, PairResult
+from ctxval.comparison.worst import WorstQuestion
+from ctxval.core.task_distribution import distribution_text
+from ctxval.core.trial import Trial
+from ctxval.errors import InputError
+
+_WORST_FIRST = 0.5
+"""Share of the budget that the question of d* may use before that of the expected distance is answered."""
+
+
+class Race:
+    """A comparison in progress. What it does next follows from the stores alone, so it can be interrupted.
+
+    Args:
+        candidates: the candidates.
+        questions: the questions.
+        budget: the largest total number of executions, including earlier ones; a shared execution counts once.
+        confidence: the probability with which all decisions hold together. It is divided between the questions.
+        seed: the seed of the draws.
+        largest_possible: a number that no distance can exceed; None if none is known.
+        stochastic: whether two executions of one task may differ.
+        on_trial: called with the name of the candidate and each trial that has ended.
+
+    Raises:
+        InputError: if the candidates cannot be compared.
+    """
+
+    def __init__(
+        self,
+        candidates: Sequence[Candidate],
+        questions: Sequence[Question],
+        budget: int,
+        confidence: float,
+        seed: int,
+        largest_possible: float | None = None,
+        stochastic: bool = False,
+        on_trial: OnTrial | None = None,
+    ) -> None:
+        require_comparable(candidates)
+        self.candidates, self.questions, self.budget, self.confidence = candidates, questions, budget, confidence
+        self.stochastic = stochastic
+        self.executions = Executions(candidates, self._note_for, on_trial)
+        predictions = {one.name: Predictions(one, seed) for one in candidates}
+        each = 1 - (1 - confidence) / len(questions)
+        self.worst = WorstQuestion(self.executions, predictions, each, budget, stochastic)
+        self.mean = MeanQuestion(self.executions, predictions, each, seed, largest_possible)
+
+    def _note_for(self, candidate: Candidate, trial: Trial, note: TrialNote) -> TrialNote:
+        if note.question == "mean":
+            return self.mean.note_of(candidate, note, trial.unit_point)
+        return replace(note, predicted=None)
+
+    def run(self) -> Comparison:
+        """Execute tasks until all pairs are decided or the budget is spent.
+
+        Raises:
+            StoreAccessError: if another process is running a store.
+            ModelError, DesignError, DistanceError: as in :meth:`ctxval.Campaign.run`.
+        """
+        with ExitStack() as stack:
+            for candidate in self.candidates:
+                if getattr(candidate.campaign.validation.system, "manual", False):
+                    raise InputError("a system that people execute cannot be compared by this command.")
+                stack.enter_context(candidate.campaign.store.sole_writer())
+            with stage("comparing", self.budget, "executions", done=self.executions.count):
+                self.executions.resume()
+                while self._step():
+                    advance()
+        return self.result()
+
+    def _step(self) -> bool:
+        """Execute one task; return False if nothing is left to do."""
+        left = self.budget - self.executions.count
+        if left <= 0:
+            return False
+        worst = "worst" in self.questions and bool(self.worst.undecided)
+        spent = sum(_question_of(trial) == "worst" for one in self.candidates for trial in one.executed)
+        last = "mean" not in self.questions
+        if worst and (last or spent < _WORST_FIRST * self.budget) and self.worst.step():
+            return True
+        if not last and self.mean.step(left):
+            return True
+        return worst and not last and self.worst.step()
+
+    # Results
+
+    def result(self) -> Comparison:
+        """Return what is decided so far."""
+        pairs = [self._pair(question, a, b) for question in self.questions for a, b in combinations(self.candidates, 2)]
+        return Comparison(
+            tuple(map(self._candidate, self.candidates)),
+            tuple(pairs),
+            self.confidence,
+            self.executions.count,
+            self.budget,
+            self.candidates[0].campaign.validation.labels.units,
+            self._assumptions(),
+        )
+
+    def _candidate(self, candidate: Candidate) -> CandidateResult:
+        worst = candidate.campaign.worst
+        bounds = [one.bound for one in self.worst.decisions if one.smaller == candidate.name]
+        drawn = [trial.distance for trial, _ in self.mean.draws_of(candidate).values() if trial.distance is not None]
+        return CandidateResult(
+            candidate.name,
+            len(candidate.executed),
+            len(candidate.shared),
+            len(candidate.campaign.failed),
+            None if worst is None else worst.distance,
+            None if worst is None else worst.parameters,
+            min(bounds, default=None),
+            len(drawn),
+            float(np.mean(drawn)) if drawn else None,
+        )
+
+    def _pair(self, question: Question, a: Candidate, b: Candidate) -> PairResult:
+        return self._worst_pair(a, b) if question == "worst" else self._mean_pair(a, b)
+
+    def _worst_pair(self, a: Candidate, b: Candidate) -> PairResult:
+        found = next((one for one in self.worst.decisions if {one.smaller, one.larger} == {a.name, b.name}), None)
+        if found is None:
+            reason = (
+                f"the largest executed distances are {a.largest:.4g} ({a.name}) and {b.largest:.4g} ({b.name}), and no "
+                "bound separates them"
+            )
+            return PairResult("worst", a.name, b.name, None, reason)
+        reason = (
+            f"d* of {found.smaller} is at most {found.bound:.4g} by the {found.certificate} bound, and an executed "
+            f"distance of {found.larger} is {found.distance:.4g}; decided after {found.executions} executions"
+        )
+        return PairResult("worst", a.name, b.name, found.smaller, reason)
+
+    def _mean_pair(self, a: Candidate, b: Candidate) -> PairResult:
+        found = self.mean.difference(a, b)
+        interval = found.estimate, found.low, found.high, found.tasks, found.variance_left
+        if found.sign:
+            smaller = b.name if found.sign > 0 else a.name
+            reason = (
+                f"the expected distance of {a.name} minus that of {b.name} is between {found.low:.3g} and "
+                f"{found.high:.3g}; decided after {found.decided_after} tasks"
+            )
+            return PairResult("mean", a.name, b.name, smaller, reason, *interval)
+        lost = self.mean.lost(a, b)
+        reason = lost or f"after {found.tasks} tasks the confidence sequence of the difference contains 0"
+        return PairResult("mean", a.name, b.name, None, reason, *interval)
+
+    def _assumptions(self) -> tuple[str, ...]:
+        said = [
+            "the candidates were fixed before the comparison, and the system does not change during it",
+        ]
+        if "worst" in self.questions:
+            kind = self.worst.options
+            said.append(
+                f"each bound on d* holds with confidence {kind.confidence:.6g} under the prior that its certificate "
+                "states (dynamics or posterior); it is a probability given the executions, so neither the changing "
+                "threshold nor the time of stopping costs confidence"
+            )
+        if "mean" in self.questions:
+            described = self.candidates[0].campaign.validation.space.distribution
+            over = "uniform over the task space" if described is None else distribution_text(described.describe())
+            said.append(f"tasks are independent draws ({over})")
+            said.append(
+                f"no distance can exceed {self.mean.most:g}; the decisions on expected distances are then valid for "
+                "any number of tasks"
+                if self.mean.most is not None
+                else "no largest possible distance is stated, so the decisions on expected distances are exact only if "
+                "corrected differences are symmetric about their mean, and asymptotic otherwise: rare large distances "
+                "that were not drawn can make them wrong"
+            )
+        if self.stochastic:
+            said.append("executions of one task may differ, and the questions are about expected distances of tasks")
+        return tuple(said)
+
+
+def _question_of(trial: Trial) -> Question | None:
+    note = TrialNote.of(trial)
+    return None if note is None else note.question

@@ -1,0 +1,148 @@
+"""``ctxval compare``, as users call it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from ctxval import Store
+from ctxval.cli import app
+from ctxval.errors import StoreError
+
+Invoke = Callable[..., Result]
+
+FILE = """
+name = "cart"
+units = "m"
+[space]
+goal = [-2.0, 2.0, "m"]
+[task]
+initial_state = [0.0, 0.0]
+goal = ["goal", 0.0]
+horizon = 40
+dt = 0.05
+[system]
+type = "Simulated"
+step = { ref = "my_compared_cart:step" }
+[model]
+type = "Linear"
+A = [[1.0, 0.05], [0.0, 1.0]]
+B = [[0.0], [0.05]]
+[distance]
+type = "WholeTrajectory"
+norm = inf
+components = [0]
+[search]
+name = "gp-ucb"
+[synthesizer]
+type = "LQR"
+"""
+STEP = """
+def step(x, u):
+    return [x[0] + 0.05 * x[1], x[1] + 0.05 * (u[0] - 0.3 * x[1] * abs(x[1]))]
+"""
+
+
+@pytest.fixture
+def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Invoke:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.delitem(sys.modules, "my_compared_cart", raising=False)
+    Path("my_compared_cart.py").write_text(STEP)
+    Path("gentle.toml").write_text(FILE + "Q = [1.0, 1.0]\nR = [1.0]\n")
+    Path("stiff.toml").write_text(FILE + "Q = [100.0, 1.0]\nR = [0.1]\n")
+    Path("wide.toml").write_text((FILE + "Q = [1.0, 1.0]\nR = [1.0]\n").replace("[-2.0, 2.0", "[-3.0, 2.0"))
+
+    def called(*arguments: str) -> Result:
+        return CliRunner().invoke(app, ["compare", *arguments])
+
+    return called
+
+
+@pytest.mark.slow
+def test_two_files_are_compared_and_the_result_is_printed_and_written(invoke: Invoke) -> None:
+    found = invoke("gentle.toml", "stiff.toml", "--question", "mean", "--out", "result.md")
+    assert found.exit_code == 0, found.stderr
+    assert "expected distance: gentle < stiff" in found.stdout
+    assert "rare large distances" in " ".join(found.stdout.split())
+    assert Path("result.md").read_text().startswith("## Comparison")
+    assert Path("result.png").read_bytes().startswith(b"\x89PNG")
+    report: dict[str, Any] = json.loads(invoke("gentle.toml", "stiff.toml", "--question", "mean", "--json").stdout)
+    assert report["decided"]
+    assert report["rankings"] == {"mean": [["gentle"], ["stiff"]]}
+    assert set(report["stores"]) == {"gentle", "stiff"}
+    before = report["executions"]
+    longer = json.loads(invoke("gentle.toml", "stiff.toml", "--question", "mean", "--budget", "300", "--json").stdout)
+    assert longer["executions"] == before  # nothing is executed again
+    shown = CliRunner().invoke(app, ["status", report["stores"]["gentle"]])
+    assert shown.exit_code == 0
+
+
+@pytest.mark.slow
+def test_candidates_have_names_and_cases_have_options(invoke: Invoke) -> None:
+    same = invoke("gentle.toml", "other/gentle.toml")
+    assert same.exit_code == 2
+    assert "two candidates are called gentle: give one another name" in same.stderr
+    found = invoke("a=pendulum", "b=linear:dim=2", "--budget", "2")
+    assert found.exit_code == 2
+    assert "a and b must have the same task spaces" in found.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["gentle.toml"], "at least two candidates, got 1"),
+        (["gentle.toml", "wide.toml"], "gentle and wide must have the same task spaces"),
+        (["gentle.toml", "stiff.toml", "--question", "best"], "question must be worst, mean or both, got 'best'"),
+        (["gentle.toml", "stiff.toml", "--budget", "0"], "budget must be a positive integer"),
+        (["gentle.toml", "stiff.toml", "--confidence", "0.2"], "more often than right"),
+        (["gentle.toml", "nothing.toml"], "there is no experiment file nothing.toml"),
+        (["gentle.toml", "stiff.toml", "--largest-possible", "-1"], "must be a positive number"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_in_one_sentence(invoke: Invoke, arguments: list[str], message: str) -> None:
+    found = invoke(*arguments)
+    assert found.exit_code == 2
+    assert message in " ".join(found.stderr.split())
+    assert "Traceback" not in found.stderr
+
+
+def trials(folder: Path) -> dict[str, list[tuple[list[float], float | None, str]]]:
+    """Return what the stores of a folder have; those that are being made have nothing."""
+    found = {}
+    for path in sorted(folder.glob("*.sqlite")):
+        try:
+            kept = Store(path).trials()
+        except StoreError:
+            continue
+        found[path.stem] = [(one.unit_point.tolist(), one.distance, json.dumps(one.note)) for one in kept]
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL")
+def test_a_comparison_that_is_killed_makes_the_same_choices(invoke: Invoke) -> None:
+    def started(folder: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "ctxval.cli", "compare", "gentle.toml", "stiff.toml", "--store", folder]
+        return subprocess.Popen([*command, "--budget", "18", "--json"], stdout=subprocess.PIPE, text=True)
+
+    whole = json.loads(started("whole").communicate()[0])
+    for count in (3, 11):
+        process = started("parts")
+        while process.poll() is None and sum(map(len, trials(Path("parts")).values())) < count:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    parts = json.loads(started("parts").communicate()[0])
+    assert trials(Path("parts")) == trials(Path("whole"))
+    assert {**parts, "stores": None} == {**whole, "stores": None}
