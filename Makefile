@@ -7,7 +7,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick check docs reliability crash-states attack bench bench-peers study reproduce search global-search calibrate parts pictures posterior-ranks clean
+.PHONY: demo test quick check docs reliability crash-states attack bench bench-peers study study-refine reproduce search global-search calibrate parts pictures posterior-ranks clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -45,6 +45,9 @@ bench-peers: .venv/peers/.installed .venv/peers-verifai/.installed  ## beside ot
 
 study: .venv/.test  ## the running example over many seeds; writes docs/main-job.md
 	$(BIN)/python benchmarks/study_main_job.py
+
+study-refine: .venv/.test  ## how much better refined models are; writes docs/refinement.md, and resumes
+	$(BIN)/python benchmarks/study_refine.py
 
 docs: .venv/.test  ## the manual, with its gallery; writes docs/_build/html
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html

@@ -11,7 +11,8 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from conftest import Predicted
+from conftest import Predicted, make_validation
+from ctxval import Campaign, refine
 from ctxval.campaign.dynamics import PREDICTION
 from ctxval.certificates import (
     KINDS,
@@ -36,6 +37,7 @@ from ctxval.data import Break, LogMapping, MemoryTable, recordings_of
 from ctxval.fitting import FittedParameter, fit
 from ctxval.learning import ExecutionPrediction
 from ctxval.models import Linear
+from ctxval.refinement import HeldOut, measure_residual
 from ctxval.replay import PredictedTask, PredictedTasks, Suggestion, replay
 from ctxval.testing import check_search
 from rig_logs import run
@@ -139,6 +141,19 @@ def test_the_glossary_explains_what_replay_and_fit_say() -> None:
     names = {*recordings.states, *recordings.inputs}
     explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
     assert used - names <= set(explained)
+
+
+def test_the_glossary_explains_what_refine_says() -> None:
+    held = HeldOut(*(np.ones((60, 3)), *[np.full((60, 2), 0.1)] * 3, np.zeros(60)))
+    residual = measure_residual(held, {"x": "m", "v": "m/s"}, {"u": "N"})
+    found = replace(
+        refine(Campaign(make_validation()).run(1), 1e-9, 1),
+        residual=residual,
+        accuracy={"x": (0.1, 0.2)},
+        parameters=(FittedParameter("mass", 1.0, 0.9, 1.1),),
+    )
+    explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    assert keys(found.to_dict()) - {"x", "v", "u", "goal"} <= set(explained)
 
 
 def test_the_glossary_is_in_alphabetical_order() -> None:

@@ -27,6 +27,13 @@ PRINTED = {
         "add 0.04 to delay in the mapping of the recordings",
         "With the delay, the one-step error of the rate falls from 0.107 to 0.003 rad/s.",
     ],
+    "7_from_logs_to_a_validated_model": [
+        "Three executions: falsified: trial",
+        "the model of round 1 is validated",
+        "counts 4 executions under its own controllers; 3 executions under controllers of other models",
+        "all records",
+        "Report: boat.html",
+    ],
     "5_audit_and_retrain": ["the largest gap in 59 random tasks is 0.29 m.", "is 0.014 m.", "What this rests on:"],
 }
 

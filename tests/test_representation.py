@@ -42,6 +42,7 @@ from ctxval import (
     learning,
     models,
     plot,
+    refinement,
     replay,
     report,
     searches,
@@ -70,6 +71,7 @@ PACKAGES = (
     ".replay",
     ".testing",
     ".report",
+    ".refinement",
 )
 
 DATA = Transitions(np.linspace(-1, 1, 80).reshape(40, 2) ** 3, np.linspace(-5, 5, 40)[:, None] ** 2, np.zeros((40, 2)))
@@ -250,7 +252,34 @@ def fitted() -> fitting.FitReport:
     return fitting.fit(data.recordings_of([data.MemoryTable("run.csv", columns)]), ["linear"], steps=[1])
 
 
+CORRECTION = models.Correction(
+    *(np.zeros(3), np.ones(3), np.zeros((4, 3)), np.ones(3), np.ones((4, 2)), np.zeros((4, 2))),
+    *(-np.ones(3), np.ones(3), np.ones(3), np.ones(2)),
+)
+HELD_OUT = refinement.HeldOut(*(np.ones((60, 3)), *[np.full((60, 2), 0.1)] * 3, np.zeros(60)))
+
+
+@functools.cache
+def refined() -> refinement.Refinement:
+    """Return a refinement that ended at once, because its budget is spent."""
+    return ctxval.refine(campaign(), 1e-9, campaign().executions)
+
+
 EXAMPLES: dict[str, Callable[[], object]] = {
+    "models.Corrected": lambda: models.Corrected(LINEAR, CORRECTION, data=DATA),
+    "models.Correction": lambda: CORRECTION,
+    "models.Refined": lambda: models.Refined(LINEAR, DATA, LINEAR),
+    "refinement.HeldOut": lambda: HELD_OUT,
+    "refinement.Learned": lambda: refinement.Learned(LINEAR, HELD_OUT),
+    "refinement.MeasuredResidual": lambda: refinement.measure_residual(HELD_OUT, {"x": "m", "v": "m/s"}, {"u": "N"}),
+    "refinement.Parameters": lambda: refinement.Parameters({"mass": (0.5, 2.0)}),
+    "refinement.Records": lambda: refinement.Records((TRAJECTORY,)),
+    "refinement.Refinement": refined,
+    "refinement.Refit": lambda: refinement.Refit("linear"),
+    "refinement.ResidualCorrection": refinement.ResidualCorrection,
+    "refinement.ResidualRegion": lambda: refinement.measure_residual(HELD_OUT, {"x": "", "v": ""}, {"u": ""}).whole,
+    "refinement.Round": lambda: refined().last,
+    "refinement.UserFit": lambda: refinement.UserFit(models.Linear.fit),
     "Campaign": campaign,
     "Comparison": compared,
     "Experiment": lambda: Experiment("pendulum", make_validation(), threshold=0.5, units="rad"),

@@ -41,12 +41,14 @@ if TYPE_CHECKING:
     from ctxval import gp as gp
     from ctxval import models as models
     from ctxval import plot as plot
+    from ctxval import refinement as refinement
     from ctxval import replay as replay
     from ctxval import report as report
     from ctxval import reproduce as reproduce
     from ctxval import searches as searches
     from ctxval import systems as systems
     from ctxval import testing as testing
+    from ctxval.refinement import refine as refine
 
 __version__ = VERSION
 
@@ -74,6 +76,7 @@ __all__ = [
     "compare",
     "grid_truth",
     "part",
+    "refine",
     "rollout",
     "search_truth",
 ]
@@ -91,6 +94,7 @@ _SUBMODULES = (
     "gp",
     "models",
     "plot",
+    "refinement",
     "replay",
     "report",
     "reproduce",
@@ -100,12 +104,17 @@ _SUBMODULES = (
 )
 """The public modules, which ``import ctxval`` alone makes usable: each is imported when it is first used."""
 
+_LAZY = {"refine": "refinement"}
+"""Public names that stand on upper floors, and the modules that have them."""
+
 
 if not TYPE_CHECKING:  # a type checker, which reads the imports above, would take any name for granted
 
     def __getattr__(name: str) -> Any:
         if name in _SUBMODULES:
             return importlib.import_module(f"{__name__}.{name}")
+        if name in _LAZY:
+            return getattr(importlib.import_module(f"{__name__}.{_LAZY[name]}"), name)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

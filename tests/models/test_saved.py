@@ -75,7 +75,7 @@ def test_a_file_that_is_no_model_is_refused(content: dict[str, Any], message: st
 
 
 def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="only linear models, networks and Gaussian processes can be written"):
+    with pytest.raises(InputError, match="networks, Gaussian processes and corrections can be written"):
         models.write_model(tmp_path / "a.npz", models.Function(lambda x, u: x))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="cannot be written: No such file or directory"):
         models.write_model(tmp_path / "absent" / "a.npz", SAVED[0])

@@ -40,7 +40,7 @@ class Provenance:
         return cls(
             space=_space_of(description),
             search=search.get("type") if isinstance(search, dict) else None,
-            remarks=remarks_on(changes),
+            remarks=(*_remarks_on_model(description), *remarks_on(changes)),
             distribution=_distribution_of(description),
         )
 
@@ -69,6 +69,22 @@ def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
         elif change.what == "remeasured":
             found.append(f"the distances are those measured anew: {change.why!r}")
     return tuple(found)
+
+
+def _remarks_on_model(description: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what a certificate says of a model that was refined."""
+    try:
+        refined = description["validation"]["model"]["type"] == "Refined"
+    except (KeyError, TypeError):
+        refined = False
+    return (REFINED,) if refined else ()
+
+
+REFINED = (
+    "the model was learned again from executions of earlier models: these are data of the model and no trials of it, "
+    "so only executions under its own controllers are counted"
+)
+"""What a certificate says of a model that was refined."""
 
 
 def _distribution_of(description: Mapping[str, Any]) -> str | None:

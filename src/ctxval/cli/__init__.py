@@ -1,6 +1,21 @@
 """The command line: a thin skin over the public interface."""
 
-from ctxval.cli import certify, collect, compare, files, fit, hand, paper, remeasure, replay, report, run, serve, stores
+from ctxval.cli import (
+    certify,
+    collect,
+    compare,
+    files,
+    fit,
+    hand,
+    paper,
+    refine,
+    remeasure,
+    replay,
+    report,
+    run,
+    serve,
+    stores,
+)
 from ctxval.cli.base import app
 from ctxval.cli.screen import print_anything
 
@@ -14,6 +29,7 @@ __all__ = [
     "hand",
     "main",
     "paper",
+    "refine",
     "remeasure",
     "replay",
     "report",

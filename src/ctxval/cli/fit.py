@@ -19,8 +19,7 @@ from ctxval.config.references import reference, require_function
 from ctxval.errors import InputError
 from ctxval.fitting import FitReport, FittedModel, fit
 from ctxval.fitting.fit import HOLD_OUT, KINDS, STEPS
-from ctxval.fitting.onnx_file import write_onnx
-from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear, Parametric, write_model, write_transitions
+from ctxval.fitting.model_file import SUFFIXES, write_model_file
 
 Kinds = Annotated[
     str | None,
@@ -66,8 +65,8 @@ Out = Annotated[
     typer.Option(
         "--out",
         help="File for the most accurate model that it can hold: .npz, with the recorded steps that the model was "
-        "learned from, or .onnx for a network or a linear model, with these steps in a file .data.npz beside it. For "
-        "the parameters of --step: .toml, the table model of an experiment file.",
+        "learned from, or .onnx, with these steps in a file .data.npz beside it. For the parameters of --step: .toml, "
+        "the table model of an experiment file.",
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
@@ -103,8 +102,8 @@ def fit_models(
     if (step is None) != (not parameter):
         raise InputError("--step and --parameter must be given together.")
     bounds = named_values(parameter, "--parameter")
-    if out_file is not None and out_file.suffix not in _SUFFIXES:
-        raise InputError(f"the file of a model must end in {', '.join(_SUFFIXES)}, got {str(out_file)!r}.")
+    if out_file is not None and out_file.suffix not in SUFFIXES:
+        raise InputError(f"the file of a model must end in {', '.join(SUFFIXES)}, got {str(out_file)!r}.")
     found = LogOptions(mapping, state, input_, time, dt, delay).read(logs)
     function = None if step is None else require_function(f"--step {step}", reference(step), "(x, u, theta) -> x_next")
     report = fit(
@@ -124,46 +123,17 @@ def fit_models(
     written: list[str] = []
     if report.fitted and out_file is not None:
         chosen = _most_accurate(report, out_file)
-        written = _written(out_file, chosen, step)
+        written = write_model_file(out_file, chosen.model, step)
         if not as_json:
             out.say(f"the {chosen.kind} model is in {' and '.join(written)}")
     result = {**report.to_json(), "files": written}
     return result if report.fitted else (result, CANNOT_GO_ON)
 
 
-def _written(path: Path, chosen: FittedModel, step: str | None) -> list[str]:
-    """Write a model to a file, and the data of an ONNX file to another one; return their paths."""
-    if isinstance(chosen.model, Parametric):
-        values = ", ".join(f"{name} = {value!r}" for name, value in chosen.model.theta.items())
-        text = f'[model]\ntype = "Parametric"\nstep = {{ ref = "{step}" }}\ntheta = {{ {values} }}\n'
-        if chosen.model.vectorized:
-            text += "vectorized = true\n"
-        try:
-            path.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"{path} cannot be written: {error.strerror}.") from error
-    elif path.suffix == ".onnx":
-        write_onnx(path, chosen.model)
-        beside = path.with_suffix(".data.npz")
-        write_transitions(beside, getattr(chosen.model, "data", None))
-        return [str(path), str(beside)]
-    else:
-        write_model(path, chosen.model)  # type: ignore[arg-type]
-    return [str(path)]
-
-
-_SUFFIXES: dict[str, tuple[type, ...]] = {
-    ".npz": (Linear, FeedforwardReLU, GaussianProcessModel),
-    ".onnx": (Linear, FeedforwardReLU),
-    ".toml": (Parametric,),
-}
-"""The models that a file of each suffix can hold."""
-
-
 def _most_accurate(report: FitReport, path: Path) -> FittedModel:
     """Return the most accurate of the models that a file can hold."""
     for one in report.fitted:
-        if one.kind != "given" and isinstance(one.model, _SUFFIXES[path.suffix]):
+        if one.kind != "given" and isinstance(one.model, SUFFIXES[path.suffix]):
             return one
     kinds = ", ".join(one.kind for one in report.fitted)
     raise InputError(f"no model that was learned ({kinds}) can be written to a file that ends in {path.suffix}.")

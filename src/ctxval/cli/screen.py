@@ -18,7 +18,7 @@ _INDENT = "\n  "
 
 PANELS = {
     "Run": ("init", "check", "run", "remeasure"),
-    "Recordings": ("replay", "fit", "collect"),
+    "Recordings": ("replay", "fit", "refine", "collect"),
     "By hand": ("ask", "tell", "import", "serve"),
     "Inspect": ("status", "certify", "report", "export"),
     "Paper": ("cases", "reproduce"),

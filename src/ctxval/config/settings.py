@@ -25,6 +25,7 @@ from ctxval.core.labels import labels_of
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping
 from ctxval.errors import InputError, UnknownNameError
+from ctxval.models import Refined, read_refined
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH
 from ctxval.searches import REGISTRY as SEARCHES
 from ctxval.searches import Search, by_name
@@ -89,6 +90,8 @@ class Settings(BaseModel):
         certificate: the certificate for the verdict.
         search: the search, and its options.
         aspect1: when the model itself counts as completing a task.
+        refined: the file of a model that `ctxval refine` has learned from executions; it replaces the model of the
+            experiment.
         recordings: the mapping of logs to states and inputs, as :class:`ctxval.data.LogMapping` takes it.
         folder: the folder of modules and files, which is the folder of the experiment file. None means the current
             folder.
@@ -117,6 +120,7 @@ class Settings(BaseModel):
     store: Path | None = None
     search: SearchTable = Field(default_factory=SearchTable)
     aspect1: Aspect1Table = Field(default_factory=Aspect1Table)
+    refined: Path | None = None
     recordings: dict[str, Any] | None = None
     folder: Path | None = None
 
@@ -127,10 +131,15 @@ class Settings(BaseModel):
             InputError: if it cannot be found or made.
         """
         made = self._made()
+        if self.refined is not None:
+            made = replace(made, validation=_with_refined(made.validation, self._path(self.refined)), truth=None)
         if self.distribution is None:
             return made
         space = with_distribution(made.validation.space, self.distribution, self.folder)
         return replace(made, validation=made.validation.with_space(space))
+
+    def _path(self, path: Path) -> Path:
+        return path if self.folder is None else self.folder / path
 
     def _made(self) -> Experiment:
         if self.experiment is None:
@@ -269,6 +278,14 @@ class Settings(BaseModel):
             return self.store
         options = [f"{key}-{value}" for key, value in self.options.items()]
         return Path("runs") / f"{'-'.join([name, *options, self.search.name])}-seed{self.seed}.sqlite"
+
+
+def _with_refined(validation: Validation, path: Path) -> Validation:
+    """Return a validation with the model in a file, which was learned from executions of the given model."""
+    found = read_refined(path, validation.model)
+    if found.data is None:
+        raise InputError(f"{path} lacks the recorded steps that the model was learned from.")
+    return validation.with_model(Refined(found, found.data, validation.model))
 
 
 def read_settings(target: str, overrides: dict[str, Any]) -> Settings:

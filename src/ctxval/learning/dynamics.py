@@ -129,10 +129,14 @@ class Residual:
         errors = self.process.factor.left_out_errors(self.process.weights)
         return self.unit * float(np.median(np.sqrt((errors**2).mean(axis=1))))
 
-    def rough(self, centres: int) -> Residual:
+    def rough(self, centres: int, error: float = _ROUGHLY) -> Residual:
         """Return the residual conditioned on the first centres only, which is cheaper to evaluate.
 
         If so many centres do not predict the residuals at the others well, twice as many are tried, and so on.
+
+        Args:
+            centres: number of centres that are tried first.
+            error: largest error, as a share of the residuals at the other centres.
         """
         first = slice(0, centres)
         fewer = replace(self, centres=self.centres[first], outputs=self.outputs[first], sources=self.sources[first])
@@ -140,7 +144,7 @@ class Residual:
         if not len(others):
             return self
         errors = fewer.process.predict(self.centres[centres:])[0] - others
-        return fewer if (errors**2).mean() <= _ROUGHLY**2 * (others**2).mean() else self.rough(2 * centres)
+        return fewer if (errors**2).mean() <= error**2 * (others**2).mean() else self.rough(2 * centres, error)
 
     def without(self, left_out: Sequence[Collection[int]]) -> ResidualsWithout:
         """Return residuals without some executions, all together; the hyperparameters do not change.
@@ -207,7 +211,9 @@ class LearnedCovariance:
         return call(self, self.model, error=self.residual.typical_error())
 
 
-def learn_covariance(model: Model, transitions: Transitions, sources: Rows, centres: int) -> LearnedCovariance | None:
+def learn_covariance(
+    model: Model, transitions: Transitions, sources: Rows, centres: int, *, of_steps: bool = True
+) -> LearnedCovariance | None:
     """Return the most likely covariance of the residual of M or, if this predicts much better, of the system's steps.
 
     If M is rougher than the system, such as a small network, then its residual has all of its kinks and is harder to
@@ -220,17 +226,16 @@ def learn_covariance(model: Model, transitions: Transitions, sources: Rows, cent
         transitions: N transitions of the system.
         sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
         centres: largest number of transitions that the residuals are conditioned on, whose errors are compared.
+        of_steps: whether the system's steps may be learned without M.
     """
     of_model = _learned(model, transitions, sources, centres)
-    if of_model is None:
-        return None
-    of_steps = _learned(Identity(), transitions, sources, centres)
-    if of_steps is None:
+    without = _learned(Identity(), transitions, sources, centres) if of_model is not None and of_steps else None
+    if of_model is None or without is None:
         return of_model
     # The few transitions from which hyperparameters are learned could not tell which model errs less.
     with single_threaded():
-        better = of_steps.residual.typical_error() < _MUCH_BETTER * of_model.residual.typical_error()
-    return of_steps if better else of_model
+        better = without.residual.typical_error() < _MUCH_BETTER * of_model.residual.typical_error()
+    return without if better else of_model
 
 
 def _learned(model: Model, transitions: Transitions, sources: Rows, centres: int) -> LearnedCovariance | None:

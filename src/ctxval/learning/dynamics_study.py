@@ -19,6 +19,7 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSetti
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings, loop_pairs
+from ctxval.models.corrected import before_refinement
 
 _PROBED = 8
 """Number of tasks at which each task parameter is moved, to see whether it changes the closed loops of M."""
@@ -92,7 +93,7 @@ class DynamicsStudy:
             return None
         rng = np.random.default_rng([self.seed, len(executed), 0])
         settings = PosteriorSettings.for_horizon(self._loops.horizon)
-        posterior = learn_posterior(self.validation.model, *recorded, rng, settings)
+        posterior = learn_posterior(before_refinement(self.validation.model), *recorded, rng, settings)
         if posterior is None or not posterior.components:
             return None
         points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)

@@ -34,6 +34,7 @@ from ctxval.learning.error_vectors import ErrorVectors, Executed, executions_of
 from ctxval.learning.plan_memory import PlanMemory
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.vector import predict_composed
+from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 
 _ResidualOf = Callable[[Rows], Step]
@@ -143,7 +144,7 @@ class DistancePredictor:
         key = b"".join(part.tobytes() for _, one in executed for part in (one.states, one.inputs))
         if self._learned is None or self._learned[0] != key:
             recorded = recorded_transitions(self.validation.model, [one for _, one in executed], loops)
-            model = self.validation.model
+            model = before_refinement(self.validation.model)
             self._learned = key, None if recorded is None else learn_covariance(model, *recorded, _centres(loops))
         return self._learned[1]
 

@@ -26,6 +26,7 @@ from ctxval.errors import InputError
 from ctxval.learning.dynamics import Residual, ResidualsWithout, learn_covariance
 from ctxval.learning.error_vectors import Executed, executions_of
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
+from ctxval.models.corrected import before_refinement
 
 _CENTRES = (100, 300)
 """Least and largest number of transitions that the residual is conditioned on."""
@@ -80,7 +81,8 @@ def _corrected(validation: Validation, executed: Executed) -> tuple[Model, Resid
             return None
         recorded = recorded_transitions(validation.model, [trajectory for _, trajectory in executed], loops)
         centres = int(np.clip(_WORK // loops.horizon, *_CENTRES))
-        learned = None if recorded is None else learn_covariance(validation.model, *recorded, centres)
+        model = before_refinement(validation.model)
+        learned = None if recorded is None else learn_covariance(model, *recorded, centres)
         return None if learned is None else (learned.model, learned.residual)
     except Exception:  # the user's own parts, at states that no execution has reached
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,11 @@ from ctxval._util.arrays import Array
 from ctxval._util.files import read_bytes
 from ctxval._util.npz import Archive
 from ctxval._util.registry import part
+from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
+from ctxval.models.corrected import Corrected, Refined
+from ctxval.models.correction import Correction
 from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
 from ctxval.models.linear import Linear
 from ctxval.models.neural_network import FeedforwardReLU
@@ -24,25 +28,54 @@ _SCALING = ("shift_in", "scale_in", "shift_out", "scale_out")
 _DATA = ("x", "u", "x_next")
 _MOST_LAYERS = 100
 
-SavedModel = Linear | FeedforwardReLU | GaussianProcessModel
+_CORRECTED = "corrected_"
+"""Before the names of the arrays of the model that a correction belongs to."""
+
+SavedModel = Linear | FeedforwardReLU | GaussianProcessModel | Corrected
 """The models that can be written to a file."""
 
 
-def write_model(path: str | Path, model: SavedModel) -> None:
+def write_model(path: str | Path, model: Model, note: dict[str, Any] | None = None) -> None:
     """Write a model and the transitions that it was learned from as an NPZ file.
+
+    Of a correction of any other model, the file has the correction alone, which :func:`read_refined` adds to the model
+    that it is given.
 
     Args:
         path: the file.
-        model: a ``Linear``, ``FeedforwardReLU`` or ``GaussianProcessModel``.
+        model: a ``Linear``, ``FeedforwardReLU``, ``GaussianProcessModel`` or ``Corrected``, perhaps ``Refined``.
+        note: plain values that are kept in the file, for :func:`read_note`.
 
     Raises:
         InputError: if the model is another one, or the file cannot be written.
     """
-    arrays = _arrays(model)
-    if model.data is not None:
-        arrays |= {name: getattr(model.data, name) for name in _DATA}
-    about = json.dumps({"format": _FORMAT, "version": 1, "kind": type(model).__name__})
-    _write(path, {"about": np.array(about), **arrays})
+    inner = model.model if isinstance(model, Refined) else model
+    about, arrays = _contents(inner)
+    data = getattr(model, "data", None)
+    if data is not None:
+        arrays |= {name: getattr(data, name) for name in _DATA}
+    about |= {"format": _FORMAT, "version": 1, **({"note": note} if note else {})}
+    _write(path, {"about": np.array(json.dumps(about)), **arrays})
+
+
+def is_savable(model: Model) -> bool:
+    """Return whether :func:`write_model` can write a model."""
+    return isinstance(model.model if isinstance(model, Refined) else model, SavedModel)
+
+
+def read_note(source: str | Path) -> dict[str, Any]:
+    """Return the plain values that were kept beside a model; empty if there are none.
+
+    Raises:
+        InputError: if the file cannot be read.
+    """
+    try:
+        arrays = Archive(read_bytes(source))
+        about = json.loads(arrays.text("about")) if "about" in arrays else {}
+    except (InputError, ValueError) as error:
+        raise InputError(f"{source} cannot be read as a model: {str(error).removesuffix('.')}.") from error
+    note = about.get("note") if isinstance(about, dict) else None
+    return note if isinstance(note, dict) else {}
 
 
 def write_transitions(path: str | Path, data: Transitions | None) -> None:
@@ -57,9 +90,11 @@ def write_transitions(path: str | Path, data: Transitions | None) -> None:
 
 
 def _write(path: str | Path, arrays: dict[str, Any]) -> None:
+    beside = Path(f"{path}.part")
     try:
-        with Path(path).open("wb") as file:
+        with beside.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
+        beside.replace(path)  # a process that is killed leaves no half of a model
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror}.") from error
 
@@ -76,20 +111,34 @@ def read_model(source: str | Path) -> SavedModel:
     Raises:
         InputError: if the file is not a model, or is damaged.
     """
+    return read_refined(source, None)
+
+
+def read_refined(source: str | Path, before: Model | None) -> SavedModel:
+    """Return a model from a file, as :func:`read_model` does; a correction alone is added to the model before.
+
+    Args:
+        source: the file.
+        before: the model that was refined; None if it is not known.
+
+    Raises:
+        InputError: if the file is not a model, is damaged, or has a correction alone of a model that is not known.
+    """
     try:
         arrays = Archive(read_bytes(source))
-        kind = _kind(arrays)
+        about = _about(arrays)
         data = Transitions(*(arrays.numbers(name) for name in _DATA)) if set(_DATA) <= set(arrays.names) else None
-        if kind == "Linear":
-            return Linear(arrays.numbers("A"), arrays.numbers("B"), _optional(arrays, "c"), data)
-        scaling = IncrementScaling(*(arrays.numbers(name) for name in _SCALING))
-        if kind == "FeedforwardReLU":
-            count = sum(name.startswith("weights_") for name in arrays.names)
-            layers = range(min(count, _MOST_LAYERS))
-            weights, biases = ([arrays.numbers(f"{name}_{i}") for i in layers] for name in ("weights", "biases"))
-            return FeedforwardReLU(weights, biases, scaling, data)
-        covariance = SquaredExponential(float(arrays.numbers("variance")), arrays.numbers("length_scales"))
-        return GaussianProcessModel(covariance, arrays.numbers("centres"), arrays.numbers("weights"), scaling, data)
+        if about["kind"] != "Corrected":
+            return _plain_model(arrays, about["kind"], data)
+        own = about.get("corrects")
+        corrected = before if own is None else _plain_model(_Prefixed(arrays), own, None)
+        if corrected is None:
+            raise InputError("it has a correction alone, without the model that is corrected: use read_refined")
+        linearised = about.get("linearised")
+        if linearised not in ("corrected", "model"):
+            raise InputError(f"it does not state whose Jacobian is used, got {str(linearised)[:40]!r}")
+        correction = Correction(*(arrays.numbers(field.name) for field in fields(Correction)))
+        return Corrected(corrected, correction, linearised=linearised, data=data)
     except (InputError, ValueError, TypeError, IndexError) as error:
         raise InputError(
             f"{source} cannot be read as a model (an NPZ file of ctxval, or one with the matrices A (n, n) and B "
@@ -97,27 +146,71 @@ def read_model(source: str | Path) -> SavedModel:
         ) from error
 
 
-def _kind(arrays: Archive) -> str:
+class _Prefixed:
+    """The arrays of the model that a correction belongs to."""
+
+    def __init__(self, arrays: Archive) -> None:
+        self._arrays = arrays
+        self.names = tuple(name.removeprefix(_CORRECTED) for name in arrays.names if name.startswith(_CORRECTED))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    def numbers(self, name: str) -> Array:
+        return self._arrays.numbers(_CORRECTED + name)
+
+
+_PLAIN = (Linear, FeedforwardReLU, GaussianProcessModel)
+
+
+def _plain_model(arrays: Archive | _Prefixed, kind: str, data: Transitions | None) -> SavedModel:
+    if kind == "Linear":
+        c = arrays.numbers("c") if "c" in arrays else None
+        return Linear(arrays.numbers("A"), arrays.numbers("B"), c, data)
+    scaling = IncrementScaling(*(arrays.numbers(name) for name in _SCALING))
+    if kind == "FeedforwardReLU":
+        count = sum(name.startswith("weights_") for name in arrays.names)
+        layers = range(min(count, _MOST_LAYERS))
+        weights, biases = ([arrays.numbers(f"{name}_{i}") for i in layers] for name in ("weights", "biases"))
+        return FeedforwardReLU(weights, biases, scaling, data)
+    covariance = SquaredExponential(float(arrays.numbers("variance")), arrays.numbers("length_scales"))
+    return GaussianProcessModel(covariance, arrays.numbers("centres"), arrays.numbers("weights"), scaling, data)
+
+
+def _about(arrays: Archive) -> dict[str, Any]:
     if "about" not in arrays:
-        return "Linear"
+        return {"kind": "Linear"}
     about: Any = json.loads(arrays.text("about"))
-    kinds = ("Linear", "FeedforwardReLU", "GaussianProcessModel")
+    plain = tuple(kind.__name__ for kind in _PLAIN)
     if not isinstance(about, dict) or about.get("format") != _FORMAT or about.get("version") != 1:
         raise InputError(f"its format must be {_FORMAT!r} of version 1")
-    if about.get("kind") not in kinds:
-        raise InputError(f"its kind must be one of {', '.join(kinds)}, got {str(about.get('kind'))[:40]!r}")
-    return str(about["kind"])
+    for key, kinds in (("kind", (*plain, "Corrected")), ("corrects", plain)):
+        given = about.get(key)
+        if given not in kinds and not (key == "corrects" and given is None):
+            raise InputError(f"its {key} must be one of {', '.join(kinds)}, got {str(given)[:40]!r}")
+    return about
 
 
-def _optional(arrays: Archive, name: str) -> Array | None:
-    return arrays.numbers(name) if name in arrays else None
+def _contents(model: Model) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what a file states about a model, and its arrays."""
+    about: dict[str, Any] = {"kind": type(model).__name__}
+    if not isinstance(model, Corrected):
+        return about, _arrays(model)
+    about["linearised"] = model.linearised
+    arrays: dict[str, Any] = dict(model.correction.arrays())
+    if isinstance(model.model, _PLAIN):
+        about["corrects"] = type(model.model).__name__
+        arrays |= {_CORRECTED + name: array for name, array in _arrays(model.model).items()}
+    return about, arrays
 
 
-def _arrays(model: SavedModel) -> dict[str, Any]:
+def _arrays(model: Model) -> dict[str, Any]:
     if isinstance(model, Linear):
         return {"A": model.A, "B": model.B, "c": model.c}
     if not isinstance(model, FeedforwardReLU | GaussianProcessModel):
-        raise InputError(f"only linear models, networks and Gaussian processes can be written, got {model!r}.")
+        raise InputError(
+            f"only linear models, networks, Gaussian processes and corrections can be written, got {model!r}."
+        )
     scaling = {name: getattr(model.scaling, name) for name in _SCALING}
     if isinstance(model, FeedforwardReLU):
         layers = {f"weights_{i}": weight for i, weight in enumerate(model.weights)}

@@ -1,0 +1,258 @@
+"""``ctxval refine``: learn a better model from the executions that falsified one, and validate it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from ctxval.campaign.campaign import Campaign
+from ctxval.certificates import CertificateOptions
+from ctxval.certificates.verdict import require_threshold
+from ctxval.cli.base import FALSIFIED, app, command, out
+from ctxval.cli.options import (
+    TARGET,
+    AsJson,
+    Confidence,
+    PartOptions,
+    Stochastic,
+    Threshold,
+    Timeout,
+    Workers,
+    named_values,
+)
+from ctxval.cli.screen import line
+from ctxval.cli.trust import Named, Trust, limit_of, open_store
+from ctxval.config.references import reference, require_function
+from ctxval.config.settings import Settings, read_settings
+from ctxval.core.experiment import Experiment
+from ctxval.core.validation import Validation
+from ctxval.errors import InputError
+from ctxval.fitting.model_file import SUFFIXES
+from ctxval.refinement import Method, Parameters, Refinement, refine
+from ctxval.refinement.files import write_refined
+from ctxval.refinement.methods import NAMES, UserFit, method_of
+from ctxval.storage.store import Store
+
+_STORES = (".sqlite", ".sqlite3", ".db")
+
+Target = Annotated[
+    str,
+    typer.Argument(
+        metavar=f"STORE|{TARGET}",
+        help="Store of the campaign that falsified the model (a .sqlite file), or an experiment, which is then run "
+        "first.",
+    ),
+]
+Budget = Annotated[
+    int | None,
+    typer.Option(
+        help="Largest total number of executions of all rounds, including those in STORE (default: the executions in "
+        "STORE and the budget of the experiment)."
+    ),
+]
+MethodName = Annotated[
+    str,
+    typer.Option(
+        help=f"How the model is learned again: {', '.join(NAMES)}. residual corrects the given model; linear, network "
+        "and gaussian-process replace it; parameters estimates those of --step, or of the given model if it is a "
+        "Parametric; fit calls the function of --fit."
+    ),
+]
+Fit = Annotated[
+    str | None,
+    typer.Option(
+        "--fit",
+        metavar="MODULE:ATTR",
+        help="Your function fit(data) -> model, for the method fit. It must return the same model for the same data.",
+    ),
+]
+StepFunction = Annotated[
+    str | None,
+    typer.Option("--step", metavar="MODULE:ATTR", help="Your function (x, u, theta) -> x_next, for parameters."),
+]
+Bounds = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--parameter",
+        metavar="NAME=[LOW, HIGH]",
+        help="Bounds of a parameter, such as mass=[0.5, 2.0], for the method parameters. Repeat --parameter in the "
+        "order of theta.",
+    ),
+]
+Vectorized = Annotated[bool, typer.Option("--vectorized", help="State that --step takes whole batches of x and u.")]
+Output = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        help="File for the last model: .onnx, which a robot can load without ctxval, .npz, or .toml for the parameters "
+        "of --step. Its measured residual is written next to it, as .residual.json and .residual.txt.",
+    ),
+]
+Seed = Annotated[int | None, typer.Option(min=0, help="Seed of an experiment that is run first (default: 0).")]
+
+
+@dataclass(frozen=True, eq=False)
+class _Opened:
+    """The experiment of the first model, its campaign, and the settings of both."""
+
+    settings: Settings
+    experiment: Experiment
+    campaign: Campaign
+
+
+@app.command("refine")
+@command
+def refine_model(
+    target: Target,
+    threshold: Threshold = None,
+    budget: Budget = None,
+    method: MethodName = "residual",
+    fit: Fit = None,
+    step: StepFunction = None,
+    parameter: Bounds = None,
+    vectorized: Vectorized = False,
+    output: Output = None,
+    confidence: Confidence = None,
+    stochastic: Stochastic = None,
+    seed: Seed = None,
+    workers: Workers = None,
+    timeout: Timeout = None,
+    experiment: Named = None,
+    trust: Trust = False,
+    option: PartOptions = None,
+    as_json: AsJson = False,
+) -> Any:
+    """Learn a better model from the executions that falsified one, and validate it, until it is validated.
+
+    Each refined model has a store and a file of its own next to STORE, such as cart.round-1.sqlite and
+    cart.round-1.npz. Run the same command again to resume. An execution counts for the model on which its controller
+    was designed, and for no other one; what was recorded goes on teaching.
+    """
+    chosen = _method(method, fit, step, parameter, vectorized)
+    if output is not None and output.suffix not in SUFFIXES:
+        raise InputError(f"the file of a model must end in {', '.join(SUFFIXES)}, got {str(output)!r}.")
+    if Path(target).suffix in _STORES:
+        if seed is not None or option:
+            raise InputError("--seed and --option are for an experiment; a store has its own.")
+        opened = _of_store(Path(target), experiment, trust)
+    else:
+        if experiment is not None or trust:
+            raise InputError("--experiment and --trust are for a store.")
+        opened = _of_experiment(target, seed, named_values(option))
+    stated = {"stochastic": stochastic}
+    settings = opened.settings.certified_as(stated)
+    settings = settings if confidence is None else settings.model_copy(update={"confidence": confidence})
+    opened = replace(opened, settings=settings)
+    limit = require_threshold(threshold) if threshold is not None else limit_of(opened.experiment, settings)
+    if limit is None:
+        raise InputError("a refinement needs a threshold: give --threshold.")
+    found = refine(
+        opened.campaign,
+        limit,
+        _budget(budget, opened),
+        method=chosen,
+        certificate=settings.certificate_options,
+        open_round=_Rounds(opened),
+        workers=workers,
+        timeout=timeout,
+    )
+    files = [] if output is None or not found.last.number else write_refined(output, found, step)
+    if not as_json:
+        _print(found, files)
+    return {**found.to_dict(), "files": files}, FALSIFIED if found.answer == "falsified" else 0
+
+
+def _method(name: str, fit: str | None, step: str | None, parameter: list[str] | None, vectorized: bool) -> Method:
+    if (fit is not None) != (name == "fit"):
+        raise InputError("--method fit and --fit MODULE:ATTR must be given together.")
+    if (parameter is not None and len(parameter) > 0) != (name == "parameters"):
+        raise InputError("--method parameters and --parameter must be given together.")
+    if step is not None and name != "parameters":
+        raise InputError("--step is for --method parameters.")
+    if fit is not None:
+        return UserFit(require_function(f"--fit {fit}", reference(fit), "(data) -> model"))
+    if name != "parameters":
+        return method_of(name)
+    function = None if step is None else require_function(f"--step {step}", reference(step), "(x, u, theta) -> x_next")
+    return Parameters(named_values(parameter, "--parameter"), function, vectorized)
+
+
+def _of_store(path: Path, experiment: str | None, trust: bool) -> _Opened:
+    found = open_store(Store.existing(path), path, experiment, trust)
+    return _Opened(found.settings, found.experiment, found.campaign)
+
+
+def _of_experiment(target: str, seed: int | None, options: dict[str, Any]) -> _Opened:
+    settings = read_settings(target, {"seed": seed, "options": options})
+    experiment = settings.load()
+    return _Opened(settings, experiment, settings.campaign(experiment, settings.store_path(experiment.name)))
+
+
+def _budget(given: int | None, opened: _Opened) -> int:
+    if given is not None:
+        return given
+    own = opened.experiment.budget if opened.settings.budget is None else opened.settings.budget
+    return opened.campaign.executions + own
+
+
+@dataclass(frozen=True, eq=False)
+class _Rounds:
+    """Makes the campaigns of rounds, whose stores name the experiment and the file of the model."""
+
+    first: _Opened
+
+    def __call__(
+        self, validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
+    ) -> Campaign:
+        settings, name = self.first.settings, self.first.experiment.name
+        if model_file is None or store is None:  # the model cannot be read again, so other commands cannot load it
+            search = settings.search.build(settings.folder)
+            return Campaign(validation, search=search, store=store, seed=settings.seed, name=name)
+        known = {"refined": model_file.resolve(), "confidence": certificate.confidence}
+        experiment = replace(self.first.experiment, validation=validation, truth=None)
+        return settings.model_copy(update=known).campaign(experiment, store)
+
+
+def _print(found: Refinement, files: list[str]) -> None:
+    table = Table(box=None, pad_edge=False)
+    for name in ("round", "model", "executions", f"worst distance {found.units}".rstrip(), "verdict", "store"):
+        table.add_column(name)
+    for one in found.rounds:
+        worst = "-" if one.worst is None else f"{one.worst:.4g}"
+        cells = (
+            str(one.number),
+            one.method,
+            str(one.executions),
+            worst,
+            one.verdict.answer,
+            one.store.name if one.store else "-",
+        )
+        table.add_row(*map(line, cells))
+    out.print(table)
+    for one in found.rounds:
+        for note in one.notes:
+            out.say((f"round {one.number}: ", "bold"), note, wrap=True)
+    out.say((found.answer, "bold"), f" against {found.threshold:g}: {found.ended}.", wrap=True)
+    out.say(found.last.verdict.reason, wrap=True)
+    out.say(found.statement, wrap=True)
+    for parameter in found.parameters:
+        note = f"; {parameter.note}" if parameter.note else ""
+        between = f"between {parameter.low:.6g} and {parameter.high:.6g} with confidence 0.95{note}"
+        out.say((parameter.name, "bold"), f" = {parameter.value:.6g}, {between}")
+    _print_residual(found)
+    if files:
+        out.say(f"the model of round {found.last.number} is in {' and '.join(files)}")
+
+
+def _print_residual(found: Refinement) -> None:
+    residual = found.residual
+    if residual is None:
+        return
+    out.say(("residual of one step", "bold"), ", measured on executions that the model was not learned from:")
+    for row in residual.text.splitlines():
+        out.say(row)
+    out.say(f"measured for {residual.range_text}; it is not guaranteed, and nothing is known outside.", wrap=True)

@@ -1,0 +1,76 @@
+"""A learned model as a file, in the format that the suffix of the file names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ctxval.core.model import Model
+from ctxval.errors import InputError
+from ctxval.fitting.onnx_file import write_onnx
+from ctxval.models import (
+    Corrected,
+    FeedforwardReLU,
+    GaussianProcessModel,
+    Linear,
+    Parametric,
+    write_model,
+    write_transitions,
+)
+
+SUFFIXES: dict[str, tuple[type, ...]] = {
+    ".npz": (Linear, FeedforwardReLU, GaussianProcessModel, Corrected),
+    ".onnx": (Linear, FeedforwardReLU, GaussianProcessModel, Corrected),
+    ".toml": (Parametric,),
+}
+"""The models that a file of each suffix can hold."""
+
+
+def require_file_for(path: Path, model: Model) -> None:
+    """Check that a file of this suffix can hold a model.
+
+    Raises:
+        InputError: if it cannot.
+    """
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"the file of a model must end in {', '.join(SUFFIXES)}, got {str(path)!r}.")
+    if not isinstance(model, SUFFIXES[path.suffix]):
+        raise InputError(f"the model {model!r} cannot be written to a file that ends in {path.suffix}.")
+
+
+def write_model_file(path: Path, model: Model, step: str | None = None) -> list[str]:
+    """Write a model to a file, and the data of an ONNX file to another one; return their paths.
+
+    Args:
+        path: the file.
+        model: the model.
+        step: ``module:attr`` of the user's function, for its parameters.
+
+    Raises:
+        InputError: if a file of this suffix cannot hold the model, or cannot be written.
+    """
+    require_file_for(path, model)
+    if isinstance(model, Parametric):
+        _write_parameters(path, model, step)
+    elif path.suffix == ".onnx":
+        write_onnx(path, model)
+        data = getattr(model, "data", None)
+        if data is not None:
+            beside = path.with_suffix(".data.npz")
+            write_transitions(beside, data)
+            return [str(path), str(beside)]
+    else:
+        write_model(path, model)
+    return [str(path)]
+
+
+def _write_parameters(path: Path, model: Parametric, step: str | None) -> None:
+    if step is None:
+        raise InputError("the parameters of a function can only be written with the reference module:attr to it.")
+    values = ", ".join(f"{name} = {value!r}" for name, value in model.theta.items())
+    text = f'[model]\ntype = "Parametric"\nstep = {{ ref = "{step}" }}\ntheta = {{ {values} }}\n'
+    if model.vectorized:
+        text += "vectorized = true\n"
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}.") from error

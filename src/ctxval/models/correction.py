@@ -1,0 +1,141 @@
+"""Corrections of a model: functions of state and input that are learned from executions and added to its steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Mask
+from ctxval._util.representation import call
+from ctxval.errors import InputError, ShapeError
+from ctxval.models.scaling import standardised_pairs
+
+_CACHED = 40_000
+"""Number of covariances that are computed together, so that they stay in the processor's cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """The correction ``r(x, u)``: a weighted sum of Matern 5/2 covariances with centres, and a linear function.
+
+    A pair is standardised, ``z = ((x, u) - shift) / scale``. Outside the box of the recorded pairs, the correction
+    fades: it is multiplied by ``exp(-1/2 sum_j (e_j / fade_j)^2)``, where e_j is the distance to the box. Far from all
+    records it is zero, and the model is as before.
+
+    Attributes:
+        shift, scale: constants of the standardised pairs, shapes ``(n + m,)``.
+        centres: standardised pairs, shape ``(M, n + m)``.
+        length_scales: of the covariance, shape ``(n + m,)``.
+        weights: of the covariances, in the units of the states, shape ``(M, n)``.
+        linear: slopes, and the constant as the last row, shape ``(n + m + 1, n)``.
+        low, high: the box of the recorded pairs, standardised, shapes ``(n + m,)``.
+        fade: standardised distances from the box over which the correction fades, shape ``(n + m,)``.
+        limit: largest magnitude of the correction of each state, shape ``(n,)``.
+
+    Raises:
+        ShapeError: if the shapes do not fit together.
+        InputError: if a value is not finite, or a scale is not positive.
+    """
+
+    shift: Array
+    scale: Array
+    centres: Array
+    length_scales: Array
+    weights: Array
+    linear: Array
+    low: Array
+    high: Array
+    fade: Array
+    limit: Array
+
+    def __post_init__(self) -> None:
+        n, k = len(self.limit), len(self.shift)
+        M = len(self.centres)
+        wanted = {
+            **dict.fromkeys(("shift", "scale", "length_scales", "low", "high", "fade"), (k,)),
+            **{"centres": (M, k), "weights": (M, n), "linear": (k + 1, n), "limit": (n,)},
+        }
+        for name, shape in wanted.items():
+            value = getattr(self, name)
+            if value.shape != shape or not 0 < n < k:
+                raise ShapeError(f"{name} of a correction must have shape {shape}, got {value.shape}.")
+            if not np.isfinite(value).all():
+                raise InputError(f"{name} of a correction must be finite.")
+        if min(float(one.min()) for one in (self.scale, self.length_scales, self.fade)) <= 0:
+            raise InputError("the scales of a correction must be positive.")
+
+    @property
+    def states(self) -> int:
+        """The number n of states."""
+        return len(self.limit)
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        """Return r, shapes ``(..., n), (..., m) -> (..., n)``."""
+        z = standardised_pairs(x, u, self.shift, self.scale)
+        rows = z.reshape(-1, z.shape[-1])
+        values = rows @ self.linear[:-1] + self.linear[-1]
+        size = max(1, _CACHED // max(1, len(self.centres)))
+        for first in range(0, len(rows), size):
+            values[first : first + size] += self._covariances(rows[first : first + size])[0] @ self.weights
+        values = np.clip(values, -self.limit, self.limit) * self._faded(rows)[:, None]
+        return np.asarray(values.reshape(*z.shape[:-1], self.states))
+
+    def jacobian(self, x: Array, u: Array) -> Array:
+        """Return the derivatives by state and input, shape ``(..., n, n + m)``."""
+        z = standardised_pairs(x, u, self.shift, self.scale)
+        rows = z.reshape(-1, z.shape[-1])
+        size = max(1, _CACHED // max(1, len(self.centres)))
+        parts = [self._jacobian(rows[first : first + size]) for first in range(0, max(1, len(rows)), size)]
+        return np.concatenate(parts).reshape(*z.shape[:-1], self.states, z.shape[-1])
+
+    def _jacobian(self, rows: Array) -> Array:
+        covariances, slopes = self._covariances(rows)
+        k = rows.shape[1]
+        moments = (self.weights[:, :, None] * self.centres[:, None, :]).reshape(-1, self.states * k)
+        pulls = (slopes @ moments).reshape(-1, self.states, k)
+        pulls -= (slopes @ self.weights)[:, :, None] * rows[:, None, :]
+        slope = pulls / self.length_scales**2 + self.linear[:-1].T
+        values = covariances @ self.weights + rows @ self.linear[:-1] + self.linear[-1]
+        limited: Mask = np.asarray(np.abs(values) > self.limit)
+        slope[limited] = 0.0
+        faded, beyond = self._faded(rows), self._beyond(rows)
+        slope *= faded[:, None, None]
+        values = np.clip(values, -self.limit, self.limit) * faded[:, None]
+        slope -= values[:, :, None] * (beyond / self.fade**2)[:, None, :]
+        return np.asarray(slope / self.scale)
+
+    def _covariances(self, rows: Array) -> tuple[Array, Array]:
+        """Return covariances k ``(q, M)`` of unit variance, and the factors of ``(c - z) / l^2`` in their gradients."""
+        a, b = rows / self.length_scales, self.centres / self.length_scales
+        r2 = a @ (-10 * b.T)
+        r2 += 5 * (a**2).sum(axis=1)[:, None]
+        r2 += 5 * (b**2).sum(axis=1)
+        np.maximum(r2, 0.0, out=r2)
+        s = np.sqrt(r2)
+        decay = np.exp(-s)
+        s += 1
+        s *= decay
+        r2 *= decay
+        r2 /= 3
+        r2 += s
+        s *= 5 / 3
+        return r2, s
+
+    def _beyond(self, rows: Array) -> Array:
+        """Return how far pairs are beyond the box of the records, with signs, shape ``(q, n + m)``."""
+        return np.asarray(rows - np.clip(rows, self.low, self.high))
+
+    def _faded(self, rows: Array) -> Array:
+        return np.asarray(np.exp(-0.5 * ((self._beyond(rows) / self.fade) ** 2).sum(axis=1)))
+
+    def of_states(self, chosen: Mask) -> Correction:
+        """Return this correction for some states ``(n,)``; that of the others is zero."""
+        return replace(self, weights=np.where(chosen, self.weights, 0.0), linear=np.where(chosen, self.linear, 0.0))
+
+    def arrays(self) -> dict[str, Array]:
+        """Return all arrays by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def __repr__(self) -> str:
+        return call(self, states=self.states, centres=len(self.centres))

@@ -1,0 +1,28 @@
+"""Better models from executions: a model is learned again from what falsified it, and validated again."""
+
+from __future__ import annotations
+
+from ctxval.refinement.disturbance import MeasuredResidual, ResidualRegion, measure_residual
+from ctxval.refinement.held_out import HeldOut, held_out
+from ctxval.refinement.methods import Learned, Method, Parameters, Refit, ResidualCorrection, UserFit
+from ctxval.refinement.records import Records
+from ctxval.refinement.refine import refine
+from ctxval.refinement.rounds import Refinement, Round
+
+__all__ = [
+    "HeldOut",
+    "Learned",
+    "MeasuredResidual",
+    "Method",
+    "Parameters",
+    "Records",
+    "Refinement",
+    "Refit",
+    "ResidualCorrection",
+    "ResidualRegion",
+    "Round",
+    "UserFit",
+    "held_out",
+    "measure_residual",
+    "refine",
+]

@@ -1,0 +1,164 @@
+"""Which Jacobian controllers are designed with, and whose controllers on executed tasks have not changed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.representation import record
+from ctxval.core.model import Model, linearize
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
+from ctxval.errors import CtxvalError
+from ctxval.learning.recorded import closed_loops_on_model
+from ctxval.models import Corrected, Linear, Refined
+
+_SAME = 1e-6
+"""Largest difference between the inputs of two controllers, as a share of the range of each input."""
+_BETTER = 0.95
+"""The Jacobian of M' is used for one linearisation if this lowers the cost of the tasks on M' to so much of it."""
+_ONCE = 2
+"""Largest number of states and inputs at which a synthesizer that linearises once asks for the Jacobian."""
+_TASKS = 32
+"""Largest number of tasks whose controllers are compared."""
+
+
+@dataclass(frozen=True)
+class SameControllers:
+    """Executed tasks of earlier rounds on which the refined model has the controller that was executed.
+
+    The distance of the refined model on such a task is known without another execution, if the system is
+    deterministic. The model has learned from them, so they can falsify it, and they never count for it.
+
+    Attributes:
+        tasks: number of executed tasks that were compared.
+        same: number of those whose controller is numerically the same.
+        worst: the largest distance of the refined model on them; None if there are none.
+    """
+
+    tasks: int = 0
+    same: int = 0
+    worst: float | None = None
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refined, str | None]:
+    """Return a refined model with the Jacobian whose controllers complete the tasks best on the refined model itself.
+
+    A synthesizer that linearises once, such as LQR, needs a linear model that is good on the whole task. If M is
+    linear, it is such a model, and the Jacobian of a nonlinear M' at one point may be none. It is used only if random
+    tasks have a clearly smaller cost on M' with it. Nothing is executed.
+
+    Args:
+        validation: the map p -> d(p) of the first model.
+        refined: the refined model.
+
+    Returns:
+        the model, and a sentence if the Jacobian of M is used.
+    """
+    own = refined.model
+    if not isinstance(own, Corrected) or not _linearises_a_linear_model_once(validation, own.model):
+        return refined, None
+    kept = Refined(
+        Corrected(own.model, own.correction, linearised="model", data=own.data), refined.data, refined.before
+    )
+    costs = [_typical_cost(validation.with_model(model)) for model in (refined, kept)]
+    if costs[0] <= _BETTER * costs[1]:
+        return refined, None
+    return kept, (
+        "controllers are designed with the Jacobian of the model before, and the prediction is corrected: the "
+        "synthesizer linearises once, and the tasks are not completed clearly better on the refined model with its own "
+        f"Jacobian (their cost is {costs[0] / costs[1]:.3g} times as large)"
+    )
+
+
+class _Counted:
+    """A model that counts the states and inputs at which its Jacobian is asked for."""
+
+    def __init__(self, model: Model) -> None:
+        self.model, self.points = model, 0
+
+    def step(self, x: Array, u: Array) -> Array:
+        return self.model.step(x, u)
+
+    def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
+        self.points += int(np.prod(x.shape[:-1]))
+        A, B = linearize(self.model, x, u)
+        return np.broadcast_to(A, (*x.shape[:-1], *A.shape[-2:])), np.broadcast_to(B, (*x.shape[:-1], *B.shape[-2:]))
+
+
+def _linearises_a_linear_model_once(validation: Validation, model: Model) -> bool:
+    """Return whether M is linear, and the design of one controller asks for its Jacobian at one or two points."""
+    if not isinstance(model, Linear):
+        return False
+    counted = _Counted(model)
+    try:
+        validation.with_model(counted).plan(validation.space.from_unit(np.full(validation.space.dimension, 0.5)))
+    except CtxvalError:
+        return False
+    return 1 <= counted.points <= _ONCE
+
+
+def _typical_cost(validation: Validation) -> float:
+    """Return the median cost of random tasks on a model; infinity if their controllers cannot be designed."""
+    try:
+        with single_threaded():
+            loops = closed_loops_on_model(validation)
+            if loops is None or loops.states.ndim == 2:
+                return _cost_one_by_one(validation)
+            space = validation.space
+            points = space.from_unit(np.random.default_rng(0).random((len(loops.states), space.dimension)))
+            costs = _cost(validation, validation.task(space.parameters(points)), loops)
+            return float(np.median(costs)) if np.isfinite(costs).all() else np.inf
+    except Exception:  # the user's own parts, on tasks that may never be executed
+        return np.inf
+
+
+def _cost_one_by_one(validation: Validation) -> float:
+    space = validation.space
+    points = space.from_unit(np.random.default_rng(0).random((8, space.dimension)))
+    plans = [validation.plan(point) for point in points]
+    return float(np.median([_cost(validation, plan.task, plan.model_trajectory) for plan in plans]))
+
+
+def _cost(validation: Validation, task: Task, loops: Trajectory) -> Array:
+    """Return the cost of closed loops: that of the synthesizer, or else the squared deviation from the reference."""
+    deviations = np.moveaxis(loops.states - task.reference, -2, 0)
+    value = getattr(getattr(validation.synthesizer, "cost", None), "value", None)
+    if callable(value):
+        return np.asarray(value(deviations, np.moveaxis(loops.inputs, -2, 0)))
+    sizes = np.maximum(np.abs(loops.states).reshape(-1, loops.states.shape[-1]).std(axis=0), 1e-12)
+    return np.asarray(((deviations / sizes) ** 2).sum(axis=(0, -1)))
+
+
+def same_controllers(validation: Validation, executed: Sequence[tuple[Trial, Trajectory]]) -> SameControllers:
+    """Return on how many executed tasks the controllers of a refined model are those that were executed.
+
+    Args:
+        validation: the map p -> d(p) of the refined model.
+        executed: completed trials of earlier rounds, with the trajectories of the system.
+    """
+    some = executed[-_TASKS:]
+    distances = [one for one in (_known_distance(validation, *pair) for pair in some) if one is not None]
+    return SameControllers(len(some), len(distances), max(distances, default=None))
+
+
+def _known_distance(validation: Validation, trial: Trial, recorded: Trajectory) -> float | None:
+    """Return the distance of a refined model on an executed task; None if its controller has changed."""
+    try:
+        plan = validation.plan(validation.space.from_unit(trial.unit_point))
+        inputs = np.array([plan.controller(t, x) for t, x in enumerate(recorded.states[:-1])])
+        if inputs.shape != recorded.inputs.shape:
+            return None
+        ranges = np.maximum(np.ptp(recorded.inputs, axis=0), 1e-9)
+        same = bool((np.abs(inputs - recorded.inputs) <= _SAME * ranges).all())
+        return validation.accept(plan, recorded).distance if same else None
+    except Exception:  # the user's own parts: what cannot be compared is not the same
+        return None

@@ -1,0 +1,321 @@
+"""The methods by which a model is learned again from executions."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from ctxval._util.arrays import Mask, single_threaded
+from ctxval._util.representation import call, record
+from ctxval._util.texts import reason_of
+from ctxval.core.model import Model, Step, as_model
+from ctxval.core.trajectory import Transitions
+from ctxval.errors import CtxvalError, InputError, ModelError, UnknownNameError
+from ctxval.fitting import FittedParameter, fit_parameters
+from ctxval.fitting.least_squares import as_bounds
+from ctxval.learning import Residual, learn_covariance
+from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
+from ctxval.models.parametric import ParametricStep
+from ctxval.refinement.held_out import HeldOut, held_out
+from ctxval.refinement.records import Records
+
+_CENTRES = 300
+"""Largest number of transitions that a correction is conditioned on."""
+_FEWEST, _PRECISE = 24, 0.005
+"""Fewer of them are kept, at least so many, if they predict the others with this relative error: design on the model is
+then faster."""
+_UNITS = (32, 32)
+"""Numbers of units in the hidden layers of a network."""
+_NEGLIGIBLE = 1e-7
+"""A residual below this share of the state's typical change is rounding."""
+_CHECKED = 50
+"""Number of recorded pairs at which a learned model is tried."""
+
+RefitKind = Literal["linear", "network", "gaussian-process"]
+NAMES = ("residual", *get_args(RefitKind), "parameters", "fit")
+"""The names of the methods on the command line."""
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """A model that was learned from records.
+
+    Attributes:
+        model: the model.
+        errors: its errors on records that were held out.
+        notes: sentences on what was learned.
+        parameters: the parameters of the user's function; none for other methods.
+    """
+
+    model: Model
+    errors: HeldOut
+    notes: tuple[str, ...] = ()
+    parameters: tuple[FittedParameter, ...] = ()
+
+    def __repr__(self) -> str:
+        return call(self, self.model, self.errors)
+
+
+class Method(ABC):
+    """A method that learns a model from records. It is a function of the model and the records.
+
+    Attributes:
+        name: its name.
+    """
+
+    name: str
+
+    @abstractmethod
+    def learn(self, model: Model, records: Records) -> Learned:
+        """Return the model that is learned from records.
+
+        Args:
+            model: the first model, which is corrected or replaced.
+            records: the records.
+
+        Raises:
+            InputError: if the records do not suffice.
+            ModelError: if the learned model is not usable.
+        """
+
+
+@dataclass(frozen=True)
+class ResidualCorrection(Method):
+    """The first model with a correction: the mean of Gaussian processes of its residual.
+
+    A state is corrected only if this lowers the error on executions that are held out. Outside the range of the
+    records the correction fades, so that the model is as before.
+
+    Attributes:
+        centres: largest number of transitions that the correction is conditioned on.
+    """
+
+    centres: int = _CENTRES
+    name: str = field(default="residual", init=False)
+
+    def learn(self, model: Model, records: Records) -> Learned:
+        """Return the corrected model."""
+
+        def corrected(some: Records) -> Model:
+            found = self._correction(model, some)
+            return model if found is None else Corrected(model, found)
+
+        errors = held_out(corrected, model, records)
+        better = errors.better
+        whole = self._correction(model, records)
+        if whole is None or not better.any():
+            raise InputError(
+                "no state can be corrected: on executions that were held out, the residual of the model is not "
+                "predicted from state and input. A state may be missing, such as a temperature or a delay, or the "
+                "executions have too little in common."
+            )
+        worth: Mask = np.asarray(errors.rms_before > _NEGLIGIBLE * errors.changes.std(axis=0))
+        notes = () if (better | ~worth).all() else (_uncorrected(better | ~worth),)
+        return Learned(Corrected(model, whole.of_states(better), data=records.transitions), errors.kept(better), notes)
+
+    def _correction(self, model: Model, records: Records) -> Correction | None:
+        found = learn_covariance(model, records.transitions, records.sources, self.centres, of_steps=False)
+        return None if found is None else correction_of(found.residual)
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+def correction_of(residual: Residual) -> Correction:
+    """Return a learned residual as a correction, with the box of the records that it was learned from."""
+    recorded = np.concatenate([residual.centres, residual.unused[0]])
+    low, high = recorded.min(axis=0), recorded.max(axis=0)
+    with single_threaded():
+        residual = residual.rough(_FEWEST, _PRECISE)
+    values = np.exp(residual.theta)
+    variance, scales, constant, slope = values[0], values[1:-2], values[-2], values[-1]
+    with single_threaded():
+        weights = residual.process.weights * residual.scale_out
+    linear = np.concatenate([slope * residual.centres.T @ weights, constant * weights.sum(axis=0, keepdims=True)])
+    return Correction(
+        residual.shift_in,
+        residual.scale_in,
+        residual.centres,
+        scales,
+        variance * weights,
+        linear,
+        low,
+        high,
+        # A coordinate that the residual does not depend on fades the correction within one more range of the records.
+        np.minimum(scales, np.maximum(high - low, 1.0)),
+        residual.limit * residual.scale_out,
+    )
+
+
+def _uncorrected(better: Mask) -> str:
+    rows = ", ".join(str(i) for i in np.flatnonzero(~better).tolist())
+    return f"not corrected, because the error on held-out executions would not fall: state {rows}"
+
+
+@dataclass(frozen=True)
+class Refit(Method):
+    """A new model of a kind of :func:`ctxval.fitting.fit`, in place of the first model.
+
+    Attributes:
+        kind: ``linear``, ``network`` or ``gaussian-process``.
+        seed: seed of all random numbers.
+
+    Raises:
+        UnknownNameError: if there is no such kind.
+    """
+
+    kind: RefitKind
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(RefitKind):
+            raise UnknownNameError.among("kind of model", str(self.kind), get_args(RefitKind))
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """Its kind."""
+        return self.kind
+
+    def learn(self, model: Model, records: Records) -> Learned:
+        """Return the new model."""
+        made: dict[str, Callable[[Transitions], Model]] = {
+            "linear": Linear.fit,
+            "network": lambda data: FeedforwardReLU.fit(data, _UNITS, seed=self.seed, restarts=2),
+            "gaussian-process": lambda data: GaussianProcessModel.fit(data, _CENTRES, seed=self.seed),
+        }
+
+        def fitted(some: Records) -> Model:
+            with single_threaded():
+                return made[self.kind](some.transitions)
+
+        return Learned(_usable(fitted(records), records), held_out(fitted, model, records))
+
+    def __repr__(self) -> str:
+        return record(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters(Method):
+    """New values of the parameters of a user's function ``(x, u, theta) -> x_next``, by least squares.
+
+    Attributes:
+        bounds: the bounds of each parameter by name, in the order of theta.
+        step: the function; None for that of the first model, which must then be a ``Parametric``.
+        vectorized: whether ``step`` takes whole batches.
+        seed: seed of the starting points.
+
+    Raises:
+        InputError: if the bounds cannot be used.
+    """
+
+    bounds: Mapping[str, tuple[float, float]]
+    step: ParametricStep | None = None
+    vectorized: bool = False
+    seed: int = 0
+    name: str = field(default="parameters", init=False)
+
+    def __post_init__(self) -> None:
+        as_bounds(self.bounds)
+
+    def learn(self, model: Model, records: Records) -> Learned:
+        """Return the model with the new parameters."""
+        step, vectorized = self.step, self.vectorized
+        if step is None:
+            if not isinstance(model, Parametric):
+                raise InputError("the method 'parameters' needs step=, because the model is not a Parametric.")
+            step, vectorized = model.function, model.vectorized
+        known: dict[str, Any] = {"vectorized": vectorized, "seed": self.seed}
+
+        def fitted(some: Records) -> Model:
+            return fit_parameters(step, self.bounds, some.transitions, **known)[0]
+
+        found, parameters = fit_parameters(step, self.bounds, records.transitions, **known)
+        return Learned(_usable(found, records), held_out(fitted, model, records), parameters=parameters)
+
+    def __repr__(self) -> str:
+        return call(self, self.step, bounds=dict(self.bounds))
+
+
+@dataclass(frozen=True, eq=False)
+class UserFit(Method):
+    """The user's own function ``fit(data) -> model``.
+
+    Attributes:
+        fit: the function of the transitions; it must always return the same for the same data.
+
+    Raises:
+        InputError: if it is not a function.
+    """
+
+    fit: Callable[[Transitions], Model | Step]
+    name: str = field(default="fit", init=False)
+
+    def __post_init__(self) -> None:
+        if not callable(self.fit):
+            raise InputError(f"fit must be a function (data) -> model, got {self.fit!r}.")
+
+    def learn(self, model: Model, records: Records) -> Learned:
+        """Return the model that the function returns."""
+        found = _usable(self._fitted(records), records)
+        return Learned(found, held_out(self._fitted, model, records))
+
+    def _fitted(self, records: Records) -> Model:
+        try:
+            return as_model(self.fit(records.transitions))
+        except CtxvalError as error:
+            raise InputError(f"the fit failed: {error}") from error
+        except (Exception, SystemExit) as error:
+            raise InputError(f"the fit failed: {reason_of(error)}.") from error
+
+    def __repr__(self) -> str:
+        return call(self, self.fit)
+
+
+def _usable(model: Model, records: Records) -> Model:
+    """Return a model that gives finite states of the right shape at recorded pairs.
+
+    Raises:
+        ModelError: if it does not.
+    """
+    data = records.transitions
+    rows = np.linspace(0, len(data) - 1, min(_CHECKED, len(data))).astype(int)
+    try:
+        with np.errstate(all="ignore"):
+            found = np.asarray(model.step(data.x[rows], data.u[rows]), dtype=np.float64)
+    except CtxvalError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise ModelError(f"the learned model failed on recorded states and inputs: {reason_of(error)}.") from error
+    if found.shape != data.x[rows].shape:
+        raise ModelError(
+            f"the learned model must return states of shape {data.x[rows].shape} for as many states, got {found.shape}."
+        )
+    if not np.isfinite(found).all():
+        raise ModelError("the learned model returns NaN or infinity on recorded states and inputs.")
+    return model
+
+
+def method_of(method: str | Method | Callable[[Transitions], Any], *, seed: int = 0) -> Method:
+    """Return a method by its name, a method unchanged, and a function ``fit(data) -> model`` as a method.
+
+    Raises:
+        UnknownNameError: if there is no such method.
+        InputError: if the method needs more than its name.
+    """
+    if isinstance(method, Method):
+        return method
+    if not isinstance(method, str):
+        return UserFit(method)
+    if method == "residual":
+        return ResidualCorrection()
+    if method in get_args(RefitKind):
+        return Refit(method, seed)  # type: ignore[arg-type]
+    if method == "parameters":
+        raise InputError("the method 'parameters' needs bounds: give refinement.Parameters({'mass': (0.5, 2.0)}).")
+    if method == "fit":
+        raise InputError("the method 'fit' needs a function: give the function fit(data) -> model itself.")
+    raise UnknownNameError.among("method of refinement", method, NAMES)

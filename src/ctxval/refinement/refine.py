@@ -1,0 +1,324 @@
+"""``refine``: learn a model again from the executions that falsified it, and validate it, until it is validated."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from ctxval._util.progress import stage
+from ctxval._util.progress_display import progress_shown
+from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.history import executed_trials
+from ctxval.certificates import CertificateOptions, Verdict
+from ctxval.certificates.verdict import counterexample, require_threshold
+from ctxval.core.model import Model, Step
+from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
+from ctxval.errors import CtxvalError, InputError
+from ctxval.models import Refined, read_refined, write_model
+from ctxval.models.corrected import before_refinement
+from ctxval.models.saved import is_savable, read_note
+from ctxval.refinement.design import SameControllers, same_controllers, with_best_jacobian
+from ctxval.refinement.disturbance import MeasuredResidual, measure_residual
+from ctxval.refinement.methods import Learned, Method, method_of
+from ctxval.refinement.records import Records
+from ctxval.refinement.rounds import Refinement, Round
+
+
+class OpensRound(Protocol):
+    """Makes the campaign of a round."""
+
+    def __call__(
+        self, validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
+    ) -> Campaign:
+        """Return the campaign of a refined model.
+
+        Args:
+            validation: the map p -> d(p) of the model.
+            store: the store of the round; None to keep its trials in memory.
+            model_file: the file of the model; None if there is none.
+            certificate: the certificate of the round, with its confidence.
+        """
+
+
+def refine(
+    campaign: Campaign,
+    threshold: float,
+    budget: int,
+    *,
+    method: str | Method | Callable[[Transitions], Model | Step] = "residual",
+    certificate: CertificateOptions | None = None,
+    on_trial: Callable[[Trial], None] | None = None,
+    open_round: OpensRound | None = None,
+    progress: bool | None = None,
+    **execution: Any,
+) -> Refinement:
+    """Learn a model again from executions and validate it, round by round, until it is validated or the budget ends.
+
+    A round ends as soon as its model is falsified; the next model learns from the executions of all rounds. Each model
+    has a store of its own next to that of the campaign, such as ``cart.round-1.sqlite``, and a file such as
+    ``cart.round-1.npz``. If these files exist, the refinement is resumed, with the same choices as without an
+    interruption.
+
+    An execution counts for one model only, that on which its controller was designed. The k-th refined model is judged
+    with confidence ``1 - alpha / (k (k + 1))``, so that all of them together are wrong with probability at most alpha.
+
+    Args:
+        campaign: the campaign of the first model. It is run until it is decided, if it is not yet.
+        threshold: tau, in the units of the distance.
+        budget: largest total number of executions of all rounds, including those of the campaign.
+        method: ``residual``, ``linear``, ``network`` or ``gaussian-process``; a method of ``ctxval.refinement``; or a
+            function ``fit(data) -> model`` that always returns the same model for the same data.
+        certificate: the kind and options of the certificates, with the confidence ``1 - alpha``; ``auto`` by default.
+        on_trial: called with each trial that has ended.
+        open_round: makes the campaign of a round; by default, like the given campaign.
+        progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
+        execution: ``workers``, ``executor`` and ``timeout`` of :meth:`ctxval.Campaign.run`.
+
+    Raises:
+        InputError: if an argument cannot be used, if the budget is spent before the first round ends, or if there is
+            nothing to learn from.
+        StoreError: if the files of a round belong to another refinement.
+        ModelError, DesignError, DistanceError, CampaignError: as in :meth:`ctxval.Campaign.run`; all executions are
+            stored.
+    """
+    if not isinstance(campaign, Campaign):
+        raise InputError(f"campaign must be a Campaign, got {campaign!r}.")
+    if not isinstance(budget, int | np.integer) or isinstance(budget, bool) or budget < 1:
+        raise InputError(f"budget must be a positive integer, got {budget!r}.")
+    if budget < campaign.executions:
+        raise InputError(
+            f"the campaign has {campaign.executions} executions already, and the budget of {budget} is a total: give "
+            "more."
+        )
+    chosen = method_of(method, seed=campaign.seed)
+    options = CertificateOptions() if certificate is None else certificate
+    loop = _Loop(
+        campaign,
+        require_threshold(threshold),
+        int(budget),
+        chosen,
+        options,
+        open_round or _Like(campaign),
+        {"on_trial": on_trial, "progress": progress, **execution},
+    )
+    with progress_shown(progress):
+        return loop.run()
+
+
+@dataclass(frozen=True, eq=False)
+class _Like:
+    """Makes the campaigns of rounds like that of the first model."""
+
+    first: Campaign
+
+    def __call__(
+        self, validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
+    ) -> Campaign:
+        search = copy.deepcopy(self.first.search)
+        return Campaign(validation, search=search, store=store, seed=self.first.seed, name=self.first.name)
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """A refined model before its first execution."""
+
+    model: Refined
+    file: Path | None
+    notes: tuple[str, ...]
+
+
+@dataclass(eq=False)
+class _Loop:
+    """The rounds so far. Everything but the executions is a function of the stores, so an interrupted loop resumes."""
+
+    first: Campaign
+    threshold: float
+    budget: int
+    method: Method
+    options: CertificateOptions
+    open_round: OpensRound
+    execution: dict[str, Any]
+    rounds: list[Round] = field(default_factory=list)
+
+    def run(self) -> Refinement:
+        """Run the rounds until one is validated, or nothing more can be done."""
+        self.rounds.append(self._first_round())
+        ended = self._why_ended()
+        while ended is None:
+            ended = self._next_round() or self._why_ended()
+        return self._result(ended)
+
+    # The first model
+
+    def _first_round(self) -> Round:
+        self._execute(self.first, self.options)
+        return Round(0, "given", self.first, self._verdict(self.first, self.options), self.options.confidence)
+
+    def _execute(self, campaign: Campaign, options: CertificateOptions) -> None:
+        """Execute tasks of a campaign until it is decided or the budget ends; people execute theirs themselves."""
+        known = counterexample(campaign.trials, self.threshold) is not None
+        left = self.budget - sum(one.executions for one in self.rounds if one.campaign is not campaign)
+        if known or getattr(campaign.validation.system, "manual", False) or left < 1:
+            return
+        campaign.run_until_decided(self.threshold, left, certificate=options, **self.execution)
+
+    def _verdict(self, campaign: Campaign, options: CertificateOptions) -> Verdict:
+        return campaign.verdict(self.threshold, certificate=options)
+
+    def _why_ended(self) -> str | None:
+        """Return why there is no further round; None if there is one."""
+        last, spent = self.rounds[-1], sum(one.executions for one in self.rounds)
+        if last.verdict.answer == "validated":
+            which = "the given model" if not last.number else f"the model of round {last.number}"
+            return f"{which} is validated"
+        if last.verdict.answer == "undecided":
+            if getattr(last.campaign.validation.system, "manual", False):
+                return f"people execute the tasks of this system: {self._by_hand(last)}"
+            return f"the verdict on the model of round {last.number} is undecided after {spent} executions"
+        if spent >= self.budget:
+            return f"the budget of {self.budget} executions is spent"
+        return None
+
+    def _by_hand(self, last: Round) -> str:
+        return f"get them with `ctxval ask {last.store}`, tell their results, and refine again"
+
+    # Refined models
+
+    def _next_round(self) -> str | None:
+        """Run one more round; return why there is none."""
+        number = len(self.rounds)
+        confidence = confidence_of_round(self.options.confidence, number)
+        options = replace(self.options, confidence=confidence)
+        with stage("learning the model again"):
+            try:
+                candidate = self._candidate(number)
+            except InputError as error:
+                if number == 1:
+                    raise
+                return f"no better model can be learned: {str(error).removesuffix('.')}"
+        validation = self.first.validation.with_model(candidate.model)
+        known = self._unchanged(validation)
+        if known.worst is not None and known.worst > self.threshold:
+            return (
+                f"the model that round {number} would learn has the distance {known.worst:.4g} on a task that it has "
+                "learned from, with the controller that was executed: another method is needed"
+            )
+        campaign = self.open_round(validation, self._beside(number, ".sqlite"), candidate.file, options)
+        self._execute(campaign, options)
+        self.rounds.append(
+            Round(
+                number,
+                self.method.name,
+                campaign,
+                self._verdict(campaign, options),
+                confidence,
+                len(candidate.model.data),
+                candidate.file,
+                candidate.notes,
+                known,
+            )
+        )
+        return None
+
+    def _candidate(self, number: int) -> _Candidate:
+        """Return the model of a round: from its file if there is one, or learned from the executions before."""
+        file, records = self._beside(number, ".npz"), self._records()
+        if file is not None and file.exists():
+            note = read_note(file)
+            if note.get("method") != self.method.name:
+                raise InputError(
+                    f"{file} was learned by the method {note.get('method')!r}: give this method, or move the files of "
+                    "the rounds away."
+                )
+            found = read_refined(file, self._base)
+            notes = tuple(str(one) for one in note.get("notes", []))
+            return _Candidate(Refined(found, found.data or records.transitions, self._base), file, notes)
+        learned = self.method.learn(self._base, records)
+        refined, note_on_design = with_best_jacobian(
+            self.first.validation, Refined(learned.model, records.transitions, self._base)
+        )
+        notes = (*learned.notes, *([note_on_design] if note_on_design else []))
+        if file is None or not is_savable(refined):
+            return _Candidate(refined, None, notes)
+        write_model(file, refined, {"method": self.method.name, "notes": list(notes)})
+        # What a resumed refinement reads is what this one uses, to the last bit.
+        return _Candidate(Refined(read_refined(file, self._base), refined.data, self._base), file, notes)
+
+    @property
+    def _base(self) -> Model:
+        """The model that is corrected or replaced; of a model that was refined before, the one before."""
+        return before_refinement(self.first.validation.model)
+
+    def _executed(self, rounds: list[Round]) -> Iterator[tuple[Trial, Trajectory]]:
+        for one in rounds:
+            yield from executed_trials(one.campaign.store, one.campaign.trials)
+
+    def _records(self, before: int | None = None) -> Records:
+        """Return what the rounds before a number have recorded; by default, all rounds."""
+        executed = [trajectory for _, trajectory in self._executed(self.rounds[:before])]
+        return Records.of(self.first.validation.model, executed)
+
+    def _unchanged(self, validation: Validation) -> SameControllers:
+        if getattr(self.options.kind, "stochastic", False):
+            return SameControllers()
+        return same_controllers(validation, list(self._executed(self.rounds)))
+
+    def _beside(self, number: int, suffix: str) -> Path | None:
+        return None if self.first.store.path is None else round_file(self.first.store.path, number, suffix)
+
+    # The result
+
+    def _result(self, ended: str) -> Refinement:
+        number = self.rounds[-1].number
+        learned, residual = self._measured(number) if number else (None, None)
+        names = {} if residual is None else residual.states
+        rms = (
+            [] if learned is None else zip(learned.errors.rms_before.tolist(), learned.errors.rms.tolist(), strict=True)
+        )
+        return Refinement(
+            tuple(self.rounds),
+            self.threshold,
+            self.options.confidence,
+            self.budget,
+            ended,
+            residual,
+            dict(zip(names, rms, strict=False)),
+            () if learned is None else learned.parameters,
+            self.first.validation.labels.units,
+        )
+
+    def _measured(self, number: int) -> tuple[Learned | None, MeasuredResidual | None]:
+        """Return the errors of the last model on executions that it was not learned from."""
+        with stage("measuring the residual"):
+            try:
+                learned = self.method.learn(self._base, self._records(number))
+            except CtxvalError:  # the file of the model is there, but its executions are not
+                return None, None
+            own = tuple(trajectory for _, trajectory in self._executed(self.rounds[number:]))
+            whole = learned.errors.with_executions(self.rounds[number].model, self._base, own)
+            names = self.first.validation.names(whole.errors.shape[1], whole.pairs.shape[1] - whole.errors.shape[1])
+            return replace(learned, errors=whole), measure_residual(whole, *names)
+
+
+def confidence_of_round(confidence: float, number: int) -> float:
+    """Return the confidence with which the k-th refined model is judged, ``1 - alpha / (k (k + 1))``.
+
+    The shares sum up to alpha, so all rounds together are wrong with probability at most alpha.
+
+    Args:
+        confidence: 1 - alpha.
+        number: k, from 1.
+    """
+    return 1 - (1 - confidence) / (number * (number + 1))
+
+
+def round_file(store: Path, number: int, suffix: str) -> Path:
+    """Return the path of a file of a round, next to the store of the first model."""
+    return store.with_name(f"{store.stem}.round-{number}{suffix}")

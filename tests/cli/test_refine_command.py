@@ -1,0 +1,245 @@
+"""``ctxval refine``, as users call it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from ctxval import Store, models
+from ctxval.cli import app
+
+Invoke = Callable[..., Result]
+
+PLANT = """
+import time
+import numpy as np
+
+def step(x, u):
+    return np.array([x[0] + 0.1 * x[1], x[1] + 0.1 * (u[0] - 0.5 * x[1] - 0.3 * x[1] * abs(x[1]))])
+
+def law(x, u, theta):
+    return np.array([x[0] + 0.1 * x[1], x[1] + 0.1 * (u[0] - theta[0] * x[1] - theta[1] * x[1] * abs(x[1]))])
+
+def broken(data):
+    raise RuntimeError("no convergence")
+
+def network(data):
+    from ctxval import models
+    return models.GaussianProcessModel.fit(data, 100)
+"""
+
+FILE = """
+name = "cart"
+budget = {budget}
+threshold = 0.05
+units = "m"
+[space]
+goal = [0.5, 2.0, "m"]
+[task]
+initial_state = [0.0, 0.0]
+goal = ["goal", 0.0]
+horizon = 30
+dt = 0.1
+[states]
+position = "m"
+speed = "m/s"
+[inputs]
+force = "N"
+[system]
+type = "Simulated"
+step = {{ ref = "refined_plant:step" }}
+[model]
+type = "Linear"
+A = [[1.0, 0.1], [0.0, 1.0]]
+B = [[0.0], [0.1]]
+[synthesizer]
+type = "LQR"
+Q = [1.0, 0.1]
+R = [0.1]
+[distance]
+type = "MaximumDeviation"
+components = [0]
+[search]
+name = "auto"
+thinking = "fast"
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.delitem(sys.modules, "refined_plant", raising=False)
+    (tmp_path / "refined_plant.py").write_text(PLANT)
+    (tmp_path / "cart.toml").write_text(FILE.format(budget=20))
+    return tmp_path
+
+
+@pytest.fixture
+def invoke(folder: Path) -> Invoke:
+    def called(*arguments: str) -> Result:
+        return CliRunner().invoke(app, list(arguments))
+
+    return called
+
+
+def falsified(invoke: Invoke) -> str:
+    """Return a store of a falsified model with one execution."""
+    store = "cart.sqlite"
+    assert invoke("run", "cart.toml", "--budget", "1", "--store", store, "--no-report").exit_code == 1
+    return store
+
+
+@pytest.mark.slow
+def test_a_falsified_store_is_refined_until_the_model_is_validated(invoke: Invoke, folder: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    store = falsified(invoke)
+    done = invoke("refine", store, "--budget", "20", "--output", "better.onnx", "--json")
+    assert done.exit_code == 0, done.stdout + done.stderr
+    found = json.loads(done.stdout)
+    assert (found["verdict"], found["threshold"], found["rounds"][0]["verdict"]) == ("validated", 0.05, "falsified")
+    assert found["executions"] == sum(one["executions"] for one in found["rounds"]) <= 20
+    assert found["distance_before"] > 0.05 > found["distance_after"]
+    assert found["files"] == ["better.onnx", "better.data.npz", "better.residual.json", "better.residual.txt"]
+    assert found["residual"]["guaranteed"] is False
+    assert models.Onnx("better.onnx").network.widths == (3,)
+    # The store of a round is a store like any other.
+    certified = invoke("certify", "cart.round-1.sqlite", "--kind", "dynamics", "--threshold", "0.05", "--json")
+    assert certified.exit_code == 0, certified.stdout + certified.stderr
+    assert json.loads(certified.stdout)["trials"] == found["rounds"][1]["executions"]
+    assert invoke("report", "cart.round-1.sqlite").exit_code == 0
+    # The same command again resumes: nothing is executed.
+    again = json.loads(invoke("refine", store, "--budget", "20", "--json").stdout)
+    assert {**again, "files": found["files"]} == found
+
+
+@pytest.mark.slow
+def test_an_experiment_is_run_first_and_the_answer_is_said(invoke: Invoke, folder: Path) -> None:
+    done = invoke("refine", "cart.toml", "--seed", "1", "--confidence", "0.9")
+    assert done.exit_code == 0, done.stdout + done.stderr
+    for part in ("falsified", "validated against 0.05", "under its own controllers", "0.95", "not guaranteed"):
+        assert part in " ".join(done.stdout.split())
+    assert (folder / "runs" / "cart-auto-seed1.round-1.sqlite").exists()
+
+
+@pytest.mark.slow
+def test_parameters_of_a_function_are_estimated_and_written(invoke: Invoke) -> None:
+    store = falsified(invoke)
+    given = ("--step", "refined_plant:law", "--parameter", "linear=[0, 2]", "--parameter", "square=[0, 2]")
+    done = invoke("refine", store, "--method", "parameters", *given, "--output", "law.toml", "--budget", "3", "--json")
+    assert done.exit_code == 0, done.stdout + done.stderr
+    found = json.loads(done.stdout)
+    assert [round(one["value"], 6) for one in found["parameters"]] == [0.5, 0.3]
+    assert 'type = "Parametric"' in Path("law.toml").read_text()
+
+
+@pytest.mark.slow
+def test_a_function_of_the_user_learns_the_model(invoke: Invoke) -> None:
+    store = falsified(invoke)
+    done = invoke("refine", store, "--method", "fit", "--fit", "refined_plant:network", "--budget", "4", "--json")
+    assert done.exit_code in (0, 1), done.stdout + done.stderr
+    assert json.loads(done.stdout)["rounds"][1]["method"] == "fit"
+
+
+@pytest.mark.slow
+def test_a_killed_refinement_loses_nothing_and_ends_as_an_unbroken_one(invoke: Invoke, folder: Path) -> None:
+    def start(target: Path) -> subprocess.Popen[bytes]:
+        target.mkdir()
+        (target / "refined_plant.py").write_text(PLANT)
+        (target / "cart.toml").write_text(FILE.format(budget=20))
+        code = "from ctxval.cli import main; main()"
+        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        return subprocess.Popen([sys.executable, "-c", code, "refine", "cart.toml"], cwd=target, **quiet)
+
+    whole = start(folder / "whole")
+    assert whole.wait(timeout=600) == 0
+    killed = start(folder / "killed")
+    stores = folder / "killed" / "runs"
+    deadline = time.monotonic() + 300
+    while executions(stores) < 2 and killed.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(killed.pid, signal.SIGKILL)
+    killed.wait()
+    before = trials(stores)
+    os.chdir(folder / "killed")
+    assert invoke("refine", "cart.toml").exit_code == 0
+    after = trials(stores)
+    assert after == trials(folder / "whole" / "runs")
+    assert all(one in after for one in before if one[2] == "completed")
+
+
+def executions(folder: Path) -> int:
+    try:
+        return sum(len(trials(folder, path)) for path in folder.glob("*.round-*.sqlite"))
+    except sqlite3.Error:
+        return 0
+
+
+def trials(folder: Path, only: Path | None = None) -> list[Any]:
+    found = []
+    for path in [only] if only else sorted(folder.glob("*.sqlite")):
+        with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as connection:
+            rows = connection.execute("SELECT number, unit_point, state, distance FROM trials").fetchall()
+        connection.close()
+        found += [(path.name, *row) for row in rows]
+    return [(name, point, state, distance) for name, _, point, state, distance in found]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["none.sqlite"], "there is no store at none.sqlite"),
+        (["cart.toml", "--budget", "0"], "budget must be a positive integer, got 0"),
+        (["cart.toml", "--method", "residul"], "did you mean 'residual'"),
+        (["cart.toml", "--method", "fit"], "--method fit and --fit MODULE:ATTR must be given together"),
+        (["cart.toml", "--fit", "refined_plant:broken"], "must be given together"),
+        (["cart.toml", "--method", "parameters"], "--parameter must be given together"),
+        (["cart.toml", "--step", "refined_plant:law"], "--step is for --method parameters"),
+        (["cart.toml", "--output", "model.pkl"], "must end in .npz, .onnx, .toml"),
+        (["cart.toml", "--trust"], "--experiment and --trust are for a store"),
+        (["cart.toml", "--threshold", "-1"], "threshold must be a positive number"),
+        (["cart.sqlite", "--seed", "1"], "--seed and --option are for an experiment"),
+    ],
+)
+def test_what_cannot_be_used_is_said_in_one_sentence(invoke: Invoke, arguments: list[str], sentence: str) -> None:
+    done = invoke("refine", *arguments)
+    assert done.exit_code == 2, done.stdout + done.stderr
+    assert sentence in " ".join(done.stderr.split())
+    assert not list(Path().rglob("*.round-*"))
+
+
+def test_a_fit_that_fails_is_said_and_nothing_is_lost(invoke: Invoke) -> None:
+    store = falsified(invoke)
+    done = invoke("refine", store, "--method", "fit", "--fit", "refined_plant:broken", "--budget", "9")
+    assert done.exit_code == 2
+    assert "the fit failed: RuntimeError: no convergence" in " ".join(done.stderr.split())
+    assert len(Store(store).trials()) == 1
+
+
+def test_a_store_without_trajectories_is_refused(invoke: Invoke) -> None:
+    store = falsified(invoke)
+    with sqlite3.connect(store) as connection:  # as in a store whose distances were told without recordings
+        connection.execute("DELETE FROM trajectories")
+    connection.close()
+    done = invoke("refine", store, "--budget", "9")
+    assert done.exit_code == 2
+    assert "no execution is stored with its trajectory" in " ".join(done.stderr.split())
+
+
+def test_a_store_of_another_experiment_is_refused(invoke: Invoke) -> None:
+    store = falsified(invoke)
+    Path("other.toml").write_text(FILE.format(budget=20).replace("[0.5, 2.0", "[0.5, 3.0"))
+    done = invoke("refine", store, "--experiment", "other.toml", "--budget", "9")
+    assert done.exit_code == 2
+    assert "space" in done.stderr
