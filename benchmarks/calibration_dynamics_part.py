@@ -80,10 +80,11 @@ The thresholds of the certificate were chosen with seeds 0 to 2 of these systems
 """
 
 EXPLAINED = {
-    "oblique-wall": """a slanting wall stands behind one corner of the positions and changes 0.2 % of the tasks. No
-  execution touched it. The records cover each position coordinate alone, and the two together as far as the certificate
-  asks (a gap of at most 50 % of their ranges), so the wall lies in a gap that is allowed. The last three predictions
-  held because their tasks do not touch it either.""",
+    "oblique-wall": """a slanting wall stands behind one corner of the positions and changes 0.2 % of the tasks. One
+  execution of seed 7 grazed it by 2 mm, one of seed 9 by less than 1 mm, and all others passed it. The records cover
+  each position coordinate alone, and the two together as far as the certificate asks (a gap of at most 50 % of their
+  ranges), so the wall lies in a gap that is allowed. The last three predictions held because their tasks do not touch
+  it.""",
     "icy-corner": """the grip is lost beyond two coordinates of the position and above a speed, in 0.3 % of the tasks.
   One of the seven executions passed there, too slowly. The records cover all pairs of coordinates as far as the
   certificate asks (a gap of at most 50 %), and it states that combinations of three are not covered.""",
