@@ -272,7 +272,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "refinement.HeldOut": lambda: HELD_OUT,
     "refinement.Learned": lambda: refinement.Learned(LINEAR, HELD_OUT),
     "refinement.MeasuredResidual": lambda: refinement.measure_residual(HELD_OUT, {"x": "m", "v": "m/s"}, {"u": "N"}),
-    "refinement.Parameters": lambda: refinement.Parameters({"mass": (0.5, 2.0)}),
+    "refinement.ParameterFit": lambda: refinement.ParameterFit({"mass": (0.5, 2.0)}),
     "refinement.Records": lambda: refinement.Records((TRAJECTORY,)),
     "refinement.Refinement": refined,
     "refinement.Refit": lambda: refinement.Refit("linear"),

@@ -13,7 +13,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
 
 from ctxval._util.arrays import Array
 from ctxval._util.progress import advance, stage
@@ -23,6 +22,7 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.certificates import CertificateOptions, Posterior
 from ctxval.certificates.options import CONFIDENCE
+from ctxval.certificates.scenario import volume_bound
 from ctxval.certificates.verdict import Verdict, require_threshold
 from ctxval.core.controller import converged_of
 from ctxval.core.distance import Distance
@@ -233,12 +233,12 @@ def _simulate(campaign: Campaign, tasks: int) -> None:
 
 
 def _share(campaign: Campaign, threshold: float | None) -> float | None:
-    """Return the exact upper bound of Clopper and Pearson (1934) for the share of tasks that M does not complete."""
+    """Return the upper bound of Clopper and Pearson (1934) for the share of tasks that M does not complete."""
     if threshold is None:
         return None
     drawn = [trial for trial in campaign.trials if trial.origin == "iid"]
     missed = sum(trial.distance is None or trial.distance > threshold for trial in drawn)
-    return float(beta.ppf(CONFIDENCE, missed + 1, len(drawn) - missed)) if missed < len(drawn) else 1.0
+    return volume_bound(len(drawn), missed, 1 - CONFIDENCE) if missed < len(drawn) else 1.0
 
 
 def _report(

@@ -14,7 +14,18 @@ from hypothesis import strategies as st
 
 from conftest import make_validation
 from ctxval import Campaign, Trajectory, searches
-from ctxval._util.texts import LONGEST, guarded, plain, reason_of, shortened, text_of, unguarded, visible
+from ctxval._util.texts import (
+    LONGEST,
+    aligned,
+    guarded,
+    markdown_text,
+    plain,
+    reason_of,
+    shortened,
+    text_of,
+    unguarded,
+    visible,
+)
 from ctxval.campaign.by_hand import read_runs
 from ctxval.core.space import TaskSpace
 from ctxval.storage.recovery import export, recover
@@ -154,3 +165,13 @@ def test_a_guarded_reason_in_a_table_of_runs_is_what_was_meant(tmp_path: Path) -
     (tmp_path / "runs.csv").write_text("goal,failed,trajectory\n1.5,'=E12: overcurrent,\n2.5,'twas loose,\n")
     runs = read_runs([tmp_path / "runs.csv"], None, TaskSpace(goal=(-3.0, 3.0)))
     assert [run.failed for run in runs] == ["=E12: overcurrent", "'twas loose"]
+
+
+def test_columns_are_as_wide_as_their_longest_cell() -> None:
+    rows = [("name", "value"), ("a", "10"), ("", "-2.5")]
+    assert aligned(rows) == "name  value\na     10\n      -2.5"
+    assert aligned(rows, right=True) == "name  value\na        10\n       -2.5"
+
+
+def test_texts_cannot_become_markup_in_markdown() -> None:
+    assert markdown_text("a|b <i>\n*c*") == r"a\|b \<i\> \*c\*"

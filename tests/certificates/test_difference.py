@@ -67,6 +67,8 @@ def test_the_sign_of_nothing_is_seldom_decided_whenever_one_stops() -> None:
     rare = 0.05 - (rng.random((300, 80)) < 0.05)
     assert share_decided(rare, beta, most=1.0) < allowed < share_decided(rare, beta)
     assert share_decided(rng.choice([-1.0, 1.0], size=(300, 80)), beta, most=1.0) < allowed
+    losing = np.where(rng.random((300, 80)) < 0.05, -1.0, 0.05)
+    assert share_decided(losing, beta) > 0.5  # the wrong sign in most comparisons, as docs/theory.md says
 
 
 @pytest.mark.slow

@@ -61,6 +61,11 @@ def cart(weight: float = 1.0, distance: Any = None, mass: float = 1.0, limit: fl
     )
 
 
+def by_hand() -> Validation:
+    rig = systems.Manual(states={"position": "m", "speed": "m/s"}, inputs={"force": "N"}, dt=0.1)
+    return make_validation(system=rig)
+
+
 def campaigns(**validations: Validation) -> dict[str, Campaign]:
     """Return campaigns with a search whose choices depend on no clock."""
     return {name: Campaign(one, search=searches.GPUCB()) for name, one in validations.items()}
@@ -180,6 +185,7 @@ def test_a_comparison_that_is_stopped_continues_with_the_same_choices(tmp_path: 
         (lambda: {"a": cart()}, "at least two candidates, got 1"),
         (lambda: {"a": cart(), "b": cart(limit=3.0)}, "the same task spaces, but space"),
         (lambda: {"a": cart(), "b": make_validation()}, "the same task spaces"),
+        (lambda: {"a": by_hand(), "b": by_hand()}, "on a system that people execute"),
         (lambda: {"a": cart(), "b": 3}, "candidate b must be a Validation"),
         (lambda: [cart(), cart()], "must be a mapping of names"),
         (

@@ -16,7 +16,7 @@ import ctxval
 from ctxval import Campaign, Store, Trajectory, Transitions, models, systems
 from ctxval.certificates.provenance import REFINED
 from ctxval.errors import InputError, ModelError
-from ctxval.refinement import Parameters, Refinement, Refit, ResidualCorrection, UserFit, refine
+from ctxval.refinement import ParameterFit, Refinement, Refit, ResidualCorrection, UserFit, refine
 from ctxval.refinement.files import write_refined
 from ctxval.refinement.methods import method_of
 from ctxval.refinement.refine import confidence_of_round
@@ -114,7 +114,7 @@ def test_a_mass_that_is_20_per_cent_off_is_found() -> None:
 
     off = models.Parametric(step, {"mass": 1.2}, vectorized=True)
     true = systems.Simulated(lambda x, u: step(x, u, np.array([1.0])), vectorized=True)
-    found = refined(method=Parameters({"mass": (0.5, 2.0)}), model=off, system=true)
+    found = refined(method=ParameterFit({"mass": (0.5, 2.0)}), model=off, system=true)
     (mass,) = found.parameters
     assert mass.low - 1e-9 <= 1.0 <= mass.high + 1e-9
     assert mass.value == pytest.approx(1.0, abs=1e-6)
@@ -222,6 +222,15 @@ def test_the_files_of_another_method_are_refused(tmp_path: Path) -> None:
     assert made.executions == 2
 
 
+@pytest.mark.slow
+def test_a_damaged_file_of_a_later_round_is_an_error_and_not_the_end(tmp_path: Path) -> None:
+    made = campaign(tmp_path / "a.sqlite").run(2)
+    models.write_model(tmp_path / "a.round-1.npz", models.Linear(FIRST.A, 1.3 * FIRST.B), {"method": "residual"})
+    (tmp_path / "a.round-2.npz").write_bytes(b"damaged")
+    with pytest.raises(InputError, match=r"round-2\.npz cannot be read"):
+        refine(made, THRESHOLD, BUDGET)
+
+
 def _steps(made: Campaign) -> Transitions:
     return Transitions.joined([made.trajectories(one)[1].transitions() for one in made.completed])  # type: ignore[union-attr]
 
@@ -247,7 +256,7 @@ def raises(data: Transitions) -> models.Model:
         ("parameters", InputError, "needs bounds"),
         ("fit", InputError, "needs a function"),
         (3, InputError, "fit must be a function"),
-        (Parameters({"mass": (0.5, 2.0)}), InputError, "needs step="),
+        (ParameterFit({"mass": (0.5, 2.0)}), InputError, "needs step="),
     ],
 )
 def test_a_method_that_cannot_be_used_is_named_and_nothing_is_lost(

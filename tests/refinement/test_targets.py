@@ -9,7 +9,7 @@ from ctxval import Campaign, Trajectory, Validation, cases, models, refine, sear
 from ctxval.cases import pendulum
 from ctxval.certificates import CertificateOptions
 from ctxval.fitting import FittedParameter
-from ctxval.refinement import Parameters, Records
+from ctxval.refinement import ParameterFit, Records
 
 CHEAP = CertificateOptions.posterior()
 """The certificate by which tasks are chosen; it costs less than the dynamics bound."""
@@ -68,7 +68,7 @@ def mass_of(seed: int) -> FittedParameter:
             states.append(swing(states[-1], u, np.array([1.0])) + [0.0, 1e-2] * rng.normal(size=2))
         executed.append(Trajectory(0.02 * np.arange(51), np.array(states), inputs))
     off = models.Parametric(swing, {"mass": 1.2}, vectorized=True)
-    return Parameters({"mass": (0.5, 2.0)}).learn(off, Records.of(off, executed)).parameters[0]
+    return ParameterFit({"mass": (0.5, 2.0)}).learn(off, Records.of(off, executed)).parameters[0]
 
 
 @pytest.mark.slow

@@ -71,6 +71,21 @@ def as_finite(name: str, value: ArrayLike) -> Array:
     return array
 
 
+def positive_count(sentence: str, count: object) -> int:
+    """Return a positive integer.
+
+    Args:
+        sentence: the beginning of the message, which says what must be positive.
+        count: the value.
+
+    Raises:
+        InputError: if the value is no integer, or is below 1.
+    """
+    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
+        raise InputError(f"{sentence}, got {count!r}.")
+    return int(count)
+
+
 def require_shape(name: str, array: Array, expected: tuple[int, ...]) -> Array:
     """Return ``array`` if its last axes are ``expected``.
 

@@ -1,8 +1,9 @@
-"""Texts from elsewhere: shortening them, and making them harmless for terminals and spreadsheets."""
+"""Texts from elsewhere, made harmless for terminals, Markdown and spreadsheets; and columns of plain text."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 LONGEST = 2_000
 """Largest number of characters of a failure's text that are kept: half from its beginning, half from its end."""
@@ -75,6 +76,26 @@ def guarded(text: str) -> str:
 def unguarded(cell: str) -> str:
     """Return the text of a cell that :func:`guarded` wrote."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell.lstrip("'")) else cell
+
+
+def markdown_text(text: str) -> str:
+    """Return a text in one line, in which characters that Markdown or HTML acts upon are escaped."""
+    return re.sub(r"([\\`*_{}\[\]<>#|!~])", r"\\\1", " ".join(shortened(visible(text)).split()))
+
+
+def aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> str:
+    """Return rows of texts as columns of plain text.
+
+    Args:
+        rows: the rows, the head first; all have the same number of cells.
+        right: whether all columns but the first are aligned to the right, as numbers are.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = zip(row, widths, strict=True)
+        lines.append("  ".join(f"{cell:{'>' if right and i else '<'}{width}}" for i, (cell, width) in enumerate(cells)))
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def parted(label: str) -> tuple[str, str]:

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ctxval._util.arrays import positive_count
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display, remeasuring
 from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.identity import description_of, identify, search_of
-from ctxval.campaign.operated import OperatedCampaign, positive_count
+from ctxval.campaign.operated import OperatedCampaign
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.until_decided import UntilDecided
 from ctxval.campaign.workers import WorkerPool, worker_pool

@@ -110,11 +110,11 @@ def costs_of(prediction: Prediction, validation: Validation, trials: Sequence[Tr
     """
     batched = bool(getattr(validation.synthesizer, "batched", False))
     with stage("timing predictions", unit="designs"):
-        each, batch, more = _prices(prediction, validation.space.dimension, batched)
+        each, batch, more = _measured(prediction, validation.space.dimension, batched)
     return Costs(each + more, _seconds_of_execution(validation, trials), each, batch)
 
 
-def _prices(prediction: Prediction, dimension: int, batched: bool) -> tuple[float, float, float]:
+def _measured(prediction: Prediction, dimension: int, batched: bool) -> tuple[float, float, float]:
     """Return the seconds of a rough prediction, of a batch besides its points, and what an exact prediction adds."""
     predict, rng = prediction.rough or prediction.expected, np.random.default_rng(0)
     single = _predicting_seconds(predict, rng.random((1, dimension)))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, positive_count
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.known import KnownExecution, TrialResult, check_known, measurement_of
@@ -181,10 +181,3 @@ class OperatedCampaign(CampaignResults):
 
     def _unit_point(self, parameters: Mapping[str, Any]) -> Array:
         return self.validation.space.to_unit(self.validation.space.point(parameters))
-
-
-def positive_count(sentence: str, count: object) -> int:
-    """Return a positive integer, or raise with the sentence."""
-    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
-        raise InputError(f"{sentence}, got {count!r}.")
-    return int(count)

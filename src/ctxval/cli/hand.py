@@ -19,13 +19,11 @@ from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, limit_of, open_
 from ctxval.config.settings import read_settings
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
+from ctxval.storage.other_stores import STORE_SUFFIXES
 from ctxval.storage.store import Store
 
 _WAIT = 60.0
 """Seconds to wait for other terminals: each of them locks the store while it chooses a task."""
-
-_STORES = (".sqlite", ".sqlite3", ".db")
-"""Usual suffixes of stores."""
 
 Target = Annotated[
     str, typer.Argument(metavar=f"STORE|{TARGET}", help="Existing store, or the experiment of a store to create.")
@@ -252,7 +250,7 @@ def _opened(
                 f"{target} is a store and keeps its own settings: remove --store, --search, --seed and --option."
             )
         return open_store(Store.existing(path), path, experiment, trust, accept_change)
-    if path.suffix in _STORES:
+    if path.suffix in STORE_SUFFIXES:
         raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` creates one.")
     if experiment is not None or trust:
         raise InputError(f"--experiment and --trust need a store as the first argument, and {target} is an experiment.")

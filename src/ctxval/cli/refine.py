@@ -32,12 +32,11 @@ from ctxval.core.experiment import Experiment
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.fitting.model_file import SUFFIXES
-from ctxval.refinement import Method, Parameters, Refinement, refine
+from ctxval.refinement import Method, ParameterFit, Refinement, refine
 from ctxval.refinement.files import write_refined
 from ctxval.refinement.methods import NAMES, UserFit, method_of
+from ctxval.storage.other_stores import STORE_SUFFIXES
 from ctxval.storage.store import Store
-
-_STORES = (".sqlite", ".sqlite3", ".db")
 
 Target = Annotated[
     str,
@@ -135,7 +134,7 @@ def refine_model(
     chosen = _method(method, fit, step, parameter, vectorized)
     if output is not None and output.suffix not in SUFFIXES:
         raise InputError(f"the file of a model must end in {', '.join(SUFFIXES)}, got {str(output)!r}.")
-    if Path(target).suffix in _STORES:
+    if Path(target).suffix in STORE_SUFFIXES:
         if seed is not None or option:
             raise InputError("--seed and --option are for an experiment; a store has its own.")
         opened = _of_store(Path(target), experiment, trust)
@@ -178,7 +177,7 @@ def _method(name: str, fit: str | None, step: str | None, parameter: list[str] |
     if name != "parameters":
         return method_of(name)
     function = None if step is None else require_function(f"--step {step}", reference(step), "(x, u, theta) -> x_next")
-    return Parameters(named_values(parameter, "--parameter"), function, vectorized)
+    return ParameterFit(named_values(parameter, "--parameter"), function, vectorized)
 
 
 def _of_store(path: Path, experiment: str | None, trust: bool) -> _Opened:
@@ -219,19 +218,10 @@ class _Rounds:
 
 def _print(found: Refinement, files: list[str]) -> None:
     table = Table(box=None, pad_edge=False)
-    for name in ("round", "model", "executions", f"worst distance {found.units}".rstrip(), "verdict", "store"):
-        table.add_column(name)
+    for name in (*found.head, "store"):
+        table.add_column(line(name))
     for one in found.rounds:
-        worst = "-" if one.worst is None else f"{one.worst:.4g}"
-        cells = (
-            str(one.number),
-            one.method,
-            str(one.executions),
-            worst,
-            one.verdict.answer,
-            one.store.name if one.store else "-",
-        )
-        table.add_row(*map(line, cells))
+        table.add_row(*map(line, (*one.cells, one.store.name if one.store else "-")))
     out.print(table)
     for one in found.rounds:
         for note in one.notes:

@@ -143,14 +143,16 @@ def require_comparable(candidates: Sequence[Candidate]) -> None:
     """Check that the candidates have the same system, the same tasks and distances of the same unit.
 
     Raises:
-        InputError: if there are fewer than two, a name occurs twice, or they cannot be compared; the message names what
-            differs.
+        InputError: if there are fewer than two, a name occurs twice, people execute the system, or they cannot be
+            compared; the message names what differs.
     """
     if len(candidates) < 2:
         raise InputError(f"a comparison needs at least two candidates, got {len(candidates)}.")
     names = [one.name for one in candidates]
     if len(set(names)) < len(names):
         raise InputError(f"each candidate needs a name of its own, got {', '.join(names)}.")
+    if any(getattr(one.campaign.validation.system, "manual", False) for one in candidates):
+        raise InputError("candidates cannot be compared on a system that people execute.")
     first, *others = candidates
     expected = first.campaign.validation
     described = expected.describe()

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from ctxval._util.arrays import positive_count
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import Campaign
 from ctxval.certificates.options import CONFIDENCE, require_confidence
@@ -94,8 +95,7 @@ def race_of(
     known: dict[str, tuple[Question, ...]] = {"worst": ("worst",), "mean": ("mean",), "both": ("worst", "mean")}
     if question not in known:
         raise InputError(f"question must be worst, mean or both, got {question!r}.")
-    if not isinstance(budget, int | np.integer) or isinstance(budget, bool) or budget < 1:
-        raise InputError(f"budget must be a positive integer, got {budget!r}.")
+    total = positive_count("budget must be a positive integer", budget)
     if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
         raise InputError(f"seed must be an integer >= 0, got {seed!r}.")
     if largest_possible is not None and not 0 < largest_possible < np.inf:
@@ -105,7 +105,7 @@ def race_of(
         raise InputError(f"largest_possible is {largest_possible:g}, but a distance of {largest:.6g} was executed.")
     require_confidence(confidence)
     return Race(
-        candidates, known[question], int(budget), float(confidence), int(seed), largest_possible, stochastic, on_trial
+        candidates, known[question], total, float(confidence), int(seed), largest_possible, stochastic, on_trial
     )
 
 

@@ -14,7 +14,7 @@ from ctxval._util.representation import call
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.comparison.candidates import Candidate, TrialNote
-from ctxval.core.plan import Plan
+from ctxval.core.plan import Plan, gives_inputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError, DistanceError
@@ -23,7 +23,7 @@ OnTrial = Callable[[str, Trial], None]
 """Called with the name of a candidate and each of its trials that has ended."""
 
 _AGREE = 1e-9
-"""Largest difference of two inputs that are the same, as a share of the largest input."""
+"""Largest difference of two inputs that are the same, as a share of the largest magnitude of each input."""
 
 NoteFor = Callable[[Candidate, Trial, TrialNote], TrialNote]
 """Returns the note of a shared trial, from the trial that was executed and its note."""
@@ -192,19 +192,5 @@ class _Elsewhere:
 
 
 def agrees(plan: Plan, trajectory: Trajectory) -> bool:
-    """Return whether the controller of a plan gives the inputs that were executed, along the executed states.
-
-    The execution is then also one of this controller: the system cannot tell the two apart.
-    """
-    states, inputs = trajectory.states, trajectory.inputs
-    if plan.model_trajectory.states.shape != states.shape or plan.model_trajectory.inputs.shape != inputs.shape:
-        return False
-    nearest = _AGREE * max(float(np.abs(inputs).max(initial=0.0)), 1e-300)
-    try:
-        with np.errstate(all="ignore"):
-            return all(
-                bool((np.abs(np.asarray(plan.controller(t, states[t])) - inputs[t]) <= nearest).all())
-                for t in range(len(inputs))
-            )
-    except Exception:  # the user's controller, at states that it never reached by itself
-        return False
+    """Return whether an execution is recorded for the candidate with this plan, too."""
+    return gives_inputs(plan, trajectory, _AGREE)

@@ -18,7 +18,6 @@ from ctxval.comparison.result import CandidateResult, Comparison, PairResult
 from ctxval.comparison.worst import WorstQuestion
 from ctxval.core.task_distribution import distribution_text
 from ctxval.core.trial import Trial
-from ctxval.errors import InputError
 
 _WORST_FIRST = 0.5
 """Share of the budget that the question of d* may use before that of the expected distance is answered."""
@@ -75,8 +74,6 @@ class Race:
         """
         with ExitStack() as stack:
             for candidate in self.candidates:
-                if getattr(candidate.campaign.validation.system, "manual", False):
-                    raise InputError("a system that people execute cannot be compared by this command.")
                 stack.enter_context(candidate.campaign.store.sole_writer())
             with stage("comparing", self.budget, "executions", done=self.executions.count):
                 self.executions.resume()

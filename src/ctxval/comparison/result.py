@@ -81,7 +81,7 @@ class PairResult:
         if self.smaller is None:
             return f"{self.first} or {self.second}: undecided"
         other = self.second if self.smaller == self.first else self.first
-        return f"{self.smaller} has the smaller {WORDS[self.question]} than {other}".replace("the smaller", "a smaller")
+        return f"{self.smaller} has a smaller {WORDS[self.question]} than {other}"
 
     def __repr__(self) -> str:
         return lines(call(self, self.question, self.first, self.second, smaller=self.smaller), line(self.reason))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
-from ctxval._util.texts import visible
+from ctxval._util.texts import markdown_text
 from ctxval.certificates.bounds import at_most
 from ctxval.comparison.result import WORDS, CandidateResult, Comparison, PairResult
 
@@ -63,11 +62,11 @@ def _number(value: Any) -> str:
 
 def markdown(comparison: Comparison) -> str:
     """Return the tables, the reasons and the assumptions as Markdown."""
-    units = f" The distances are in {_escaped(comparison.units)}." if comparison.units else ""
+    units = f" The distances are in {markdown_text(comparison.units)}." if comparison.units else ""
     parts = [
         "## Comparison",
         "\n".join(
-            f"- {WORDS[question].capitalize()}: {_escaped(comparison.ranking_text(question))}"
+            f"- {WORDS[question].capitalize()}: {markdown_text(comparison.ranking_text(question))}"
             for question in comparison.questions
         ),
         f"{comparison.executions} executions of at most {comparison.budget}. All decisions hold together with "
@@ -76,22 +75,18 @@ def markdown(comparison: Comparison) -> str:
         _table(PAIRS, pair_rows(comparison)),
         _reasons(comparison),
         "It assumes that",
-        "\n".join(f"- {_escaped(assumption)};" for assumption in comparison.assumptions),
+        "\n".join(f"- {markdown_text(assumption)};" for assumption in comparison.assumptions),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def _reasons(comparison: Comparison) -> str:
     return "\n".join(
-        f"- {_escaped(pair.first)}, {_escaped(pair.second)}: {_escaped(pair.reason)}." for pair in comparison.pairs
+        f"- {', '.join(map(markdown_text, (pair.first, pair.second)))}: {markdown_text(pair.reason)}."
+        for pair in comparison.pairs
     )
 
 
 def _table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [headers, ["---"] * len(headers), *rows]
-    return "\n".join(f"| {' | '.join(map(_escaped, cells))} |" for cells in lines)
-
-
-def _escaped(text: str) -> str:
-    """Return a text without what Markdown or HTML would take for markup."""
-    return re.sub(r"([\\`*_\[\]<>|])", r"\\\1", " ".join(visible(text).split()))
+    return "\n".join(f"| {' | '.join(map(markdown_text, cells))} |" for cells in lines)

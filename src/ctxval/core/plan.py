@@ -115,6 +115,30 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
         )
 
 
+def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
+    """Return whether the controller of a plan gives the recorded inputs at the recorded states.
+
+    The execution is then also one of this controller: a deterministic system cannot tell the two apart.
+
+    Args:
+        plan: the plan of one task.
+        trajectory: an execution of this task, perhaps with another controller.
+        tolerance: the largest difference, as a share of the largest magnitude of each input.
+    """
+    states, inputs = trajectory.states, trajectory.inputs
+    if plan.model_trajectory.states.shape != states.shape or plan.model_trajectory.inputs.shape != inputs.shape:
+        return False
+    nearest = tolerance * np.maximum(np.abs(inputs).max(axis=0, initial=0.0), 1e-300)
+    try:
+        with np.errstate(all="ignore"):
+            return all(
+                bool((np.abs(np.asarray(plan.controller(t, states[t])) - inputs[t]) <= nearest).all())
+                for t in range(len(inputs))
+            )
+    except Exception:  # the user's controller, at states that it never reached by itself
+        return False
+
+
 def executed_in(expected: Trajectory, batch: Trajectory) -> Mask:
     """Return which tasks of a batch have a complete and finite trajectory, shape ``(N,)``."""
     same = batch.states.shape == expected.states.shape and batch.inputs.shape == expected.inputs.shape

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.extras import require_extra
-from ctxval._util.files import read_bytes
+from ctxval._util.mjcf import compile_mjcf, identity_of_mjcf, is_mjcf_text
 from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.trajectory import Transitions
@@ -43,7 +42,7 @@ class MuJoCo:
 
     def __init__(self, mjcf: str | Path, *, dt: float | None = None, data: Transitions | None = None) -> None:
         self._mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo")
-        self._mjcf, self._model = self._compiled(mjcf)
+        self._mjcf, self._model = compile_mjcf(mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)))
         self.substeps = _substeps(float(self._model.opt.timestep), dt)
         self.data = data
         if self._model.na:
@@ -55,18 +54,6 @@ class MuJoCo:
     def dt(self) -> float:
         """Length of a step, seconds."""
         return float(self._model.opt.timestep) * self.substeps
-
-    def _compiled(self, mjcf: str | Path) -> tuple[str, Any]:
-        path = None if isinstance(mjcf, str) and "<" in mjcf else identified_in(Path(mjcf))
-        try:
-            text = str(mjcf) if path is None else read_bytes(path).decode("utf-8")
-        except (InputError, UnicodeDecodeError) as error:
-            raise InputError(f"the MuJoCo model {str(mjcf)!r} cannot be read: {error}.") from error
-        loader = self._mujoco.MjModel
-        try:
-            return text, loader.from_xml_string(text) if path is None else loader.from_xml_path(str(path))
-        except ValueError as error:
-            raise InputError(f"MuJoCo cannot compile the model: {error}") from error
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
@@ -95,8 +82,7 @@ class MuJoCo:
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this model in a store."""
-        digest = hashlib.sha256(self._mjcf.encode()).hexdigest()[:16]
-        return {"mjcf": digest, "mass": self._model.body_mass.tolist(), "substeps": self.substeps}
+        return {**identity_of_mjcf(self._mjcf, self._model), "substeps": self.substeps}
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the module, which another process imports itself."""

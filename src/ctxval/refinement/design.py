@@ -10,6 +10,7 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import record
 from ctxval.core.model import Model, linearize
+from ctxval.core.plan import gives_inputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
@@ -19,7 +20,7 @@ from ctxval.learning.recorded import closed_loops_on_model
 from ctxval.models import Corrected, Linear, Refined
 
 _SAME = 1e-6
-"""Largest difference between the inputs of two controllers, as a share of the range of each input."""
+"""Largest difference between the inputs of two controllers, as a share of the largest magnitude of each input."""
 _BETTER = 0.95
 """The Jacobian of M' is used for one linearisation if this lowers the cost of the tasks on M' to so much of it."""
 _ONCE = 2
@@ -75,7 +76,7 @@ def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refine
     return kept, (
         "controllers are designed with the Jacobian of the model before, and the prediction is corrected: the "
         "synthesizer linearises once, and the tasks are not completed clearly better on the refined model with its own "
-        f"Jacobian (their cost is {costs[0] / costs[1]:.3g} times as large)"
+        f"Jacobian (their cost is {costs[0]:.3g} with it, and {costs[1]:.3g} without)"
     )
 
 
@@ -154,11 +155,6 @@ def _known_distance(validation: Validation, trial: Trial, recorded: Trajectory) 
     """Return the distance of a refined model on an executed task; None if its controller has changed."""
     try:
         plan = validation.plan(validation.space.from_unit(trial.unit_point))
-        inputs = np.array([plan.controller(t, x) for t, x in enumerate(recorded.states[:-1])])
-        if inputs.shape != recorded.inputs.shape:
-            return None
-        ranges = np.maximum(np.ptp(recorded.inputs, axis=0), 1e-9)
-        same = bool((np.abs(inputs - recorded.inputs) <= _SAME * ranges).all())
-        return validation.accept(plan, recorded).distance if same else None
+        return validation.accept(plan, recorded).distance if gives_inputs(plan, recorded, _SAME) else None
     except Exception:  # the user's own parts: what cannot be compared is not the same
         return None

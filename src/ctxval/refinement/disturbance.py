@@ -10,6 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import Shown, call
+from ctxval._util.texts import aligned
 from ctxval.refinement.held_out import HeldOut
 
 QUANTILE = 0.95
@@ -22,7 +23,6 @@ _PLACES = (0.25, 0.5, 0.75)
 """Quantiles of a coordinate at which a region may be split."""
 _GAIN = 0.1
 """Least share of the spread of the logarithms that a split must explain."""
-
 _ROUNDING = 1e-6
 """Spread of the logarithms of one transition that may be rounding."""
 
@@ -72,13 +72,7 @@ class MeasuredResidual:
         head = ["region", "steps", *(f"{unit}: 95 %" for unit in units), *(f"{unit}: largest" for unit in units)]
         rows = [head, *(self._row(one, self._where(one)) for one in self.regions)]
         rows.append(self._row(self.whole, "all records"))
-        widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-        return "\n".join(
-            "  ".join(
-                cell.ljust(width) if not i else cell.rjust(width) for i, (cell, width) in enumerate(line)
-            ).rstrip()
-            for line in (zip(row, widths, strict=True) for row in rows)
-        )
+        return aligned(rows, right=True)
 
     @property
     def range_text(self) -> str:

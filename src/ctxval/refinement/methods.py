@@ -199,7 +199,7 @@ class Refit(Method):
 
 
 @dataclass(frozen=True, eq=False)
-class Parameters(Method):
+class ParameterFit(Method):
     """New values of the parameters of a user's function ``(x, u, theta) -> x_next``, by least squares.
 
     Attributes:
@@ -315,7 +315,7 @@ def method_of(method: str | Method | Callable[[Transitions], Any], *, seed: int 
     if method in get_args(RefitKind):
         return Refit(method, seed)  # type: ignore[arg-type]
     if method == "parameters":
-        raise InputError("the method 'parameters' needs bounds: give refinement.Parameters({'mass': (0.5, 2.0)}).")
+        raise InputError("the method 'parameters' needs bounds: give refinement.ParameterFit({'mass': (0.5, 2.0)}).")
     if method == "fit":
         raise InputError("the method 'fit' needs a function: give the function fit(data) -> model itself.")
     raise UnknownNameError.among("method of refinement", method, NAMES)

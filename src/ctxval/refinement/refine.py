@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-
+from ctxval._util.arrays import positive_count
 from ctxval._util.progress import stage
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign.campaign import Campaign
@@ -83,16 +82,15 @@ def refine(
 
     Raises:
         InputError: if an argument cannot be used, if the budget is spent before the first round ends, or if there is
-            nothing to learn from.
-        StoreError: if the files of a round belong to another refinement.
+            nothing to learn from, or if the file of a round cannot be read or was learned by another method.
+        StoreError: if the store of a round belongs to another refinement.
         ModelError, DesignError, DistanceError, CampaignError: as in :meth:`ctxval.Campaign.run`; all executions are
             stored.
     """
     if not isinstance(campaign, Campaign):
         raise InputError(f"campaign must be a Campaign, got {campaign!r}.")
-    if not isinstance(budget, int | np.integer) or isinstance(budget, bool) or budget < 1:
-        raise InputError(f"budget must be a positive integer, got {budget!r}.")
-    if budget < campaign.executions:
+    total = positive_count("budget must be a positive integer", budget)
+    if total < campaign.executions:
         raise InputError(
             f"the campaign has {campaign.executions} executions already, and the budget of {budget} is a total: give "
             "more."
@@ -102,10 +100,10 @@ def refine(
     loop = _Loop(
         campaign,
         require_threshold(threshold),
-        int(budget),
+        total,
         chosen,
         options,
-        open_round or _Like(campaign),
+        open_round or _SameSettings(campaign),
         {"on_trial": on_trial, "progress": progress, **execution},
     )
     with progress_shown(progress):
@@ -113,7 +111,7 @@ def refine(
 
 
 @dataclass(frozen=True, eq=False)
-class _Like:
+class _SameSettings:
     """Makes the campaigns of rounds like that of the first model."""
 
     first: Campaign
@@ -126,7 +124,7 @@ class _Like:
 
 
 @dataclass(frozen=True, eq=False)
-class _Candidate:
+class _RefinedModel:
     """A refined model before its first execution."""
 
     model: Refined
@@ -146,6 +144,7 @@ class _Loop:
     open_round: OpensRound
     execution: dict[str, Any]
     rounds: list[Round] = field(default_factory=list)
+    _last: tuple[int, Learned] | None = field(default=None, init=False)
 
     def run(self) -> Refinement:
         """Run the rounds until one is validated, or nothing more can be done."""
@@ -196,21 +195,22 @@ class _Loop:
         number = len(self.rounds)
         confidence = confidence_of_round(self.options.confidence, number)
         options = replace(self.options, confidence=confidence)
-        with stage("learning the model again"):
+        made = self._stored(number)
+        if made is None:
             try:
-                candidate = self._candidate(number)
+                made = self._learned_model(number)
             except InputError as error:
                 if number == 1:
                     raise
                 return f"no better model can be learned: {str(error).removesuffix('.')}"
-        validation = self.first.validation.with_model(candidate.model)
+        validation = self.first.validation.with_model(made.model)
         known = self._unchanged(validation)
         if known.worst is not None and known.worst > self.threshold:
             return (
                 f"the model that round {number} would learn has the distance {known.worst:.4g} on a task that it has "
                 "learned from, with the controller that was executed: another method is needed"
             )
-        campaign = self.open_round(validation, self._beside(number, ".sqlite"), candidate.file, options)
+        campaign = self.open_round(validation, self._beside(number, ".sqlite"), made.file, options)
         self._execute(campaign, options)
         self.rounds.append(
             Round(
@@ -219,37 +219,47 @@ class _Loop:
                 campaign,
                 self._verdict(campaign, options),
                 confidence,
-                len(candidate.model.data),
-                candidate.file,
-                candidate.notes,
+                len(made.model.data),
+                made.file,
+                made.notes,
                 known,
             )
         )
         return None
 
-    def _candidate(self, number: int) -> _Candidate:
-        """Return the model of a round: from its file if there is one, or learned from the executions before."""
-        file, records = self._beside(number, ".npz"), self._records()
-        if file is not None and file.exists():
-            note = read_note(file)
-            if note.get("method") != self.method.name:
-                raise InputError(
-                    f"{file} was learned by the method {note.get('method')!r}: give this method, or move the files of "
-                    "the rounds away."
-                )
-            found = read_refined(file, self._base)
-            notes = tuple(str(one) for one in note.get("notes", []))
-            return _Candidate(Refined(found, found.data or records.transitions, self._base), file, notes)
-        learned = self.method.learn(self._base, records)
-        refined, note_on_design = with_best_jacobian(
-            self.first.validation, Refined(learned.model, records.transitions, self._base)
-        )
+    def _stored(self, number: int) -> _RefinedModel | None:
+        """Return the model of a round from its file; None if there is none.
+
+        Raises:
+            InputError: if the file cannot be read, or its model was learned by another method.
+        """
+        file = self._beside(number, ".npz")
+        if file is None or not file.exists():
+            return None
+        note = read_note(file)
+        if note.get("method") != self.method.name:
+            raise InputError(
+                f"{file} was learned by the method {note.get('method')!r}: give this method, or move the files of the "
+                "rounds away."
+            )
+        found = read_refined(file, self._base)
+        notes = tuple(str(one) for one in note.get("notes", []))
+        return _RefinedModel(Refined(found, found.data or self._records(number).transitions, self._base), file, notes)
+
+    def _learned_model(self, number: int) -> _RefinedModel:
+        """Return the model of a round, learned from the executions before, and write its file."""
+        file, data = self._beside(number, ".npz"), self._records(number).transitions
+        with stage("learning the model again"):
+            learned = self._learned(number)
+            refined, note_on_design = with_best_jacobian(
+                self.first.validation, Refined(learned.model, data, self._base)
+            )
         notes = (*learned.notes, *([note_on_design] if note_on_design else []))
         if file is None or not is_savable(refined):
-            return _Candidate(refined, None, notes)
+            return _RefinedModel(refined, None, notes)
         write_model(file, refined, {"method": self.method.name, "notes": list(notes)})
         # What a resumed refinement reads is what this one uses, to the last bit.
-        return _Candidate(Refined(read_refined(file, self._base), refined.data, self._base), file, notes)
+        return _RefinedModel(Refined(read_refined(file, self._base), refined.data, self._base), file, notes)
 
     @property
     def _base(self) -> Model:
@@ -260,8 +270,14 @@ class _Loop:
         for one in rounds:
             yield from executed_trials(one.campaign.store, one.campaign.trials)
 
-    def _records(self, before: int | None = None) -> Records:
-        """Return what the rounds before a number have recorded; by default, all rounds."""
+    def _learned(self, number: int) -> Learned:
+        """Return what the rounds before a number teach; the result needs it after the round, too."""
+        if self._last is None or self._last[0] != number:
+            self._last = number, self.method.learn(self._base, self._records(number))
+        return self._last[1]
+
+    def _records(self, before: int) -> Records:
+        """Return what the rounds before a number have recorded."""
         executed = [trajectory for _, trajectory in self._executed(self.rounds[:before])]
         return Records.of(self.first.validation.model, executed)
 
@@ -298,7 +314,7 @@ class _Loop:
         """Return the errors of the last model on executions that it was not learned from."""
         with stage("measuring the residual"):
             try:
-                learned = self.method.learn(self._base, self._records(number))
+                learned = self._learned(number)
             except CtxvalError:  # the file of the model is there, but its executions are not
                 return None, None
             own = tuple(trajectory for _, trajectory in self._executed(self.rounds[number:]))

@@ -10,6 +10,7 @@ from typing import Any
 
 from ctxval._util.describe import describe
 from ctxval._util.representation import Shown, call, counted, line, lines, table
+from ctxval._util.texts import aligned
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates.verdict import Answer, Verdict
 from ctxval.core.model import Model
@@ -69,6 +70,12 @@ class Round:
     def store(self) -> Path | None:
         """The store of the round; None if it is in memory."""
         return self.campaign.store.path
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Number, method, executions, largest distance and verdict as texts."""
+        worst = "-" if self.worst is None else f"{self.worst:.4g}"
+        return str(self.number), self.method, str(self.executions), worst, self.verdict.answer
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values."""
@@ -171,18 +178,15 @@ class Refinement:
         )
 
     @property
+    def head(self) -> tuple[str, ...]:
+        """What the cells of a round are."""
+        units = f" [{self.units}]" if self.units else ""
+        return "round", "model", "executions", f"worst distance{units}", "verdict"
+
+    @property
     def text(self) -> str:
         """The rounds as a table of plain text."""
-        head = ("round", "model", "executions", f"worst distance{f' [{self.units}]' if self.units else ''}", "verdict")
-        rows = [head, *(self._cells(one) for one in self.rounds)]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-        return "\n".join(
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-        )
-
-    def _cells(self, one: Round) -> tuple[str, ...]:
-        worst = "-" if one.worst is None else f"{one.worst:.4g}"
-        return str(one.number), one.method, str(one.executions), worst, one.verdict.answer
+        return aligned([self.head, *(one.cells for one in self.rounds)])
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the models as plain values."""
@@ -214,5 +218,5 @@ class Refinement:
         return lines(head, f"ended: {line(self.ended)}", *(line(row) for row in self.text.splitlines()[1:4]))
 
     def _repr_html_(self) -> str:
-        rows = [(f"round {one.number}: {one.method}", ", ".join(self._cells(one)[2:])) for one in self.rounds]
+        rows = [(f"round {one.number}: {one.method}", ", ".join(one.cells[2:])) for one in self.rounds]
         return table(f"Refinement: {self.answer}", [*rows, ("ended", self.ended), ("statement", self.statement)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -11,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ctxval._util.describe import describe
-from ctxval._util.texts import shortened, visible
+from ctxval._util.texts import markdown_text, shortened, visible
 from ctxval.errors import InputError
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
@@ -114,9 +113,9 @@ def markdown(context: ReportContext) -> str:
     units, verdict = context.labels.units, context.verdict
     answer = "No verdict: no threshold was given." if verdict is None else f"{verdict}"
     lines = [
-        f"# Validation of {plain(context.name) or 'campaign'}",
+        f"# Validation of {markdown_text(context.name) or 'campaign'}",
         "",
-        f"**{plain(answer)}**",
+        f"**{markdown_text(answer)}**",
         "",
         f"{context.executions} executions, {len(context.failed)} without a distance.",
         "",
@@ -130,38 +129,35 @@ def markdown(context: ReportContext) -> str:
         "",
         "## What was not tested",
         "",
-        *(f"- {plain(one)}" for one in not_tested(context)),
+        *(f"- {markdown_text(one)}" for one in not_tested(context)),
         "",
         "## Worst tasks",
         "",
-        f"| trial | distance | {' | '.join(map(plain, context.space.labels))} |",
+        f"| trial | distance | {' | '.join(map(markdown_text, context.space.labels))} |",
         f"|{'---|' * (2 + context.space.dimension)}",
         *_worst_rows(context, units),
         "",
         "## For the file",
         "",
-        *(f"- **{plain(one.term)}** ({one.standard}): {plain(one.content)}" for one in appendix(context)),
+        *(
+            f"- **{markdown_text(one.term)}** ({one.standard}): {markdown_text(one.content)}"
+            for one in appendix(context)
+        ),
         "",
     ]
     return "\n".join(lines)
 
 
 def _item(finding: Finding) -> str:
-    return f"- {WORDS[finding.light]}: **{plain(finding.name)}.** {plain(finding.text)}"
+    return f"- {WORDS[finding.light]}: **{markdown_text(finding.name)}.** {markdown_text(finding.text)}"
 
 
 def _worst_rows(context: ReportContext, units: str) -> list[str]:
     trials = context.worst_tasks(_WORST)
     return [
-        f"| {trial.number} | {plain(quantity(distance_of(trial), units))} | {' | '.join(map(number, point))} |"
+        f"| {trial.number} | {markdown_text(quantity(distance_of(trial), units))} | {' | '.join(map(number, point))} |"
         for trial, point in zip(trials, context.coordinates(trials).tolist(), strict=True)
     ]
-
-
-def plain(words: str) -> str:
-    """Return a text in one line, in which characters that Markdown acts upon are escaped."""
-    line = " ".join(shortened(visible(words)).split())
-    return re.sub(r"([\\`*_{}\[\]<>#|!~])", r"\\\1", line)
 
 
 def write_text(path: str | Path, content: str) -> Path:

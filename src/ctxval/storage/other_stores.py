@@ -15,7 +15,8 @@ from urllib.parse import quote
 from ctxval._util.describe import first_difference
 from ctxval.storage import schema
 
-_SUFFIXES = (".sqlite", ".sqlite3", ".db")
+STORE_SUFFIXES = (".sqlite", ".sqlite3", ".db")
+"""Suffixes of files that are taken for stores."""
 _MOST_FILES = 500
 """Largest number of files in a folder that are checked."""
 
@@ -37,7 +38,7 @@ def other_stores(path: Path) -> list[Path]:
     """
     try:
         own = _validation_of(path)
-        beside = sorted(one for one in path.absolute().parent.iterdir() if one.suffix in _SUFFIXES)[:_MOST_FILES]
+        beside = sorted(one for one in path.absolute().parent.iterdir() if one.suffix in STORE_SUFFIXES)[:_MOST_FILES]
     except _UNREADABLE:
         return []
     return [path.with_name(one.name) for one in beside if one.name != path.name and _is_of(one, own)]

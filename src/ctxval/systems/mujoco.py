@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
-from ctxval._util.files import read_bytes
+from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, positive_count, require_shape
+from ctxval._util.mjcf import compile_mjcf, identity_of_mjcf
 from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
@@ -58,9 +57,9 @@ class MuJoCo:
         axes: str = "xy",
         threads: int = 1,
     ) -> None:
-        self._mjcf, self._model = _compiled(mjcf)
-        self.substeps = _positive("substeps", substeps)
-        self.threads = _positive("threads", threads)
+        self._mjcf, self._model = compile_mjcf(mjcf)
+        self.substeps = positive_count("substeps must be a positive integer", substeps)
+        self.threads = positive_count("threads must be a positive integer", threads)
         self.sites = (sites,) if isinstance(sites, str) else tuple(sites)
         self.axes = axes
         self._coordinates = _coordinates(self._model, self.sites, axes)
@@ -72,15 +71,8 @@ class MuJoCo:
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this system in a store."""
-        digest = hashlib.sha256(self._mjcf.encode()).hexdigest()[:16]
-        masses = self._model.body_mass.tolist()  # because the masses of meshes are not in the text
-        return {
-            "mjcf": digest,
-            "mass": masses,
-            "substeps": self.substeps,
-            "sites": self.sites,
-            "axes": self.axes,
-        }
+        known = identity_of_mjcf(self._mjcf, self._model)
+        return {**known, "substeps": self.substeps, "sites": self.sites, "axes": self.axes}
 
     def state(self, qpos: ArrayLike, qvel: ArrayLike | None = None) -> Array:
         """Return the complete states for configurations and velocities.
@@ -282,29 +274,6 @@ class _Loop:
             if data.warning.number.any():
                 self.warnings[i] = data.warning.number
                 mujoco.mj_resetData(model, data)  # so that the warning does not count for the other simulations
-
-
-def _compiled(mjcf: str | Path) -> tuple[str, Any]:
-    """Return the text and the compiled model."""
-    try:
-        import mujoco
-    except ImportError as error:
-        raise InputError('MuJoCo is not installed: pip install "ctxval[mujoco]".') from error
-    is_text = isinstance(mjcf, str) and "<" in mjcf
-    try:
-        text = str(mjcf) if is_text else read_bytes(mjcf).decode("utf-8")
-        model = mujoco.MjModel.from_xml_string(text) if is_text else mujoco.MjModel.from_xml_path(str(mjcf))
-    except (InputError, UnicodeDecodeError) as error:
-        raise InputError(f"the MuJoCo model {str(mjcf)!r} cannot be read: {error}.") from error
-    except ValueError as error:
-        raise InputError(f"MuJoCo cannot compile the model: {error}") from error
-    return text, model
-
-
-def _positive(name: str, value: int) -> int:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
-        raise InputError(f"{name} must be a positive integer, got {value!r}.")
-    return int(value)
 
 
 def _coordinates(model: Any, sites: Sequence[str], axes: str) -> tuple[Rows, ...]:
