@@ -128,7 +128,7 @@ def test_more_rows_than_a_plan_has_are_not_read(tmp_path: Path) -> None:
 
 def test_numbers_of_csv_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.csv").write_text("t,x0\n" + "0,1\n" * 100)
-    monkeypatch.setattr("ctxval.core.trajectory.MOST_BYTES", 1000)
+    monkeypatch.setattr("ctxval.core.csv_columns.MOST_BYTES", 1000)
     with pytest.raises(InputError, match="too many numbers: 1000 bytes may be read"):
         Trajectory.from_csv(tmp_path / "a.csv")
 

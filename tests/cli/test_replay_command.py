@@ -193,7 +193,7 @@ def test_splits_are_printed(invoke: Invoke) -> None:
         (("absent", *LINEAR), "there is no file absent"),
         (
             ("logs", "--model", "Linaer"),
-            "a model must be a file that ends in .onnx, .npz or .toml, module:attr, or one",
+            "a model must be a file that ends in .onnx, .npz, .xml or .toml, a result of mujoco.sysid",
         ),
         (("logs", "--model", "absent.npz"), "absent.npz cannot be read as a model (an NPZ file of ctxval, or one with"),
         (("logs", "--model", "absent.toml"), "there is no experiment file absent.toml"),

@@ -214,5 +214,5 @@ def test_a_written_onnx_file_computes_the_same(kind: Any, tmp_path: Path) -> Non
     read = models.Onnx(str(tmp_path / "model.onnx"))
     x, u = np.random.default_rng(0).normal(size=(2, 9, 2))
     np.testing.assert_allclose(read.step(x, u[:, :1]), learned.step(x, u[:, :1]), rtol=1e-12, atol=1e-12)
-    with pytest.raises(InputError, match="only networks and linear models can be written as ONNX"):
+    with pytest.raises(InputError, match="only linear models, networks, Gaussian processes and corrections of these"):
         write_onnx(tmp_path / "other.onnx", models.Function(lambda x, u: x))

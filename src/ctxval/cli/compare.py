@@ -34,8 +34,8 @@ Targets = Annotated[
 QuestionName = Annotated[
     str,
     typer.Option(
-        help="worst: which has the smaller largest distance d*. mean: which has the smaller expected distance over the "
-        "distribution of tasks. both: both."
+        help="Question: worst (which has the smaller largest distance d*), mean (which has the smaller expected "
+        "distance over the distribution of tasks), or both."
     ),
 ]
 Budget = Annotated[

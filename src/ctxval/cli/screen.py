@@ -17,8 +17,8 @@ _INDENT = "\n  "
 """Before further lines of a text, so that they cannot be mistaken for other lines of the output."""
 
 PANELS = {
-    "Run": ("init", "check", "run", "remeasure"),
-    "Recordings": ("replay", "fit", "refine", "collect"),
+    "Run": ("init", "check", "run", "compare", "refine", "remeasure"),
+    "Recordings": ("replay", "fit", "collect"),
     "By hand": ("ask", "tell", "import", "serve"),
     "Inspect": ("status", "certify", "report", "export"),
     "Paper": ("cases", "reproduce"),
