@@ -117,6 +117,11 @@ def test_what_cannot_be_compared_is_refused_in_one_sentence(invoke: Invoke, argu
     assert "Traceback" not in found.stderr
 
 
+def test_candidates_that_cannot_be_compared_leave_no_store(invoke: Invoke) -> None:
+    assert invoke("gentle.toml", "wide.toml", "--store", "refused").exit_code == 2
+    assert not list(Path("refused").glob("*"))
+
+
 def trials(folder: Path) -> dict[str, list[tuple[list[float], float | None, str]]]:
     """Return what the stores of a folder have; those that are being made have nothing."""
     found = {}

@@ -207,6 +207,7 @@ def trials(folder: Path, only: Path | None = None) -> list[Any]:
         (["cart.toml", "--method", "parameters"], "--parameter must be given together"),
         (["cart.toml", "--step", "refined_plant:law"], "--step is for --method parameters"),
         (["cart.toml", "--output", "model.pkl"], "must end in .npz, .onnx, .toml"),
+        (["cart.toml", "--output", "nowhere/model.npz"], "cannot be written: there is no folder nowhere"),
         (["cart.toml", "--trust"], "--experiment and --trust are for a store"),
         (["cart.toml", "--threshold", "-1"], "threshold must be a positive number"),
         (["cart.sqlite", "--seed", "1"], "--seed and --option are for an experiment"),

@@ -215,11 +215,21 @@ def test_another_system_is_refused() -> None:
         ({"largest_possible": 0.0}, "largest_possible must be a positive number"),
         ({"largest_possible": float("nan")}, "largest_possible must be a positive number"),
         ({"confidence": 0.3}, "more often than right"),
+        ({"stochastic": True}, "question must be mean for a stochastic system, got 'both'"),
+        ({"stochastic": True, "question": "worst"}, "executed distances do not tell which d. is larger"),
     ],
 )
 def test_values_that_cannot_be_used_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         compare({"a": cart(), "b": cart(10.0)}, **options)
+
+
+@pytest.mark.parametrize("question", ["mean", "both"])
+def test_a_distance_above_the_largest_possible_one_ends_the_comparison(tmp_path: Path, question: Any) -> None:
+    with pytest.raises(InputError, match=r"largest_possible is 0\.0001, but a distance of"):
+        compare({"a": cart(), "b": cart(10.0)}, question=question, budget=9, largest_possible=1e-4, stores=tmp_path)
+    kept = [trial for name in "ab" for trial in Store(tmp_path / f"{name}.sqlite").trials()]
+    assert max(trial.distance for trial in kept) > 1e-4
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import ctxval
-from ctxval import Campaign, Store, Trajectory, Transitions, models, systems
+from ctxval import Campaign, Store, Trajectory, Transitions, models, searches, systems
 from ctxval.certificates.provenance import REFINED
 from ctxval.errors import InputError, ModelError
 from ctxval.refinement import ParameterFit, Refinement, Refit, ResidualCorrection, UserFit, refine
@@ -256,7 +256,7 @@ def raises(data: Transitions) -> models.Model:
         ("parameters", InputError, "needs bounds"),
         ("fit", InputError, "needs a function"),
         (3, InputError, "fit must be a function"),
-        (ParameterFit({"mass": (0.5, 2.0)}), InputError, "needs step="),
+        (ParameterFit({"mass": (0.5, 2.0)}), InputError, "needs the function step"),
     ],
 )
 def test_a_method_that_cannot_be_used_is_named_and_nothing_is_lost(
@@ -317,3 +317,27 @@ def test_people_get_the_tasks_of_the_refined_model(tmp_path: Path) -> None:
     assert (found.answer, len(found.rounds), found.last.executions) == ("undecided", 2, 0)
     assert "ctxval ask" in found.ended
     assert "hand.round-1.sqlite" in found.ended
+
+
+class _Memorised(models.Linear):
+    """The linear model, except at the transitions that it has seen: its controllers are those of the linear model."""
+
+    def __init__(self, data: Transitions) -> None:
+        super().__init__([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]])
+        self._seen = np.concatenate([data.x, data.u], axis=1)
+        self._next = data.x_next
+
+    def step(self, x: Any, u: Any) -> Any:
+        gaps = np.abs(self._seen - np.concatenate([x, u], axis=-1)[..., None, :]).max(axis=-1)
+        known = (gaps.min(axis=-1) < 1e-6)[..., None]
+        return np.where(known, self._next[gaps.argmin(axis=-1)], super().step(x, u))
+
+
+def test_the_initial_tasks_of_a_round_are_not_those_that_its_model_has_learned_from() -> None:
+    first = Campaign(make_cart(), search=searches.by_name("bayesian-optimisation")).run(3)
+    found = refine(first, THRESHOLD, 8, method=_Memorised)
+    assert len(found.rounds) > 1
+    before = np.array([trial.unit_point for trial in found.rounds[0].campaign.trials])
+    for trial in found.rounds[1].campaign.trials:
+        assert np.abs(before - trial.unit_point).max(axis=1).min() > 1e-6
+    assert found.rounds[1].verdict.answer == "falsified"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctxval import Trajectory, Transitions, models, systems
+from ctxval import Task, Trajectory, Transitions, controllers, models, rollout, systems
 from ctxval.cases import by_name
 from ctxval.data import LogMapping, MemoryTable, Recordings, recordings_of
 from ctxval.errors import InputError, ModelError
@@ -65,6 +65,19 @@ def test_errors_of_several_steps_are_those_of_a_loop() -> None:
     np.testing.assert_allclose([one.largest for one in found], np.abs(gaps).max(axis=0), rtol=1e-9)
     assert all(one.lowest < one.rms < one.highest for one in found)
     assert all(one.median < one.upper < one.largest for one in found)
+
+
+def test_an_exact_nonlinear_model_gets_no_advice_on_the_timing_of_closed_loops() -> None:
+    # Feedback makes late inputs a good guess of an affine model, and the exact model needs no guess.
+    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        drag = 0.4 * x[..., 1] + 0.2 * x[..., 1] * np.abs(x[..., 1])
+        return np.stack([x[..., 0] + 0.1 * x[..., 1], x[..., 1] + 0.1 * (u[..., 0] - drag)], axis=-1)
+
+    linear = models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]])
+    tasks = [Task([0.0, 0.0], goal=[goal, 0.0], horizon=20, dt=0.1) for goal in (0.5, 1.0, 1.5, 2.0)]
+    runs = [rollout(step, controllers.LQR([10, 1], [1]).design(task, linear), task) for task in tasks]
+    assert replay(models.Function(step), recorded(runs)).suggestions == ()
+    assert replay(models.Function(step, vectorized=True), recorded(runs)).suggestions == ()
 
 
 def test_friction_that_the_model_lacks_is_an_affine_function_of_the_state() -> None:

@@ -37,7 +37,7 @@ class IndependentDraws:
         self._store, self._validation, self._seed = store, validation, seed
 
     def search_seed(self, trials: Sequence[Trial]) -> int:
-        """Return the seed of a search whose points are all independent draws."""
+        """Return the seed of a search that depends on the model, because of independent draws or a refined model."""
         entropy = [self._seed, *self.of_model(trials)]
         return self._seed if len(entropy) == 1 else int(np.random.SeedSequence(entropy).generate_state(1)[0])
 

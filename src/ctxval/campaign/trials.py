@@ -26,6 +26,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Origin, State, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError, StoreError
+from ctxval.models import Refined
 from ctxval.searches import BaseSearch, Search
 from ctxval.storage.store import Store
 
@@ -115,7 +116,9 @@ class TrialRecorder:
         """Read the trials from the store, reset the search and tell it all trials."""
         self._trials = self.store.trials()
         self._changes = self.store.signature()[2]
-        seed = self.draws.search_seed(self._trials) if self.search.iid else self._seed
+        # A refined model has learned from the tasks of the model before: the same initial tasks would not test it.
+        of_model = self.search.iid or isinstance(self.validation.model, Refined)
+        seed = self.draws.search_seed(self._trials) if of_model else self._seed
         self.search.reset(self.validation.space.dimension, seed)
         history = history_of(self._trials)
         if history:

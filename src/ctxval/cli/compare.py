@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +16,7 @@ from ctxval.certificates.options import CONFIDENCE
 from ctxval.cli.base import app, command, err, failures_of, out, print_failures
 from ctxval.cli.options import AsJson, Confidence, PartOptions, named_values
 from ctxval.cli.screen import line
-from ctxval.comparison.candidates import Candidate
+from ctxval.comparison.candidates import Candidate, require_comparable
 from ctxval.comparison.compare import BUDGET, race_of, store_name
 from ctxval.comparison.result import WORDS, Comparison
 from ctxval.comparison.tables import CANDIDATES, PAIRS, candidate_rows, markdown, pair_rows
@@ -58,7 +58,10 @@ LargestPossible = Annotated[
         "for any number of tasks, and a failed execution counts as this distance."
     ),
 ]
-Stochastic = Annotated[bool, typer.Option("--stochastic", help="State that two executions of one task may differ.")]
+Stochastic = Annotated[
+    bool,
+    typer.Option("--stochastic", help="State that two executions of one task may differ; only with --question mean."),
+]
 Out = Annotated[
     Path | None,
     typer.Option(
@@ -87,8 +90,7 @@ def compare(
     The comparison stops when all pairs are decided or the budget is spent. If it is interrupted, run it again: it
     continues from the stores.
     """
-    named = _named(candidates)
-    made = [_candidate(name, target, store, seed, named_values(option)) for name, target in named.items()]
+    made = _candidates(_named(candidates), store, seed, named_values(option))
     race = race_of(
         made,
         question,
@@ -124,10 +126,15 @@ def _named(texts: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def _candidate(name: str, target: str, folder: Path, seed: int, options: dict[str, Any]) -> Candidate:
-    settings = _settings(target, seed, options)
-    path = folder / f"{store_name(name)}.sqlite"
-    return Candidate(name, settings.campaign(settings.load(), path))
+def _candidates(named: Mapping[str, str], folder: Path, seed: int, options: dict[str, Any]) -> list[Candidate]:
+    """Return the candidates with their stores. A refused comparison leaves no store that a later one would find."""
+    found = {name: _settings(target, seed, options) for name, target in named.items()}
+    loaded = {name: settings.load() for name, settings in found.items()}
+    require_comparable({name: experiment.validation for name, experiment in loaded.items()})
+    return [
+        Candidate(name, settings.campaign(loaded[name], folder / f"{store_name(name)}.sqlite"))
+        for name, settings in found.items()
+    ]
 
 
 def _settings(target: str, seed: int, options: dict[str, Any]) -> Settings:

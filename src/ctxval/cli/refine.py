@@ -134,6 +134,9 @@ def refine_model(
     chosen = _method(method, fit, step, parameter, vectorized)
     if output is not None and output.suffix not in SUFFIXES:
         raise InputError(f"the file of a model must end in {', '.join(SUFFIXES)}, got {str(output)!r}.")
+    if output is not None and (output.is_dir() or not output.parent.is_dir()):  # before anything is executed
+        what = "it is a folder" if output.is_dir() else f"there is no folder {output.parent}"
+        raise InputError(f"{output} cannot be written: {what}.")
     if Path(target).suffix in STORE_SUFFIXES:
         if seed is not None or option:
             raise InputError("--seed and --option are for an experiment; a store has its own.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 
@@ -16,6 +16,7 @@ from ctxval.campaign.history import executed_trials
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 
 Question = Literal["worst", "mean"]
@@ -139,35 +140,33 @@ def is_shared(trial: Trial) -> bool:
     return note is not None and note.shared is not None
 
 
-def require_comparable(candidates: Sequence[Candidate]) -> None:
+def require_comparable(candidates: Mapping[str, Validation]) -> None:
     """Check that the candidates have the same system, the same tasks and distances of the same unit.
 
+    Args:
+        candidates: the candidates by name.
+
     Raises:
-        InputError: if there are fewer than two, a name occurs twice, people execute the system, or they cannot be
-            compared; the message names what differs.
+        InputError: if there are fewer than two, people execute the system, or they cannot be compared; the message
+            names what differs.
     """
     if len(candidates) < 2:
         raise InputError(f"a comparison needs at least two candidates, got {len(candidates)}.")
-    names = [one.name for one in candidates]
-    if len(set(names)) < len(names):
-        raise InputError(f"each candidate needs a name of its own, got {', '.join(names)}.")
-    if any(getattr(one.campaign.validation.system, "manual", False) for one in candidates):
+    if any(getattr(one.system, "manual", False) for one in candidates.values()):
         raise InputError("candidates cannot be compared on a system that people execute.")
-    first, *others = candidates
-    expected = first.campaign.validation
+    (first, expected), *others = candidates.items()
     described = expected.describe()
-    for other in others:
-        validation = other.campaign.validation
+    for other, validation in others:
         found = validation.describe()
         for part, what in (("space", "task spaces"), ("tasks", "tasks"), ("system", "systems")):
             unequal = next(differences(described[part], found[part], part), None)
             if unequal is not None:
                 raise InputError(
-                    f"{first.name} and {other.name} must have the same {what}, but {unequal[0]} differs: only models, "
+                    f"{first} and {other} must have the same {what}, but {unequal[0]} differs: only models, "
                     "controllers and distances on one system can be compared."
                 )
         if validation.labels.units != expected.labels.units:
             raise InputError(
-                f"the distances of {first.name} and {other.name} must have the same unit, got "
+                f"the distances of {first} and {other} must have the same unit, got "
                 f"{expected.labels.units or 'none'!r} and {validation.labels.units or 'none'!r}."
             )

@@ -60,12 +60,13 @@ def compare(
         largest_possible: a number that no distance can exceed, if one is known. Decisions on expected distances are
             then valid for any number of tasks; otherwise they are asymptotic. A failed execution counts as this
             distance.
-        stochastic: whether two executions of one task may differ.
+        stochastic: whether two executions of one task may differ; then only the question ``mean`` can be asked.
         on_trial: called with the name of the candidate and each trial that has ended.
         progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
 
     Raises:
-        InputError: if a value cannot be used, or the candidates differ in the system, the tasks or the unit.
+        InputError: if a value cannot be used, the candidates differ in the system, the tasks or the unit, or a distance
+            exceeds ``largest_possible``.
         StoreError: if a store cannot be used, or another experiment made it.
         ModelError, DesignError, DistanceError: as in :meth:`ctxval.Campaign.run`; what was executed is stored.
     """
@@ -100,9 +101,11 @@ def race_of(
         raise InputError(f"seed must be an integer >= 0, got {seed!r}.")
     if largest_possible is not None and not 0 < largest_possible < np.inf:
         raise InputError(f"largest_possible must be a positive number, got {largest_possible!r}.")
-    largest = max((one.largest for one in candidates), default=0.0)
-    if largest_possible is not None and largest > largest_possible:
-        raise InputError(f"largest_possible is {largest_possible:g}, but a distance of {largest:.6g} was executed.")
+    if stochastic and question != "mean":
+        raise InputError(
+            f"question must be mean for a stochastic system, got {question!r}: an execution may have a larger distance "
+            "than the largest expected one, so executed distances do not tell which d* is larger."
+        )
     require_confidence(confidence)
     return Race(
         candidates, known[question], total, float(confidence), int(seed), largest_possible, stochastic, on_trial

@@ -18,6 +18,7 @@ from ctxval.comparison.result import CandidateResult, Comparison, PairResult
 from ctxval.comparison.worst import WorstQuestion
 from ctxval.core.task_distribution import distribution_text
 from ctxval.core.trial import Trial
+from ctxval.errors import InputError
 
 _WORST_FIRST = 0.5
 """Share of the budget that the question of d* may use before that of the expected distance is answered."""
@@ -51,7 +52,7 @@ class Race:
         stochastic: bool = False,
         on_trial: OnTrial | None = None,
     ) -> None:
-        require_comparable(candidates)
+        require_comparable({one.name: one.campaign.validation for one in candidates})
         self.candidates, self.questions, self.budget, self.confidence = candidates, questions, budget, confidence
         self.stochastic = stochastic
         self.executions = Executions(candidates, self._note_for, on_trial)
@@ -59,6 +60,7 @@ class Race:
         each = 1 - (1 - confidence) / len(questions)
         self.worst = WorstQuestion(self.executions, predictions, each, budget, stochastic)
         self.mean = MeanQuestion(self.executions, predictions, each, seed, largest_possible)
+        self._require_possible()
 
     def _note_for(self, candidate: Candidate, trial: Trial, note: TrialNote) -> TrialNote:
         if note.question == "mean":
@@ -71,6 +73,7 @@ class Race:
         Raises:
             StoreAccessError: if another process is running a store.
             ModelError, DesignError, DistanceError: as in :meth:`ctxval.Campaign.run`.
+            InputError: if people execute the system, or an executed distance exceeds the largest possible one.
         """
         with ExitStack() as stack:
             for candidate in self.candidates:
@@ -83,6 +86,7 @@ class Race:
 
     def _step(self) -> bool:
         """Execute one task; return False if nothing is left to do."""
+        self._require_possible()
         left = self.budget - self.executions.count
         if left <= 0:
             return False
@@ -94,6 +98,12 @@ class Race:
         if not last and self.mean.step(left):
             return True
         return worst and not last and self.worst.step()
+
+    def _require_possible(self) -> None:
+        """Check that no executed distance refutes the stated largest one, with which decisions would be false."""
+        largest = max(one.largest for one in self.candidates)
+        if self.mean.most is not None and largest > self.mean.most:
+            raise InputError(f"largest_possible is {self.mean.most:g}, but a distance of {largest:.6g} was executed.")
 
     # Results
 

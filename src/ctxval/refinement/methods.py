@@ -226,7 +226,9 @@ class ParameterFit(Method):
         step, vectorized = self.step, self.vectorized
         if step is None:
             if not isinstance(model, Parametric):
-                raise InputError("the method 'parameters' needs step=, because the model is not a Parametric.")
+                raise InputError(
+                    "the method 'parameters' needs the function step (--step), because the model is not a Parametric."
+                )
             step, vectorized = model.function, model.vectorized
         known: dict[str, Any] = {"vectorized": vectorized, "seed": self.seed}
 

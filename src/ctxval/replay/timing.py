@@ -85,7 +85,8 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
         return Suggestion("delay", shift * dt, ratio, agreeing, text)
     fitted = {shift: _errors(_affine_errors(x, u, reached, where.groups), sizes) for shift, u in shifted.items()}
     chosen = _chosen("delay", fitted, where.groups, 0)
-    if chosen is None:
+    # A model that predicts better than these affine models was not learned with inputs of another time.
+    if chosen is None or by_model[0].mean() <= fitted[chosen[0]].mean():
         return None
     shift, ratio, agreeing = chosen
     text = (
