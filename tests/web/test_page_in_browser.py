@@ -203,10 +203,10 @@ def test_a_reload_midway_loses_nothing(browser: Any, tmp_path: Path) -> None:
     one.page.get_by_text("There is no connection to the server.").wait_for(timeout=WAIT)
     one.trial(1).get_by_text("It failed, or there is no recording").click()
     one.trial(1).get_by_label("Reason").fill("the power failed")
+    # Read before the new server is up, because the page may replace it as soon as it is connected.
+    before = one.page.locator("#trial-1 input[name=token]").first.get_attribute("value")
     with serving(tmp_path, port=server.port):
         one.page.locator("#connection", has_not_text="There is no connection").wait_for(state="attached", timeout=WAIT)
-        fields = one.page.locator("#trial-1 input[name=token]")
-        before = fields.first.get_attribute("value")
         one.page.wait_for_function(
             "before => document.querySelector('#trial-1 input[name=token]').value !== before", arg=before
         )
