@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
+from ctxval.models.kernel_maps import KernelSum, matern
 from ctxval.models.scaling import standardised_pairs
 
 _CACHED = 40_000
@@ -77,7 +79,7 @@ class Correction:
         values = rows @ self.linear[:-1] + self.linear[-1]
         size = max(1, _CACHED // max(1, len(self.centres)))
         for first in range(0, len(rows), size):
-            values[first : first + size] += self._covariances(rows[first : first + size])[0] @ self.weights
+            values[first : first + size] += self._kernel_sum.value(rows[first : first + size])
         values = np.clip(values, -self.limit, self.limit) * self._faded(rows)[:, None]
         return np.asarray(values.reshape(*z.shape[:-1], self.states))
 
@@ -90,13 +92,9 @@ class Correction:
         return np.concatenate(parts).reshape(*z.shape[:-1], self.states, z.shape[-1])
 
     def _jacobian(self, rows: Array) -> Array:
-        covariances, slopes = self._covariances(rows)
-        k = rows.shape[1]
-        moments = (self.weights[:, :, None] * self.centres[:, None, :]).reshape(-1, self.states * k)
-        pulls = (slopes @ moments).reshape(-1, self.states, k)
-        pulls -= (slopes @ self.weights)[:, :, None] * rows[:, None, :]
-        slope = pulls / self.length_scales**2 + self.linear[:-1].T
-        values = covariances @ self.weights + rows @ self.linear[:-1] + self.linear[-1]
+        values, pull_back = self._kernel_sum.linearised(rows)
+        slope = pull_back(np.eye(self.states)) + self.linear[:-1].T
+        values = values + rows @ self.linear[:-1] + self.linear[-1]
         limited: Mask = np.asarray(np.abs(values) > self.limit)
         slope[limited] = 0.0
         faded, beyond = self._faded(rows), self._beyond(rows)
@@ -105,22 +103,11 @@ class Correction:
         slope -= values[:, :, None] * (beyond / self.fade**2)[:, None, :]
         return np.asarray(slope / self.scale)
 
-    def _covariances(self, rows: Array) -> tuple[Array, Array]:
-        """Return covariances k ``(q, M)`` of unit variance, and the factors of ``(c - z) / l^2`` in their gradients."""
-        a, b = rows / self.length_scales, self.centres / self.length_scales
-        r2 = a @ (-10 * b.T)
-        r2 += 5 * (a**2).sum(axis=1)[:, None]
-        r2 += 5 * (b**2).sum(axis=1)
-        np.maximum(r2, 0.0, out=r2)
-        s = np.sqrt(r2)
-        decay = np.exp(-s)
-        s += 1
-        s *= decay
-        r2 *= decay
-        r2 /= 3
-        r2 += s
-        s *= 5 / 3
-        return r2, s
+    @functools.cached_property
+    def _kernel_sum(self) -> KernelSum:
+        covariance = matern(self.length_scales, 2.5)
+        assert covariance is not None  # of this smoothness there is one
+        return KernelSum(covariance, self.centres, self.weights)
 
     def _beyond(self, rows: Array) -> Array:
         """Return how far pairs are beyond the box of the records, with signs, shape ``(q, n + m)``."""
