@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibrate_dynamics import BUDGETS, FALSE, GROUPS, RULE, STORED, TRUE, wanted
+from calibrate_dynamics import BUDGETS, FALSE, GROUPS, STORED, TRUE, rule_of, wanted
 from calibration_verdicts_part import false_of, table
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import dynamics as rule
@@ -126,7 +126,7 @@ def by_dynamics() -> str:
 
 
 def _of(group: str) -> list[Result]:
-    return STORED.select(rule=RULE, group=group)
+    return [one for one in STORED.select(group=group) if one["rule"] == rule_of(one["entry"])]
 
 
 def _at(results: Iterable[Result], share: float) -> list[Result]:

@@ -26,11 +26,12 @@ from ctxval._util.describe import rounded
 from ctxval._util.json_lines import JsonLines
 from dynamics_development import DEVELOPMENT
 from dynamics_reporting import REPORTING
+from dynamics_rough import ROUGH
 from dynamics_systems import Entry, realisations
 from study_auto import RESULTS
 
 TRUTHS = JsonLines(RESULTS / "dynamics_truths.jsonl", ("entry", "seed", "digest"))
-ENTRIES = {**DEVELOPMENT, **REPORTING}
+ENTRIES = {**DEVELOPMENT, **REPORTING, **ROUGH}
 REALISATIONS = 8
 AGREEMENT, LEAST, MOST = 2e-3, 3, 8
 """Relative difference of the repeats that ends the search, and the fewest and the most repeats."""

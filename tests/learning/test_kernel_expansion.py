@@ -22,7 +22,7 @@ def direct(one: KernelExpansion, z: Array) -> Array:
     return np.stack([kernel(theta, own, one.centres) @ w for own, w in zip(z, one.weights, strict=True)])
 
 
-@pytest.mark.parametrize("nu", [1.5, 2.5])
+@pytest.mark.parametrize("nu", [1.5, 2.5, 4.5])
 @pytest.mark.parametrize(("growth", "inputs"), [(0.0, 1), (1.0, 1), (1.0, 2), (0.3, 2)])
 @pytest.mark.parametrize(("functions", "arguments"), [(1, 1), (1, 512), (1, 1300), (3, 170), (3, 171), (2, 513)])
 def test_values_are_the_sums_of_covariances(

@@ -53,16 +53,16 @@ class Kernel(Covariance, Protocol):
 
 @dataclass(frozen=True)
 class Matern:
-    """Matern kernel of smoothness 3/2 or 5/2; theta = log of (variance, length-scales).
+    """Matern kernel of smoothness 3/2, 5/2 or 9/2; theta = log of (variance, length-scales).
 
     Attributes:
-        nu: smoothness, 1.5 (the paper's) or 2.5.
+        nu: smoothness, 1.5 (the paper's), 2.5 or 4.5.
         ard: whether each dimension has its own length-scale; if not, all share one.
         length_scale: bounds of the length-scales in the unit cube.
         variance: bounds of the variance, for values of unit variance.
 
     Raises:
-        InputError: if nu is neither 1.5 nor 2.5.
+        InputError: if nu is another number.
     """
 
     nu: float = 1.5
@@ -71,8 +71,8 @@ class Matern:
     variance: tuple[float, float] = (0.05, 50.0)
 
     def __post_init__(self) -> None:
-        if self.nu not in (1.5, 2.5):
-            raise InputError(f"the smoothness nu of a Matern kernel must be 1.5 or 2.5, got {self.nu!r}.")
+        if self.nu not in (1.5, 2.5, 4.5):
+            raise InputError(f"the smoothness nu of a Matern kernel must be 1.5, 2.5 or 4.5, got {self.nu!r}.")
 
     def bounds(self, dimension: int) -> Bounds:
         """Return the box of theta."""
@@ -148,15 +148,25 @@ class Matern:
     def _profile_and_slope(self, r: Array) -> tuple[Array, Array]:
         s = np.sqrt(2 * self.nu) * r
         decay = np.exp(-s)
-        slope = 3 * decay if self.nu == 1.5 else 5 / 3 * (1 + s) * decay
+        slope = self._slope_polynomial(s) * decay
         decay *= self._polynomial(s)
         return decay, slope
+
+    def _slope_polynomial(self, s: Array) -> Array | float:
+        """Return the polynomial that multiplies ``exp(-s)`` in the slope."""
+        if self.nu == 1.5:
+            return 3.0
+        if self.nu == 2.5:
+            return 5 / 3 * (1 + s)
+        return 9 / 7 * (1 + s * (1 + s * (2 / 5 + s / 15)))
 
     def _polynomial(self, s: Array) -> Array:
         """Return the polynomial that multiplies ``exp(-s)``; s is overwritten."""
         if self.nu == 1.5:
             s += 1
             return s
+        if self.nu == 4.5:
+            return 1 + s * (1 + s * (3 / 7 + s * (2 / 21 + s / 105)))
         squares = s**2
         squares /= 3
         s += 1

@@ -21,9 +21,16 @@ from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise, tenfold
 from ctxval.gp.subset import pivoted_cholesky, pivoted_rows
-from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters, draw_hyperparameters, learning_rows
+from ctxval.learning.hyperparameters import (
+    FAMILIES,
+    SMOOTHER_FAMILIES,
+    Hyperparameters,
+    draw_hyperparameters,
+    learning_rows,
+)
 from ctxval.learning.kernel_expansion import KernelExpansion
 from ctxval.learning.residual_data import ResidualData, residual_data
+from ctxval.learning.without_model import smoother_than
 
 _PIVOT = 0.1
 """Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
@@ -63,6 +70,10 @@ class PosteriorSettings:
     def for_horizon(cls, horizon: int) -> PosteriorSettings:
         """Return settings in which a closed loop of many steps has fewer centres, so that it does not take longer."""
         return cls(centres=int(np.clip(_WORK // horizon, *_CENTRES)))
+
+    def without_model(self) -> PosteriorSettings:
+        """Return settings for learning S itself, which is smoother than the error of M and takes more transitions."""
+        return replace(self, centres=2 * self.centres, families=SMOOTHER_FAMILIES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,17 +188,19 @@ class DynamicsPosterior:
     """The posterior of the dynamics of S, given recorded transitions.
 
     Attributes:
-        model: the model to which residuals are added.
+        model: the model to which residuals are added: M, or a linear one.
         data: the standardised residuals.
         components: posteriors of the learned states, one for each draw of the hyperparameters; the first one has the
             most probable hyperparameters.
         settings: its settings.
+        without_model: whether residuals are added to a linear model, because M is rougher than the system.
     """
 
     model: Model
     data: ResidualData
     components: tuple[Component, ...]
     settings: PosteriorSettings = field(default_factory=PosteriorSettings)
+    without_model: bool = False
 
     @property
     def mean(self) -> DynamicsDraws:
@@ -303,7 +316,8 @@ def learn_posterior(
 ) -> DynamicsPosterior | None:
     """Return the posterior of the dynamics given recorded transitions.
 
-    Returns None if fewer than two transitions are usable, or if M explains all of them.
+    Returns None if fewer than two transitions are usable, or if M explains all of them. If M is rougher than S, the
+    residuals are those of a linear model (:mod:`ctxval.learning.without_model`).
 
     Args:
         model: the model M.
@@ -316,12 +330,16 @@ def learn_posterior(
     data = residual_data(model, transitions, sources)
     if data is None:
         return None
-    Z, Y = data.pairs, data.outputs[:, data.learned]
     with single_threaded():
+        smoother = smoother_than(data, chosen.learned_from)
+        if smoother is not None:
+            model, data = smoother
+            chosen = chosen.without_model()
+        Z, Y = data.pairs, data.outputs[:, data.learned]
         rows = learning_rows(Z, data.inputs, chosen.learned_from)
         drawn = draw_hyperparameters(Z[rows], Y[rows], data.inputs, chosen.hyperparameters, rng, chosen.families)
         components = tuple(_conditioned(drawn, Z, Y, chosen.centres, rng))
-    return DynamicsPosterior(model, data, components, chosen)
+    return DynamicsPosterior(model, data, components, chosen, smoother is not None)
 
 
 def _conditioned(

@@ -24,6 +24,9 @@ from ctxval.learning.residual_kernel import ResidualKernel
 FAMILIES = ((2.5, 0.0), (2.5, 1.0), (1.5, 0.0))
 """Smoothness and growth of the covariances, equally likely a priori."""
 
+SMOOTHER_FAMILIES = ((4.5, 0.0), *FAMILIES)
+"""The same for the system itself, without a learned model, which may be rough."""
+
 NOISE = (1e-7, 1.0)
 """Bounds of the noise variance, relative to that of the Matern part."""
 
@@ -137,6 +140,17 @@ def draw_prior(dimension: int, inputs: int, rng: np.random.Generator) -> Hyperpa
     return _of(ResidualKernel(nu, growth, inputs), centres + deviations * rng.standard_normal(dimension + 3))
 
 
+def highest_log_posterior(Z: Array, Y: Array, inputs: int) -> float:
+    """Return the largest log density of the hyperparameters of the most usual family, up to a constant.
+
+    Args:
+        Z: standardised pairs ``(N, k)``.
+        Y: standardised residuals ``(N, n)``.
+        inputs: the number of inputs of the system.
+    """
+    return _climbed(ResidualKernel(*FAMILIES[0], inputs), Z, Y)[0][0]
+
+
 def learning_rows(Z: Array, inputs: int, count: int) -> Rows:
     """Return rows of well-spread pairs, from which the hyperparameters are learned."""
     k = Z.shape[1]
@@ -195,6 +209,13 @@ def _box(kernel: ResidualKernel, dimension: int) -> tuple[Array, Array]:
 
 def _modes_of(kernel: ResidualKernel, Z: Array, Y: Array) -> list[_Mode]:
     """Return the modes of a family, the highest first: one with little noise, one with much, or one that is both."""
+    (height, mode), (lower, other) = found = _climbed(kernel, Z, Y)
+    relevant = height - lower < _LOWEST and np.abs(mode - other).max() > _SAME
+    return [_Mode(kernel, *one, _scale_at(kernel, one[1], Z, Y)) for one in (found if relevant else found[:1])]
+
+
+def _climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Array]]:
+    """Return the log posterior and its place where climbs from little and from much noise end, the highest first."""
     low, high = _box(kernel, Z.shape[1])
     found: list[tuple[float, Array]] = []
     for noise in _STARTS:
@@ -203,10 +224,7 @@ def _modes_of(kernel: ResidualKernel, Z: Array, Y: Array) -> list[_Mode]:
             lambda parameters: log_posterior(kernel, parameters, Z, Y), start[None], list(zip(low, high, strict=True))
         )
         found.append((log_posterior(kernel, mode, Z, Y)[0], mode))
-    found.sort(key=lambda one: -one[0])
-    (height, mode), (lower, other) = found
-    relevant = height - lower < _LOWEST and np.abs(mode - other).max() > _SAME
-    return [_Mode(kernel, *one, _scale_at(kernel, one[1], Z, Y)) for one in (found if relevant else found[:1])]
+    return sorted(found, key=lambda one: -one[0])
 
 
 def _scale_at(kernel: ResidualKernel, mode: Array, Z: Array, Y: Array) -> Array:

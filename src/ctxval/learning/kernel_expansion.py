@@ -70,12 +70,7 @@ class KernelExpansion:
         np.maximum(r2, 0.0, out=r2)
         r = np.sqrt(r2)
         # The same array holds the squares, the polynomial's quadratic term, and then the decay.
-        if kernel.nu == 2.5:
-            r2 *= 1 / 3
-            polynomial = np.add(r, r2)
-            polynomial += 1
-        else:
-            polynomial = np.add(r, 1)
+        polynomial = _polynomial(kernel.nu, r, r2)
         decay = np.exp(np.negative(r, out=r), out=r2)
         decay *= polynomial
         if kernel.growth:
@@ -84,6 +79,24 @@ class KernelExpansion:
             growth += 1
             decay *= growth
         return np.asarray(decay)
+
+
+def _polynomial(nu: float, r: Array, r2: Array) -> Array:
+    """Return the polynomial of the Matern function of scaled distances and their squares, which are overwritten."""
+    if nu == 1.5:
+        return np.asarray(np.add(r, 1))
+    if nu == 2.5:
+        r2 *= 1 / 3
+        polynomial = np.add(r, r2)
+    else:
+        polynomial = np.multiply(r, 1 / 105)
+        polynomial += 2 / 21
+        polynomial *= r
+        polynomial += 3 / 7
+        polynomial *= r2
+        polynomial += r
+    polynomial += 1
+    return np.asarray(polynomial)
 
 
 def _blocks(functions: int, arguments: int, largest: int) -> Iterator[tuple[slice, slice]]:

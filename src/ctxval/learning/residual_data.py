@@ -12,7 +12,7 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.models.scaling import standard_deviations, standardised_pairs
 
-_NEGLIGIBLE = 1e-7
+NEGLIGIBLE = 1e-7
 """A residual below this share of the state's typical change is rounding."""
 _ABSURD = 1e100
 """Transitions with larger numbers have diverged and are left out; the squares of such numbers would not be finite."""
@@ -29,6 +29,7 @@ class ResidualData:
         shift, scale: constants that standardise a state-input pair, shapes ``(n + m,)``.
         sizes: root mean square of the residual of each state, shape ``(n,)``.
         steps: standard deviation of the change of each state in one step, shape ``(n,)``.
+        transitions: the N transitions.
     """
 
     pairs: Array
@@ -38,11 +39,12 @@ class ResidualData:
     scale: Array
     sizes: Array
     steps: Array
+    transitions: Transitions
 
     @property
     def learned(self) -> Mask:
         """Which states have a residual that is not negligible, shape ``(n,)``."""
-        return np.asarray(self.sizes > _NEGLIGIBLE * self.steps)
+        return np.asarray(self.sizes > NEGLIGIBLE * self.steps)
 
     @property
     def inputs(self) -> int:
@@ -80,11 +82,12 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
     if usable.sum() < 2:
         return None
     pairs, residuals = pairs[usable], residuals[usable]
+    kept = Transitions(transitions.x[usable], transitions.u[usable], transitions.x_next[usable])
     typical = standard_deviations(steps[usable])
     sizes = np.sqrt((residuals**2).mean(axis=0))
-    learned = sizes > _NEGLIGIBLE * typical
+    learned = sizes > NEGLIGIBLE * typical
     if not learned.any():
         return None
     shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
     outputs = residuals / np.where(learned, sizes, np.inf)
-    return ResidualData((pairs - shift) / scale, outputs, sources[usable], shift, scale, sizes, typical)
+    return ResidualData((pairs - shift) / scale, outputs, sources[usable], shift, scale, sizes, typical, kept)

@@ -21,7 +21,7 @@ class ResidualKernel:
     return to its mean outside the data.
 
     Attributes:
-        nu: smoothness of the Matern part, 1.5 or 2.5.
+        nu: smoothness of the Matern part, 1.5, 2.5 or 4.5.
         growth: factor of the product of the inputs; 0 for a stationary Matern part.
         inputs: the number m of inputs of the system, which are the last columns.
     """

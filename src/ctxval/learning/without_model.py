@@ -1,0 +1,68 @@
+"""A linear model in place of M, to which residuals are added if M is rougher than the system.
+
+The residual ``S - M`` is as rough as the rougher one of S and M. The kinks of a network, or the waves of a Gaussian
+process between its data, make it rough although S is smooth. Such a residual takes many executions to learn, and S
+itself only few. The data decide: both models explain the same recorded transitions, with some probability density.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Rows
+from ctxval.core.trajectory import Transitions
+from ctxval.learning.hyperparameters import highest_log_posterior, learning_rows
+from ctxval.learning.residual_data import NEGLIGIBLE, ResidualData, residual_data
+from ctxval.models.linear import Linear
+from ctxval.models.scaling import standard_deviations
+
+PREFERRED = 1.0
+"""Least gain in the log density of each recorded number by which the linear model is preferred to M."""
+
+_LINEAR = 1e-3
+"""M is linear if it differs from a linear model by less than this share of its residual in every state."""
+
+
+def smoother_than(data: ResidualData, count: int) -> tuple[Linear, ResidualData] | None:
+    """Return a linear model and its residuals if with them the transitions are far more probable than with M's.
+
+    Args:
+        data: the residuals of M.
+        count: number of transitions from which hyperparameters are learned.
+    """
+    if _is_linear(data):
+        return None
+    rows = learning_rows(data.pairs, data.inputs, count)
+    needed = _log_density(data, rows) + PREFERRED * len(rows) * len(data.sizes)
+    known, n, m = data.transitions, len(data.sizes), data.inputs
+    # If S itself is linear, its linear model leaves no residual. The change of its state has the same prior.
+    for linear in (_fitted(known, known.x_next), Linear(np.eye(n), np.zeros((n, m)))):
+        other = residual_data(linear, known, data.sources)
+        if other is not None and len(other.pairs) == len(data.pairs):
+            return (linear, other) if _log_density(other, rows) > needed else None
+    return None
+
+
+def _log_density(data: ResidualData, rows: Rows) -> float:
+    """Return the log density of transitions in the units of the system, up to a constant that all models share."""
+    sizes = np.maximum(data.sizes, NEGLIGIBLE * data.steps)
+    learned = highest_log_posterior(data.pairs[rows], data.outputs[rows][:, data.learned], data.inputs)
+    return learned - len(rows) * float(np.log(sizes).sum())
+
+
+def _is_linear(data: ResidualData) -> bool:
+    """Return whether the model of these residuals is linear, as far as it matters for them."""
+    known = data.transitions
+    predicted = known.x_next - data.outputs * data.units
+    deviations = predicted - _fitted(known, predicted).step(known.x, known.u)
+    return bool((np.sqrt((deviations**2).mean(axis=0)) <= _LINEAR * data.sizes).all())
+
+
+def _fitted(known: Transitions, following: Array) -> Linear:
+    """Return the linear model with the least squared errors, and with the smallest weights if they are not unique."""
+    pairs, n = np.concatenate([known.x, known.u], axis=1), known.x.shape[1]
+    shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
+    regressors = np.concatenate([(pairs - shift) / scale, np.ones((len(pairs), 1))], axis=1)
+    weights = np.linalg.lstsq(regressors, following - known.x, rcond=1e-10)[0]
+    slopes = (weights[:-1] / scale[:, None]).T
+    return Linear(np.eye(n) + slopes[:, :n], slopes[:, n:], weights[-1] - slopes @ shift)
