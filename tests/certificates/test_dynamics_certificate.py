@@ -197,6 +197,15 @@ def test_many_coordinates_are_said_not_to_be_covered_jointly() -> None:
     assert any("not all combinations" in one for one in found.assumptions)
 
 
+def test_it_says_that_the_system_was_learned_without_its_model() -> None:
+    found = certify_dynamics(sample(), replace(GOOD, without_model=True))
+    assert any("the system is learned without M" in one for one in found.assumptions)
+    assert found.details["without_model"] is True
+    usual = certify_dynamics(sample(), GOOD)
+    assert not any("without M" in one for one in usual.assumptions)
+    assert usual.details["without_model"] is False
+
+
 def test_it_needs_the_model_and_executions_that_did_not_fail() -> None:
     with pytest.raises(CertificateError, match="experiment is not loaded"):
         Dynamics().certify(Sample.of(trials()))

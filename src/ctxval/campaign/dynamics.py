@@ -140,6 +140,8 @@ class CampaignDynamics:
             groups=len(worst.maxima) // len(learned.posterior.components),
             unplanned=worst.unplanned,
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
+            without_model=learned.posterior.without_model,
+            sharpness=worst.sharpness,
         )
 
     def _coordinates(self, learned: LearnedDynamics) -> tuple[str, ...]:

@@ -3,7 +3,8 @@ r"""The bound from learned dynamics: the posterior of ``d* = max_p d(p)`` under 
 The residual ``r(x, u) = x' - M(x, u)`` has a Gaussian-process prior with unknown hyperparameters. Each draw r_s from
 its posterior makes a system ``M + r_s``, whose largest distance d*_s is searched over all tasks. Under the prior, d*
 and these S maxima are exchangeable, so d* is at most the k-th smallest one with probability ``k / (S + 1)``. Draws
-that share hyperparameters make this approximate. Bayes' rule does not depend on how the tasks were chosen.
+that share hyperparameters make this approximate. Bayes' rule does not depend on how the tasks were chosen. If M is
+rougher than the system, a linear model takes its place in r (:mod:`ctxval.learning.without_model`).
 
 The bound lies if the prior is wrong: if a state is not recorded, or the dynamics jump. So it is withdrawn unless
 predictions that were made before executions held, and unless the records cover what the closed loops visit. It is
@@ -59,6 +60,9 @@ NOISE = 0.01
 
 LEFT_OUT = 0.5
 """Largest share of the posterior variance that the draws may leave out between their pivots."""
+
+SHARP = 0.05
+"""Largest share by which a large predicted distance may exceed the median of those of nearly the same tasks."""
 
 TESTED = 0.8
 """Least share of the largest distance on the posterior mean that must have been executed: the bound is tested there."""
@@ -264,6 +268,12 @@ def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
             f"the draws of the dynamics leave out {100 * evidence.left_out:.0f} % of the largest variance, more than "
             f"{100 * LEFT_OUT:g} %; more executions reduce this variance"
         )
+    if evidence.sharpness > SHARP:
+        return (
+            f"one of the largest predicted distances falls by {100 * evidence.sharpness:.0f} % if its task changes by "
+            "a thousandth of its ranges, so a search may miss larger ones: the controllers change abruptly from task to "
+            "task, as those of a model with kinks do, or the closed loop does; use a smoother model, or an audit"
+        )
     return uncovered(evidence) or untested(evidence, best, bound)
 
 
@@ -323,6 +333,19 @@ def untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
     return None
 
 
+def _prior(evidence: DynamicsEvidence) -> str:
+    if evidence.without_model:
+        return (
+            "a smooth function and a linear model explain the records far better than one and M, so the system is "
+            "learned without M: its difference from the linear model that fits best is a draw from a Gaussian process, "
+            "a Matern kernel of smoothness 3/2, 5/2 or 9/2 that may grow with the inputs, plus a linear function"
+        )
+    return (
+        "the residual x' - M(x, u) is a draw from a Gaussian process: a Matern kernel of smoothness 3/2 or 5/2 that "
+        "may grow with the inputs, plus a linear function"
+    )
+
+
 def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
     coordinates = len(evidence.coverage.resolution)
     joint = (
@@ -335,8 +358,7 @@ def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
     return (
         "the recorded state is complete: the next state depends on it and on the input alone",
         "the system is deterministic, and its dynamics do not change with time or with the task",
-        "the residual x' - M(x, u) is a draw from a Gaussian process: a Matern kernel of smoothness 3/2 or 5/2 that "
-        "may grow with the inputs, plus a linear function; its hyperparameters are unknown and integrated over",
+        f"{_prior(evidence)}; its hyperparameters are unknown and integrated over",
         "the residual is like what was seen, to a resolution in state and input of "
         f"{_texts(evidence.coverage.resolution)} (in the units of the system)",
         joint,
@@ -372,6 +394,8 @@ def _details(sample: Sample, evidence: DynamicsEvidence, bound: float, error: fl
         "largest_gap_at": coverage.marginal.place,
         "resolution": coverage.resolution,
         "noise": evidence.noise,
+        "without_model": evidence.without_model,
+        "sharpness": evidence.sharpness,
         "variance_left_out": evidence.left_out,
         "failures": sample.failures,
     }

@@ -136,6 +136,8 @@ class DynamicsEvidence:
         groups: number of draws that share hyperparameters.
         unplanned: share of the tasks for which no controller can be designed, or on which M diverges.
         untried: a parameter that M's loops do not depend on; None if there is none.
+        without_model: whether the system was learned without M, because M is rougher than the system.
+        sharpness: largest share by which a large distance on the mean exceeds those of tasks that are nearly the same.
     """
 
     maxima: Array
@@ -151,6 +153,8 @@ class DynamicsEvidence:
     groups: int = 2
     unplanned: float = 0.0
     untried: UntriedParameter | None = None
+    without_model: bool = False
+    sharpness: float = 0.0
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""

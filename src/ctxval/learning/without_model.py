@@ -19,6 +19,9 @@ from ctxval.models.scaling import standard_deviations
 PREFERRED = 1.0
 """Least gain in the log density of each recorded number by which the linear model is preferred to M."""
 
+_FEWEST = 10
+"""Least number of transitions for each coefficient of the linear model, so that the fit itself explains little."""
+
 _LINEAR = 1e-3
 """M is linear if it differs from a linear model by less than this share of its residual in every state."""
 
@@ -30,7 +33,7 @@ def smoother_than(data: ResidualData, count: int) -> tuple[Linear, ResidualData]
         data: the residuals of M.
         count: number of transitions from which hyperparameters are learned.
     """
-    if _is_linear(data):
+    if len(data.pairs) < _FEWEST * (data.pairs.shape[1] + 1) or _is_linear(data):
         return None
     rows = learning_rows(data.pairs, data.inputs, count)
     needed = _log_density(data, rows) + PREFERRED * len(rows) * len(data.sizes)

@@ -35,6 +35,8 @@ _SHOWN = 16
 """Largest number of these tasks."""
 _SAME = 0.02
 """Least distance of two of them, as a share of the cube's diagonal."""
+_NEARBY = 1e-3
+"""Largest change of each coordinate by which tasks next to the best ones differ from them."""
 _APART = 0.15
 """Least distance of two tasks that are not next to each other, as a share of the cube's diagonal."""
 
@@ -51,6 +53,8 @@ class WorstCaseSettings:
         moves: number of random moves in each round of the search on each draw.
         rounds: number of these rounds, at most 4.
         relevant: number of state-input pairs, on the loops of elites and of random tasks, from which pivots are chosen.
+        peaks: number of elites next to which tasks are tried.
+        nearby: number of tasks next to each of them.
     """
 
     pool: int = 1024
@@ -60,6 +64,8 @@ class WorstCaseSettings:
     moves: int = 10
     rounds: int = 4
     relevant: int = 700
+    peaks: int = 5
+    nearby: int = 32
 
     @classmethod
     def for_dimension(cls, dimension: int, batched: bool = True) -> WorstCaseSettings:
@@ -70,7 +76,7 @@ class WorstCaseSettings:
             batched: whether controllers are designed in batches; if not, there are far fewer tasks.
         """
         if not batched:
-            return cls(pool=48, evaluations=240, elites=6, shared=12, moves=2, rounds=0)
+            return cls(pool=48, evaluations=240, elites=6, shared=12, moves=2, rounds=0, peaks=1, nearby=8)
         evaluations = _EVALUATIONS[min(dimension, len(_EVALUATIONS)) - 1]
         return cls(pool=min(1024, evaluations // 4), evaluations=evaluations)
 
@@ -87,6 +93,7 @@ class WorstCase:
         evaluations: number of closed loops that were compared; a few of them may be the same.
         left_out: largest share of the posterior variance that a draw leaves out between its pivots.
         unplanned: share of the pool's tasks for which no controller can be designed, or on which M diverges.
+        sharpness: largest share by which a distance on the mean is larger than those of tasks that are nearly the same.
     """
 
     maxima: Array
@@ -96,6 +103,7 @@ class WorstCase:
     evaluations: int
     left_out: float
     unplanned: float
+    sharpness: float = 0.0
 
     def __repr__(self) -> str:
         return call(self, draws=len(self.maxima), of_mean=self.of_mean, evaluations=self.evaluations)
@@ -163,6 +171,7 @@ class WorstCaseSearch:
             tasks = np.concatenate([elites, known, self.pool[rng.permutation(len(self.pool))[: self.settings.shared]]])
             draws = posterior.draw(self._relevant(posterior, tasks, rng), rng, functions)
             points, maxima, more = self._search_draws(draws, tasks, rng)
+            sharpness = self._sharpness(posterior.mean, elites, rng)
         return WorstCase(
             np.where(maxima >= _DIVERGED, np.inf, maxima),
             points,
@@ -171,6 +180,7 @@ class WorstCaseSearch:
             evaluations + len(draws) * more,
             max(draws.left_out),
             self._unplanned,
+            sharpness,
         )
 
     def _search_mean(self, mean: DynamicsDraws, known: Array, rng: np.random.Generator) -> tuple[float, Array, int]:
@@ -187,6 +197,21 @@ class WorstCaseSearch:
         found = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
         elites = np.concatenate([found.points[:1], found.elites[: self.settings.elites]])
         return float(found.values[0]), elites, len(self.pool) + found.evaluations
+
+    def _sharpness(self, mean: DynamicsDraws, elites: Array, rng: np.random.Generator) -> float:
+        """Return the largest share that the distance of an elite loses at the median of the tasks next to it.
+
+        If controllers jump from task to task, the largest distance is a needle that a search finds by chance.
+        """
+        peaks = elites[: self.settings.peaks]
+        moves = rng.uniform(-_NEARBY, _NEARBY, (len(peaks), self.settings.nearby, self.dimension))
+        tasks = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
+        planned = self.planner.plan(tasks.reshape(-1, self.dimension))
+        found = _finite(self.planner.distances(mean, planned, tasks.shape[0] * tasks.shape[1]))
+        distances = np.maximum(found.reshape(tasks.shape[:2]), 0.0)
+        peak, next_to_it = distances[:, 0], np.median(distances[:, 1:], axis=1)
+        lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
+        return float(max(lost.max(initial=0.0), 0.0))
 
     def _relevant(self, posterior: DynamicsPosterior, tasks: Array, rng: np.random.Generator) -> Array:
         """Return standardised pairs on the mean's closed loops, from which pivots are chosen."""
