@@ -7,6 +7,8 @@ the tables in docs/comparison.md. What is there already is not computed again.
   system from its target. The truths are the largest and the mean distance on a grid.
 - ``cart``: two LQRs on carts with different drags, where the truths are known. Some pairs are nearly equal. The
   question ``plain`` is ``mean`` without predictions, which is cheap enough for many seeds.
+- ``skewed``: independent draws of distributions whose mean is 0, as differences of distances without a largest one.
+  Every decision on their sign is false.
 """
 
 from __future__ import annotations
@@ -128,18 +130,49 @@ def without_predictions(seed: int) -> dict[str, Any]:
     }
 
 
+SKEWED: dict[str, Callable[[np.random.Generator, int], Array]] = {
+    "normal": lambda rng, count: rng.normal(size=count),
+    "exponential": lambda rng, count: rng.exponential(size=count) - 1,
+    "lognormal, sigma = 1.5": lambda rng, count: rng.lognormal(0, 1.5, count) - np.exp(1.5**2 / 2),
+}
+"""Draws with the mean 0."""
+DRAWS, REPETITIONS = 1000, 2000
+
+
+def skewed(name: str, seed: int) -> dict[str, Any]:
+    """Return in how many repetitions a sign of the mean 0 was decided, after any number of draws."""
+    false = 0
+    for repetition in range(REPETITIONS):
+        values = SKEWED[name](np.random.default_rng([seed, repetition]), DRAWS)
+        differences = PairedDifferences(values, np.zeros(DRAWS))
+        ends = [float(differences.log_wealth(np.array(0.0), above=above)[-1]) for above in (True, False)]
+        false += int(max(ends) >= np.log(2 / (1 - CONFIDENCE)))
+    about = {"case": "skewed", "question": name, "seed": seed}
+    return {**about, "draws": DRAWS, "repetitions": REPETITIONS, "false": false}
+
+
+def result(case: str, question: str, seed: int) -> dict[str, Any]:
+    """Return the result of one seed."""
+    if case == "skewed":
+        return skewed(question, seed)
+    return without_predictions(seed) if question == "plain" else one(case, question, seed)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "--cases",
         nargs="+",
-        default=["cart:plain:1000", "arm:mean:5", "cart:mean:200", "arm:worst:3", "cart:worst:200"],
+        default=[
+            *(f"skewed:{name}:1" for name in SKEWED),
+            *("cart:plain:1000", "arm:mean:5", "cart:mean:200", "arm:worst:3", "cart:worst:200"),
+        ],
     )
     for text in parser.parse_args().cases:
         case, question, seeds = text.split(":")
         for seed in range(int(seeds)):
             if (case, question, seed) not in STORED:
-                STORED.append(without_predictions(seed) if question == "plain" else one(case, question, seed))
+                STORED.append(result(case, question, seed))
                 print(STORED[case, question, seed], flush=True)
 
 

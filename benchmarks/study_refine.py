@@ -227,6 +227,14 @@ corrected model.
 """
 
 MASS_TEXT = """
+**Errors.** The residual correction is kept for the states whose error on held-out executions falls, and the errors that
+`ctxval refine` reports include the same held-out executions. They are therefore slightly too small; only the errors on
+the executions of the last round are not affected, because these executions chose nothing.
+
+**Several refinements.** The confidence of a validated model is that of one refinement, however many rounds it has. If
+several refinements begin with the same stores or executions, for example one for each method, the probability that any
+of them validates a model wrongly is larger than stated.
+
 **Known truth.** A pendulum model has a mass 20 % too large. Its mass is estimated from three executions with noise in
 each step. The interval of confidence 0.95 held the true mass in {held} of {of} repetitions.
 """

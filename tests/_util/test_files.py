@@ -11,7 +11,7 @@ import pytest
 
 from ctxval import Trajectory
 from ctxval._util import files
-from ctxval._util.files import csv_rows, open_regular, read_bytes, read_json, require_regular_file
+from ctxval._util.files import csv_rows, open_regular, read_bytes, read_json, require_regular_file, written_whole
 from ctxval.config.parts import recorded
 from ctxval.core.exchange import read_task
 from ctxval.errors import InputError
@@ -144,3 +144,29 @@ def test_a_file_that_grows_while_it_is_read_is_refused(tmp_path: Path, monkeypat
     monkeypatch.setattr(files.os, "fstat", lambda descriptor: Shorter(original(descriptor)))
     with pytest.raises(InputError, match="it grew while it was read"):
         read_bytes(tmp_path / "a")
+
+
+def test_a_file_is_complete_or_as_before(tmp_path: Path) -> None:
+    path = tmp_path / "model.onnx"
+    with written_whole(path) as file:
+        file.write(b"first")
+        assert not path.exists()
+    with pytest.raises(TypeError), written_whole(path) as file:
+        file.writelines([b"half of the sec", None])  # type: ignore[list-item]
+    assert path.read_bytes() == b"first"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@POSIX
+def test_a_link_is_written_through(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "target")
+    with written_whole(tmp_path / "link") as file:
+        file.write(b"one")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "target").read_bytes() == b"one"
+
+
+def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
+    for path, reason in ((tmp_path / "no" / "a.npz", "No such file"), (tmp_path, "irectory")):
+        with pytest.raises(InputError, match=f"cannot be written: .*{reason}"), written_whole(path) as file:
+            file.write(b"one")

@@ -13,6 +13,5 @@ def test_the_page_states_the_measured_times() -> None:
     page = (ROOT / "docs" / "how-to" / "replay.md").read_text()
     assert set(found) == {"install", "mcap", "mat", "lerobot"}
     for times in found.values():
-        assert f"| {times['cpu']} s | {times['wall']} s |" in page
-    # A report within a minute of installing.
-    assert all(found[kind]["wall"] < 60 for kind in ("mcap", "mat", "lerobot"))
+        assert f"| {times['cpu']} s |" in page
+        assert f"{times['wall']} s" not in page  # it depends on what else the computer did

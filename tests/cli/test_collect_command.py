@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
 
 from ctxval import Trajectory
-from ctxval.cli import app
+from rig_cli import Invoke, calling, report
 
-Invoke = Callable[..., Result]
 OPTIONS = ("--amplitude", "0.5", "--limits", "15")
 
 
@@ -21,16 +16,7 @@ OPTIONS = ("--amplitude", "0.5", "--limits", "15")
 def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Invoke:
     monkeypatch.chdir(tmp_path)
 
-    def called(*arguments: str) -> Result:
-        return CliRunner().invoke(app, ["collect", *arguments])
-
-    return called
-
-
-def report(result: Result) -> dict[str, Any]:
-    assert result.exit_code == 0, result.stdout + result.stderr
-    found: dict[str, Any] = json.loads(result.stdout)
-    return found
+    return calling("collect")
 
 
 def test_executions_are_recorded_and_not_repeated(invoke: Invoke) -> None:

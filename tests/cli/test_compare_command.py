@@ -8,18 +8,16 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
 from ctxval import Store
 from ctxval.cli import app
 from ctxval.errors import StoreError
-
-Invoke = Callable[..., Result]
+from rig_cli import Invoke, calling
 
 FILE = """
 name = "cart"
@@ -63,10 +61,7 @@ def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Invoke:
     Path("stiff.toml").write_text(FILE + "Q = [100.0, 1.0]\nR = [0.1]\n")
     Path("wide.toml").write_text((FILE + "Q = [1.0, 1.0]\nR = [1.0]\n").replace("[-2.0, 2.0", "[-3.0, 2.0"))
 
-    def called(*arguments: str) -> Result:
-        return CliRunner().invoke(app, ["compare", *arguments])
-
-    return called
+    return calling("compare")
 
 
 @pytest.mark.slow
@@ -118,7 +113,7 @@ def test_what_cannot_be_compared_is_refused_in_one_sentence(invoke: Invoke, argu
 
 
 def test_candidates_that_cannot_be_compared_leave_no_store(invoke: Invoke) -> None:
-    assert invoke("gentle.toml", "wide.toml", "--store", "refused").exit_code == 2
+    assert invoke("gentle.toml", "wide.toml", "--stores", "refused").exit_code == 2
     assert not list(Path("refused").glob("*"))
 
 
@@ -138,7 +133,7 @@ def trials(folder: Path) -> dict[str, list[tuple[list[float], float | None, str]
 @pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL")
 def test_a_comparison_that_is_killed_makes_the_same_choices(invoke: Invoke) -> None:
     def started(folder: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "ctxval.cli", "compare", "gentle.toml", "stiff.toml", "--store", folder]
+        command = [sys.executable, "-m", "ctxval.cli", "compare", "gentle.toml", "stiff.toml", "--stores", folder]
         return subprocess.Popen([*command, "--budget", "18", "--json"], stdout=subprocess.PIPE, text=True)
 
     whole = json.loads(started("whole").communicate()[0])

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
 from ctxval import models
-from ctxval.cli import app
 from ctxval.config.parts import part
+from rig_cli import Invoke, calling, report
 from rig_logs import DT, run, write_mcap_json
-
-Invoke = Callable[..., Result]
 
 STEP = f"""
 import numpy as np
@@ -39,16 +34,7 @@ def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Invoke:
         run(80, seed).to_csv(f"logs/{seed}.csv")
     Path("my_cart_step.py").write_text(STEP)
 
-    def called(*arguments: str) -> Result:
-        return CliRunner().invoke(app, ["fit", *arguments])
-
-    return called
-
-
-def report(result: Result) -> dict[str, Any]:
-    assert result.exit_code == 0, result.stdout + result.stderr
-    found: dict[str, Any] = json.loads(result.stdout)
-    return found
+    return calling("fit")
 
 
 def test_a_linear_model_is_learned_and_written_with_its_data(invoke: Invoke) -> None:
@@ -120,11 +106,27 @@ def test_batches_are_taken_if_they_are_promised(invoke: Invoke) -> None:
     assert "vectorized = true" in Path("a.toml").read_text()
 
 
+@pytest.mark.parametrize("content", ["<mujoco>", None])
+def test_a_given_model_that_cannot_be_used_is_an_error(content: str | None, invoke: Invoke) -> None:
+    pytest.importorskip("mujoco")
+    slide = (
+        f"<mujoco><option timestep='{DT}'/><worldbody><body><joint type='slide'/><geom size='1'/></body></worldbody>"
+    )
+    Path("given.xml").write_text(content or f"{slide}</mujoco>")
+    result = invoke("logs", "--kind", "linear", "--given", "given.xml")
+    assert result.exit_code in (2, 3), result.stdout + result.stderr
+    wanted = "cannot compile" if content else "2 states and 1 inputs: the model has 1 qpos, 1 qvel and 0 inputs"
+    assert wanted in " ".join(result.stderr.split())
+    assert not result.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("--kind", "linaer"), "no kind of model is called 'linaer'; did you mean 'linear'"),
         (("--hold-out", "1"), "the share that is held out must be between 0 and 1, got 1"),
+        (("--kind", "linear", "--out", "logs"), "the file of a model must end in"),
+        (("--kind", "linear", "--out", "map.npz/a.npz"), "map.npz/a.npz cannot be written"),
         (("--kind", "linear", "--out", "a.txt"), "the file of a model must end in .npz, .onnx, .toml, got 'a.txt'"),
         (
             ("--kind", "linear", "--out", "a.toml"),
@@ -139,6 +141,7 @@ def test_batches_are_taken_if_they_are_promised(invoke: Invoke) -> None:
     ],
 )
 def test_what_cannot_be_used_is_said_in_one_sentence(arguments: tuple[str, ...], message: str, invoke: Invoke) -> None:
+    Path("map.npz").write_text("no folder")
     result = invoke("logs", *arguments)
     assert result.exit_code == 2, result.stdout + result.stderr
     assert message in " ".join(result.stderr.split())

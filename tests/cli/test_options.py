@@ -9,21 +9,17 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner, Result
 
-from ctxval.cli import app
 from ctxval.cli.options import named_values, parsed
 from ctxval.errors import InputError
+from rig_cli import calling
 
 
 @pytest.fixture
 def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.chdir(tmp_path)
 
-    def run(*arguments: str) -> Result:
-        return CliRunner().invoke(app, list(arguments))
-
-    return run
+    return calling()
 
 
 @pytest.mark.parametrize(

@@ -9,17 +9,13 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
 
 from ctxval import Store, models
-from ctxval.cli import app
-
-Invoke = Callable[..., Result]
+from rig_cli import Invoke, calling
 
 PLANT = """
 import time
@@ -88,10 +84,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def invoke(folder: Path) -> Invoke:
-    def called(*arguments: str) -> Result:
-        return CliRunner().invoke(app, list(arguments))
-
-    return called
+    return calling()
 
 
 def falsified(invoke: Invoke) -> str:
@@ -105,7 +98,7 @@ def falsified(invoke: Invoke) -> str:
 def test_a_falsified_store_is_refined_until_the_model_is_validated(invoke: Invoke, folder: Path) -> None:
     pytest.importorskip("onnxruntime")
     store = falsified(invoke)
-    done = invoke("refine", store, "--budget", "20", "--output", "better.onnx", "--json")
+    done = invoke("refine", store, "--budget", "20", "--out", "better.onnx", "--json")
     assert done.exit_code == 0, done.stdout + done.stderr
     found = json.loads(done.stdout)
     assert (found["verdict"], found["threshold"], found["rounds"][0]["verdict"]) == ("validated", 0.05, "falsified")
@@ -137,7 +130,7 @@ def test_an_experiment_is_run_first_and_the_answer_is_said(invoke: Invoke, folde
 def test_parameters_of_a_function_are_estimated_and_written(invoke: Invoke) -> None:
     store = falsified(invoke)
     given = ("--step", "refined_plant:law", "--parameter", "linear=[0, 2]", "--parameter", "square=[0, 2]")
-    done = invoke("refine", store, "--method", "parameters", *given, "--output", "law.toml", "--budget", "3", "--json")
+    done = invoke("refine", store, "--method", "parameters", *given, "--out", "law.toml", "--budget", "3", "--json")
     assert done.exit_code == 0, done.stdout + done.stderr
     found = json.loads(done.stdout)
     assert [round(one["value"], 6) for one in found["parameters"]] == [0.5, 0.3]
@@ -206,8 +199,23 @@ def trials(folder: Path, only: Path | None = None) -> list[Any]:
         (["cart.toml", "--fit", "refined_plant:broken"], "must be given together"),
         (["cart.toml", "--method", "parameters"], "--parameter must be given together"),
         (["cart.toml", "--step", "refined_plant:law"], "--step is for --method parameters"),
-        (["cart.toml", "--output", "model.pkl"], "must end in .npz, .onnx, .toml"),
-        (["cart.toml", "--output", "nowhere/model.npz"], "cannot be written: there is no folder nowhere"),
+        (["cart.toml", "--out", "model.pkl"], "must end in .npz, .onnx, .toml"),
+        (["cart.toml", "--out", "cart.toml/model.npz"], "cart.toml/model.npz cannot be written"),
+        (["cart.toml", "--out", "model.toml"], "'residual' cannot be written to a file that ends in .toml: give one"),
+        (["cart.toml", "--method", "network", "--out", "a.toml"], "give one that ends in .npz or .onnx"),
+        (
+            ["cart.toml", "--method", "parameters", "--parameter", "a=[0, 1]", "--out", "a.onnx"],
+            "'parameters' cannot be written to a file that ends in .onnx: give one that ends in .toml",
+        ),
+        (
+            ["cart.toml", "--method", "parameters", "--parameter", "a=[0, 1]", "--out", "a.toml"],
+            "can only be written with the reference module:attr to it (--step)",
+        ),
+        (
+            ["better.npz"],
+            "better.npz is neither a case, an experiment file (.toml), a store (.sqlite, .sqlite3, .db) nor",
+        ),
+        (["refined_plant.py"], "nor a reference module:attr (here refined_plant:NAME)"),
         (["cart.toml", "--trust"], "--experiment and --trust are for a store"),
         (["cart.toml", "--threshold", "-1"], "threshold must be a positive number"),
         (["cart.sqlite", "--seed", "1"], "--seed and --option are for an experiment"),
@@ -218,6 +226,19 @@ def test_what_cannot_be_used_is_said_in_one_sentence(invoke: Invoke, arguments: 
     assert done.exit_code == 2, done.stdout + done.stderr
     assert sentence in " ".join(done.stderr.split())
     assert not list(Path().rglob("*.round-*"))
+    assert not any(Store(path).trials() for path in Path().rglob("*.sqlite"))
+
+
+def test_a_correction_of_a_function_cannot_be_onnx_and_is_refused_before_executions(invoke: Invoke) -> None:
+    pytest.importorskip("onnx")
+    described = FILE.format(budget=20)
+    table = '[model]\ntype = "refined_plant:step"\n'
+    start, end = described.index("[model]"), described.index("[synthesizer]")
+    Path("cart.toml").write_text(described[:start] + table + described[end:])
+    done = invoke("refine", "cart.toml", "--out", "better.onnx")
+    assert done.exit_code == 2, done.stdout + done.stderr
+    assert "can be written as ONNX, got" in " ".join(done.stderr.split())
+    assert not any(Store(path).trials() for path in Path().rglob("*.sqlite"))
 
 
 def test_a_fit_that_fails_is_said_and_nothing_is_lost(invoke: Invoke) -> None:

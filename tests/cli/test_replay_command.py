@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from ctxval.cli import app
+from rig_cli import Invoke, calling, report
 from rig_logs import DT, run, write_lerobot, write_mat, write_mcap_json
 
-Invoke = Callable[..., Result]
 LINEAR = ("--model", "Linear", "--option", f"A=[[1.0, {DT}], [0.0, 1.0]]", "--option", f"B=[[0.0], [{DT}]]")
 FIELDS = ("--state", "position=/state.cart.position", "--state", "speed=/state.cart.speed", "--input", "/command.force")
 
@@ -65,16 +63,7 @@ def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Invoke:
     for seed in range(4):
         run(80, seed).to_csv(f"logs/{seed}.csv")
 
-    def called(*arguments: str) -> Result:
-        return CliRunner().invoke(app, ["replay", *arguments])
-
-    return called
-
-
-def report(result: Result) -> dict:  # type: ignore[type-arg]
-    assert result.exit_code == 0, result.stdout + result.stderr
-    found: dict = json.loads(result.stdout)  # type: ignore[type-arg]
-    return found
+    return calling("replay")
 
 
 def refusal(result: Result) -> str:

@@ -10,11 +10,10 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-from typer.testing import CliRunner, Result
 
 from conftest import STATE
 from ctxval import Store
-from ctxval.cli import app
+from rig_cli import calling
 
 RIG = """
 from conftest import make_validation
@@ -39,10 +38,7 @@ def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     (tmp_path / "short_rig.py").write_text(RIG)
     sys.modules.pop("short_rig", None)
 
-    def run(*arguments: str) -> Result:
-        return CliRunner().invoke(app, list(arguments))
-
-    return run
+    return calling()
 
 
 @pytest.fixture
@@ -136,7 +132,7 @@ def test_a_kind_and_a_confidence_of_ones_own(invoke: Any, store: Path) -> None:
         (("a.sqlite", "-o", "."), "cannot be written"),
         (("a.sqlite", "--threshold", "-1"), "must be a positive number"),
         (("a.sqlite", "--trust", "--experiment", "pendulum"), "cannot be given together"),
-        (("a.sqlite", "--junit", "no/such/folder.xml"), "cannot be written"),
+        (("a.sqlite", "--junit", "a.sqlite/junit.xml"), "cannot be written"),
     ],
 )
 def test_nonsense_is_one_sentence(invoke: Any, store: Path, arguments: tuple[str, ...], says: str) -> None:

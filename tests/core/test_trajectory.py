@@ -303,3 +303,9 @@ def test_a_file_that_is_no_text_is_refused_by_name(tmp_path: Path) -> None:
         Trajectory.from_csv(tmp_path / "rig.csv")
     with pytest.raises(InputError, match=r"nothing\.csv cannot be read as CSV"):
         Trajectory.from_csv(tmp_path / "nothing.csv")
+
+
+def test_recorded_steps_of_different_sizes_are_not_joined() -> None:
+    small, large = (Transitions(np.ones((4, n)), np.ones((4, 1)), np.ones((4, n))) for n in (2, 3))
+    with pytest.raises(ShapeError, match="got 2 states and 1 inputs and 3 states and 1 inputs"):
+        Transitions.joined([small, large])

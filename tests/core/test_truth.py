@@ -228,6 +228,6 @@ def test_a_write_that_fails_halfway_leaves_nothing_behind(tmp_path: Path, monkey
     def full(source: object, target: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("ctxval.core.truth.os.replace", full)
+    monkeypatch.setattr("pathlib.Path.replace", full)
     assert cached_truth(of_surface(hill), Counted(), tmp_path).distance == 2.0
     assert list(tmp_path.iterdir()) == []

@@ -216,3 +216,18 @@ def test_a_written_onnx_file_computes_the_same(kind: Any, tmp_path: Path) -> Non
     np.testing.assert_allclose(read.step(x, u[:, :1]), learned.step(x, u[:, :1]), rtol=1e-12, atol=1e-12)
     with pytest.raises(InputError, match="only linear models, networks, Gaussian processes and corrections of these"):
         write_onnx(tmp_path / "other.onnx", models.Function(lambda x, u: x))
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        models.Linear(np.eye(3), np.ones((3, 1))),
+        models.GaussianProcessModel.fit(
+            Transitions(np.random.default_rng(0).random((9, 3)), np.ones((9, 1)), np.zeros((9, 3))), 5
+        ),
+    ],
+    ids=["linear", "gaussian-process"],
+)
+def test_a_given_model_of_another_size_is_refused_in_one_sentence(model: Any) -> None:
+    with pytest.raises(ModelError, match=r"2 states and 1 inputs: the model has [34] states and .*, got (2|states)"):
+        fit(RECORDED, ["linear"], given=model)

@@ -134,3 +134,13 @@ def test_units_do_not_decide_whether_data_are_enough() -> None:
     units = np.array([1e-5, 1e5])
     fitted = Linear.fit(Transitions(data.x * units, data.u, data.x_next * units))
     np.testing.assert_allclose(fitted.A, truth.A * units[:, None] / units, rtol=1e-8)
+
+
+def test_states_and_data_of_another_size_are_refused_in_one_sentence() -> None:
+    data = Transitions(np.ones((4, 3)), np.ones((4, 1)), np.ones((4, 3)))
+    with pytest.raises(ShapeError, match="has 2 states and 1 inputs, and its data have 3 states and 1 inputs"):
+        Linear(np.eye(2), np.ones((2, 1)), data=data)
+    with pytest.raises(
+        ShapeError, match=r"2 states and 1 inputs, got states of shape \(3,\) and inputs of shape \(1,\)"
+    ):
+        Linear(np.eye(2), np.ones((2, 1))).step(np.ones(3), np.ones(1))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from ctxval.cli import app
 from ctxval.config.parts import part
 from ctxval.data import recordings_of
 from ctxval.data.log import MemoryTable
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import InputError, ModelError, ShapeError
 from ctxval.fitting import fit
 
 mujoco = pytest.importorskip("mujoco")
@@ -111,6 +113,27 @@ def test_it_is_the_model_of_a_campaign_and_repeats_itself_in_a_store(tmp_path: P
     np.testing.assert_array_equal(again.step(np.ones(2), np.ones(1)), validation.model.step(np.ones(2), np.ones(1)))
 
 
+def test_a_store_that_an_older_version_made_still_opens(tmp_path: Path) -> None:
+    (tmp_path / "options.xml").write_text('<mujoco><option gravity="0 0 -9.81"/></mujoco>')
+    (tmp_path / "model.xml").write_text(mjcf(0.02).replace("<worldbody>", '<include file="options.xml"/><worldbody>'))
+    validation = Validation(
+        space=TaskSpace(goal=(-1.0, 1.0, "rad")),
+        task=lambda p: Task([0.0, 0.0], goal=[p.goal, 0.0], horizon=20, dt=DT),
+        system=systems.MuJoCo(mjcf(0.08), substeps=4),
+        model=models.MuJoCo(tmp_path / "model.xml", dt=DT),
+        synthesizer=controllers.LQR([1.0, 0.1], [0.1]),
+        distance=distances.FinalState(components=[0]),
+    )
+    path = tmp_path / "a.sqlite"
+    Campaign(validation, store=path).run(1)
+    with closing(sqlite3.connect(path)) as connection, connection:
+        ((known,),) = connection.execute("SELECT value FROM experiment WHERE key = 'validation'").fetchall()
+        described = json.loads(known)
+        assert described["model"].pop("compiled")["gravity"] == [0, 0, -9.81]
+        connection.execute("UPDATE experiment SET value = ? WHERE key = 'validation'", (json.dumps(described),))
+    assert Campaign(validation, store=path).run(2).executions == 2
+
+
 @pytest.mark.parametrize(
     ("given", "options", "said"),
     [
@@ -166,14 +189,14 @@ def test_the_result_of_mujoco_sysid_is_a_model_with_its_held_out_error(tmp_path:
     assert part("model", {"type": "MuJoCo", "mjcf": "result", "dt": DT}, tmp_path).dt == pytest.approx(DT)
 
 
-def test_a_given_model_with_another_time_step_or_size_is_a_failed_fit() -> None:
+def test_a_given_model_with_another_time_step_or_size_is_refused() -> None:
     one = recorded()
     log = MemoryTable("a", {"t": one.times, "x": one.states, "u": np.append(one.inputs, [[np.nan]], axis=0)})
-    report = fit(recordings_of([log]), ["linear"], given=models.MuJoCo(mjcf(0.1)))
-    assert [one.kind for one in report.fitted] == ["linear"]
-    assert report.failed[0].reason == "the given model has steps of 0.005 s and the recordings have steps of 0.02 s."
-    wrong = fit(recordings_of([log]), ["linear"], given=models.Linear(np.eye(3), np.zeros((3, 1))))
-    assert [one.kind for one in wrong.failed] == ["given"]
+    with pytest.raises(InputError, match=r"steps of 0.005 s and the recordings have steps of 0.02 s"):
+        fit(recordings_of([log]), ["linear"], given=models.MuJoCo(mjcf(0.1)))
+    larger = mjcf(0.1).replace("<body>", '<body><joint type="slide"/>')
+    with pytest.raises(ModelError, match=r"have 2 states and 1 inputs: the model has 2 qpos, 2 qvel and 1 inputs"):
+        fit(recordings_of([log]), ["linear"], given=models.MuJoCo(larger, dt=DT))
 
 
 def test_a_folder_must_have_one_identified_model(tmp_path: Path) -> None:

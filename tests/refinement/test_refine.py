@@ -62,6 +62,7 @@ def test_the_confidence_of_a_round_is_that_of_the_whole_sequence(found: Refineme
     assert found.last.verdict.certificate is not None
     assert found.last.verdict.certificate.confidence == found.last.confidence
     assert "at most 0.05" in found.statement
+    assert "This holds for one refinement" in found.statement
 
 
 def test_the_shares_of_the_rounds_sum_up_to_alpha() -> None:

@@ -86,6 +86,17 @@ def positive_count(sentence: str, count: object) -> int:
     return int(count)
 
 
+def count_from_zero(name: str, count: object) -> int:
+    """Return an integer that is at least 0, such as a seed.
+
+    Raises:
+        InputError: if the value is no integer, or is below 0.
+    """
+    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 0:
+        raise InputError(f"{name} must be an integer >= 0, got {count!r}.")
+    return int(count)
+
+
 def require_shape(name: str, array: Array, expected: tuple[int, ...]) -> Array:
     """Return ``array`` if its last axes are ``expected``.
 

@@ -1,7 +1,9 @@
-"""Bounded reading of files from elsewhere: only regular files are read, and only up to a stated number of bytes.
+"""Bounded reading of files from elsewhere, and writing of files that are complete or missing.
+
+Only regular files are read, and only up to a stated number of bytes.
 
 A FIFO would wait for its writer, a device such as ``/dev/zero`` never ends, and a few crafted bytes can unpack to many.
-The message of every error here is only the reason; the caller puts the name of the file before it.
+The message of an error of reading is only the reason; the caller puts the name of the file before it.
 """
 
 from __future__ import annotations
@@ -10,8 +12,10 @@ import csv
 import io
 import json
 import os
+import secrets
 import stat
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -104,6 +108,40 @@ def read_json(path: str | Path) -> Any:
         raise InputError("it is nested too deeply") from error
     except ValueError as error:
         raise InputError(f"it is not JSON: {error}") from error
+
+
+def make_folder_of(path: str | Path) -> None:
+    """Make the folder of a file that will be written, if there is none.
+
+    Raises:
+        InputError: if it cannot be made; the message names the file.
+    """
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
+
+
+@contextmanager
+def written_whole(path: str | Path) -> Iterator[BinaryIO]:
+    """Yield a file to write to, which gets its name at the end: it is complete or, after an error or a kill, missing.
+
+    Two processes may write the same file at once: one of the two complete files stays.
+
+    Raises:
+        InputError: if the file cannot be written; the message names it.
+    """
+    target = Path(os.path.realpath(path))  # a link stays a link
+    beside = target.with_name(f"{target.name}.{secrets.token_hex(4)}.part")
+    try:
+        with beside.open("xb") as file:
+            yield file
+        beside.replace(target)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
+    finally:
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
 
 
 def csv_rows(path: str | Path, most: int = MOST_BYTES) -> Iterator[tuple[int, list[str]]]:

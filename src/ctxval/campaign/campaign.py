@@ -6,9 +6,7 @@ import concurrent.futures as cf
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
-from ctxval._util.arrays import positive_count
+from ctxval._util.arrays import count_from_zero, positive_count
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display, remeasuring
 from ctxval.campaign.choices import Choice, OpenTrial
@@ -65,11 +63,9 @@ class Campaign(OperatedCampaign):
     ) -> None:
         if not isinstance(validation, Validation):
             raise InputError(f"validation must be a Validation, got {validation!r}.")
-        if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
-            raise InputError(f"seed must be an integer >= 0, got {seed!r}.")
+        self.seed = count_from_zero("seed", seed)
         if search is not None and not isinstance(search, Search):
             raise InputError(f"search must have reset, ask and tell, got {search!r}.")
-        self.seed = int(seed)
         self.name = name
         trials = store if isinstance(store, Store) else Store(store)
         self.search: Search = search_of(trials) if search is None else search

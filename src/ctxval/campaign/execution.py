@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ctxval._util.arrays import count_from_zero
 from ctxval._util.interrupts import Interrupts, exits_as_exceptions
 from ctxval._util.progress import advance, is_heard, stage
 from ctxval.campaign.choices import Choice, OpenTrial
@@ -38,9 +39,7 @@ class RetryPolicy:
 
     def __post_init__(self) -> None:
         for name in ("retries", "retry_failures"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-                raise InputError(f"{name} must be an integer >= 0, got {value!r}.")
+            count_from_zero(name, getattr(self, name))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, differences
+from ctxval._util.mjcf import COMPILED
 from ctxval.core.distance import Distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Change, Trial
@@ -126,7 +127,7 @@ def identify(
     if accept is not None and not accept.strip():
         raise InputError('accepting a change needs a reason, such as "gripper replaced".')
     stored = _with_present_names(store.describe_first(description))
-    present = description if "version" in stored else _as_before(description, stored)
+    present = _without_new(description if "version" in stored else _as_before(description, stored), stored)
     found = list(differences(stored, present))
     asked = [sentence for path, sentence in found if path.startswith(_QUESTION)]
     if asked:
@@ -269,6 +270,16 @@ def _with_present_names(stored: dict[str, Any]) -> dict[str, Any]:
         return start + _RENAMED[old] if old in _RENAMED and (start or key == "type") else value
 
     return {**stored, "search": renamed(stored["search"])} if "search" in stored else stored
+
+
+def _without_new(present: Any, stored: Any) -> Any:
+    """Return a description without the numbers of MuJoCo models, if an older version described the stored models."""
+    if isinstance(present, dict) and isinstance(stored, dict):
+        kept = {key: value for key, value in present.items() if key != COMPILED or key in stored}
+        return {key: _without_new(value, stored.get(key)) for key, value in kept.items()}
+    if isinstance(present, list) and isinstance(stored, list) and len(present) == len(stored):
+        return [_without_new(a, b) for a, b in zip(present, stored, strict=True)]
+    return present
 
 
 def _as_before(present: dict[str, Any], stored: dict[str, Any]) -> dict[str, Any]:

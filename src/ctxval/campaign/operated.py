@@ -21,7 +21,10 @@ from ctxval.errors import InputError
 
 
 class OperatedCampaign(CampaignResults):
-    """The part of a campaign that opens trials for people and records their results. It executes nothing."""
+    """The part of a campaign that opens trials for people and records their results.
+
+    None of its methods executes the system: people do.
+    """
 
     def ask(
         self,

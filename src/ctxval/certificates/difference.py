@@ -31,9 +31,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import record
-
-_CAUTION = 0.75
-"""Largest bet on bounded differences, as a share of that with which one task could lose everything."""
+from ctxval.certificates.bets import log_wealth_of_bets, weights_so_far
 
 _LARGEST = 0.9
 """Largest gain or loss of one bet on unbounded differences, as a share of the wealth."""
@@ -72,12 +70,7 @@ class PairedDifferences:
     @property
     def _weights(self) -> Array:
         """The slope of differences against predictions among the recent earlier tasks, from 0 to 1, ``(N,)``."""
-        d, h = self.values, self.predicted
-        sums = [_recent_sum(part) for part in (d, h, d * h, h**2)]
-        count = _recent_sum(np.ones(len(d)))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            slope = (sums[2] - sums[0] * sums[1] / count) / (sums[3] - sums[1] ** 2 / count)
-        return np.asarray(np.where(np.isfinite(slope) & (count >= 3), np.clip(slope, 0.0, 1.0), 1.0))
+        return weights_so_far(self.values, self.predicted, _recent_sum)
 
     def log_wealth(self, mean: Array, *, above: bool) -> Array:
         """Return the logarithm of the largest wealth so far, of bets that the mean is not the given one.
@@ -218,9 +211,7 @@ def _by_bound(values: Array, mean: Array, lowest: Array, most: float) -> Array:
     deviations = (values - np.cumsum(values) / (count + 1)) ** 2
     spread = (most**2 / 16 + np.cumsum(deviations) - deviations) / count
     wanted = np.sqrt(2 * np.log(20.0) / (spread * count * np.log1p(count)))
-    room = np.maximum(mean - lowest, 1e-300)
-    gain = np.minimum(wanted, _CAUTION / room) * (values - mean)
-    return np.asarray(np.cumsum(np.log1p(np.maximum(gain, -_CAUTION)), axis=-1))
+    return log_wealth_of_bets(values - mean, wanted, mean - lowest)
 
 
 def _end(differences: PairedDifferences, centre: float, level: float, *, above: bool) -> float:

@@ -271,8 +271,8 @@ def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
     if evidence.sharpness > SHARP:
         return (
             f"one of the largest predicted distances falls by {100 * evidence.sharpness:.0f} % if its task changes by "
-            "a thousandth of its ranges, so a search may miss larger ones: the controllers change abruptly from task to "
-            "task, as those of a model with kinks do, or the closed loop does; use a smoother model, or an audit"
+            "a thousandth of its ranges, so a search may miss larger ones: the controllers change abruptly from task "
+            "to task, as those of a model with kinks do, or the closed loop does; use a smoother model, or an audit"
         )
     return uncovered(evidence) or untested(evidence, best, bound)
 

@@ -25,12 +25,7 @@ from scipy.optimize import brentq
 from scipy.special import bdtr, stdtrit
 
 from ctxval._util.arrays import Array
-
-_CAUTION = 0.75
-"""Largest bet as a share of that with which one draw could lose everything."""
-
-_NO_ROOM = 1e-300
-"""Stands for no room at all: no draw can lose, and the bet is limited by the variance alone."""
+from ctxval.certificates.bets import log_wealth_of_bets, weights_so_far
 
 _OF_PREDICTIONS = 0.1
 """Share of beta for the mean of the prediction over all tasks; the rest is for the draws."""
@@ -132,7 +127,7 @@ def log_wealth_against(
     """
     plain = _log_wealth(values, np.zeros_like(values), most - np.zeros_like(values), most, mean, beta, above=above)
     about, slack = centre
-    weights = _earlier_weights(values, predicted)
+    weights = weights_so_far(values, predicted, _earlier_sum)
     moved, lowest, highest = values - weights * (predicted - about), -weights * (most - about), most + weights * about
     # The mean of the moved values differs from that of the values by the error of the predictions' mean, at most.
     beyond = mean + slack if above else mean - slack
@@ -145,9 +140,9 @@ def _log_wealth(
 ) -> Array:
     """Return the log wealth of one sequence of bets on values that lie between lowest and highest, ``(..., N)``."""
     wanted = np.sqrt(2 * np.log(2 / beta) / (values.shape[-1] * _earlier_variance(values, most)))
-    room = np.maximum(mean - lowest if above else highest - mean, _NO_ROOM)
-    gain = np.minimum(wanted, _CAUTION / room) * (values - mean if above else mean - values)
-    return np.asarray(np.cumsum(np.log1p(np.maximum(gain, -_CAUTION)), axis=-1))
+    if above:
+        return log_wealth_of_bets(values - mean, wanted, mean - lowest)
+    return log_wealth_of_bets(mean - values, wanted, highest - mean)
 
 
 def quantile_ranks(n: int, level: float, beta: float) -> tuple[int | None, int | None]:
@@ -179,15 +174,6 @@ def _best_weight(values: Array, predicted: Array, elsewhere: int) -> float:
 def _variance_left(values: Array, residual: Array) -> float:
     spread = float(values.var())
     return min(1.0, float(residual.var()) / spread) if spread > 0 else 1.0
-
-
-def _earlier_weights(values: Array, predicted: Array) -> Array:
-    """Return for each draw the slope of values against predictions among the earlier draws, from 0 to 1."""
-    count = np.arange(values.shape[-1])
-    sums = [_earlier_sum(part) for part in (values, predicted, values * predicted, predicted**2)]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        slope = (sums[2] - sums[0] * sums[1] / count) / (sums[3] - sums[1] ** 2 / count)
-    return np.asarray(np.where(np.isfinite(slope) & (count >= 3), np.clip(slope, 0.0, 1.0), 1.0))
 
 
 def _earlier_variance(values: Array, most: float) -> Array:

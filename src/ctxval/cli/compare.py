@@ -11,6 +11,7 @@ import typer
 from rich.table import Table
 
 from ctxval import plot
+from ctxval._util.files import make_folder_of
 from ctxval._util.texts import reason_of
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.cli.base import app, command, err, failures_of, out, print_failures
@@ -22,6 +23,7 @@ from ctxval.comparison.result import WORDS, Comparison
 from ctxval.comparison.tables import CANDIDATES, PAIRS, candidate_rows, markdown, pair_rows
 from ctxval.config.settings import Settings, read_settings
 from ctxval.errors import InputError
+from ctxval.report.twins import write_text
 
 Targets = Annotated[
     list[str],
@@ -48,9 +50,12 @@ Budget = Annotated[
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the random numbers of the data, the models and the draws.")]
 Stores = Annotated[
     Path,
-    typer.Option("--store", metavar="FOLDER", help="Folder of the stores, one for each candidate. If they exist, the "
-    "comparison is resumed."),
-]  # fmt: skip
+    typer.Option(
+        "--stores",
+        metavar="FOLDER",
+        help="Folder of the stores, one for each candidate. If they exist, the comparison is resumed.",
+    ),
+]
 LargestPossible = Annotated[
     float | None,
     typer.Option(
@@ -78,7 +83,7 @@ def compare(
     budget: Budget = BUDGET,
     confidence: Confidence = None,
     seed: Seed = 0,
-    store: Stores = Path("runs/compare"),
+    stores: Stores = Path("runs/compare"),
     largest_possible: LargestPossible = None,
     stochastic: Stochastic = False,
     out_file: Out = None,
@@ -90,26 +95,27 @@ def compare(
     The comparison stops when all pairs are decided or the budget is spent. If it is interrupted, run it again: it
     continues from the stores.
     """
-    made = _candidates(_named(candidates), store, seed, named_values(option))
+    if out_file is not None:
+        make_folder_of(out_file)  # before executions are paid for
+    made = _candidates(_named(candidates), stores, seed, named_values(option))
     race = race_of(
         made,
         question,
-        budget,
-        CONFIDENCE if confidence is None else confidence,
-        seed,
-        largest_possible,
-        stochastic,
-        None,
+        budget=budget,
+        confidence=CONFIDENCE if confidence is None else confidence,
+        seed=seed,
+        largest_possible=largest_possible,
+        stochastic=stochastic,
     )
     found = race.run()
-    files = [] if out_file is None else _written(found, out_file)
     failures = {one.name: failures_of(one.campaign.failed) for one in made}
     if not as_json:
         _print(found)
         for one in failures.values():
             print_failures(one)
-    stores = {one.name: str(one.campaign.store.path) for one in made}
-    return {**found.to_dict(), "stores": stores, "failures": failures, "files": files}
+    files = [] if out_file is None else _written(found, out_file)
+    paths = {one.name: str(one.campaign.store.path) for one in made}
+    return {**found.to_dict(), "stores": paths, "failures": failures, "files": files}
 
 
 def _named(texts: Sequence[str]) -> dict[str, str]:
@@ -148,11 +154,7 @@ def _settings(target: str, seed: int, options: dict[str, Any]) -> Settings:
 
 def _written(found: Comparison, path: Path) -> list[str]:
     """Write the tables and the picture; return the names of the files."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(markdown(found), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+    write_text(path, markdown(found))
     try:
         drawn = [str(plot.save(found.plot(), path.with_suffix(".png")))]
     except Exception as error:

@@ -11,9 +11,10 @@ from typing import Annotated, Any
 import typer
 
 from ctxval.aspect1 import TASKS
+from ctxval.cli.aspect1_findings import aspect1_findings
 from ctxval.cli.base import BAD_INPUT, FALSIFIED, app, command, out
 from ctxval.cli.options import TARGET, AsJson, PartOptions, named_values
-from ctxval.config.check import Finding, aspect1_findings, check_experiment
+from ctxval.config.check import Checked, check_experiment
 from ctxval.config.settings import read_settings
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import InputError
@@ -188,7 +189,7 @@ def check(
     return {**report, **({"aspect1": None if found is None else found.to_json()} if aspect1 else {})}, status
 
 
-def _print_findings(findings: list[Finding]) -> None:
+def _print_findings(findings: list[Checked]) -> None:
     colours = {"ok": "green", "noted": "yellow", "failed": "bold red", "skipped": "dim"}
     for finding in findings:
         out.say((f"{finding.state:<8}", colours[finding.state]), f"{finding.check}: {finding.text}")

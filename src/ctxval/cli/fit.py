@@ -11,11 +11,11 @@ from rich.table import Table
 from ctxval._util.texts import shortened
 from ctxval.cli.base import CANNOT_GO_ON, app, command, err, out
 from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingFile, States, TimeField, print_breaks
+from ctxval.cli.model_options import Vectorized, print_parameters, require_writable, step_function
 from ctxval.cli.options import AsJson, named_values
 from ctxval.cli.replay import numbers, print_titled
 from ctxval.cli.screen import line
 from ctxval.config.named_model import named_model
-from ctxval.config.references import reference, require_function
 from ctxval.errors import InputError
 from ctxval.fitting import FitReport, FittedModel, fit
 from ctxval.fitting.fit import HOLD_OUT, KINDS, STEPS
@@ -43,7 +43,6 @@ Parameters = Annotated[
         help="Bounds of a parameter of --step, such as mass=[0.5, 2.0]. Repeat --parameter in the order of theta.",
     ),
 ]
-Vectorized = Annotated[bool, typer.Option("--vectorized", help="State that --step takes whole batches of x and u.")]
 HoldOut = Annotated[
     float, typer.Option(help="Share of the recordings that is held out, from which no model is learned.")
 ]
@@ -102,14 +101,12 @@ def fit_models(
     if (step is None) != (not parameter):
         raise InputError("--step and --parameter must be given together.")
     bounds = named_values(parameter, "--parameter")
-    if out_file is not None and out_file.suffix not in SUFFIXES:
-        raise InputError(f"the file of a model must end in {', '.join(SUFFIXES)}, got {str(out_file)!r}.")
+    require_writable(out_file)
     found = LogOptions(mapping, state, input_, time, dt, delay).read(logs)
-    function = None if step is None else require_function(f"--step {step}", reference(step), "(x, u, theta) -> x_next")
     report = fit(
         found,
         [name.strip() for name in kinds],
-        step=function,
+        step=step_function(step),
         bounds=bounds,
         vectorized=vectorized,
         given=None if given is None else named_model(given, {}, found.dt),
@@ -157,10 +154,7 @@ def _print(report: FitReport) -> None:
             table.add_row(*map(line, cells))
     print_titled("error on held-out recordings", table)
     for one in report.fitted:
-        for parameter in one.parameters:
-            note = f"; {parameter.note}" if parameter.note else ""
-            between = f"between {parameter.low:.6g} and {parameter.high:.6g} with confidence 0.95{note}"
-            out.say((parameter.name, "bold"), f" = {parameter.value:.6g}, {between}")
+        print_parameters(one.parameters)
         for note in one.notes:
             out.say((f"{one.kind}: ", "bold"), note, wrap=True)
     for failure in report.failed:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,10 +13,9 @@ from ctxval.campaign.by_hand import KnownRun, parameters_from, read_runs, write_
 from ctxval.campaign.campaign import OpenTrial
 from ctxval.campaign.known import KnownExecution
 from ctxval.campaign.telling import ToldResult, parameters_of_trial, require_tolerance, result_sentence, tell_result
-from ctxval.certificates.verdict import require_threshold
 from ctxval.cli.base import FALSIFIED, app, command, out, print_verdict
 from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, Threshold, named_values
-from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, limit_of, open_store
+from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, open_store, require_limit, require_target
 from ctxval.config.settings import read_settings
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
@@ -109,29 +109,48 @@ def ask(
     option: PartOptions = None,
 ) -> Any:
     """Open the next trial of a system that people operate, and write its task and controller to files."""
-    if sum((bool(parameters), draw, again is not None, trial is not None, until_decided)) > 1:
-        raise InputError("--set, --draw, --again, --trial and --until-decided cannot be combined.")
+    _require_one_choice(parameters, draw, again, trial, until_decided)
     if not until_decided and (threshold is not None or budget is not None):
         raise InputError("--threshold and --budget need --until-decided.")
     if because is not None and again is None:
         raise InputError("--because needs --again TRIAL: it states why the task is executed again.")
     overrides = {"store": store, "search": search, "seed": seed, "options": named_values(option) or None}
     opened = _opened(target, overrides, experiment, trust, accept_change)
-    found: OpenTrial | None
     if trial is not None:
         found = opened.campaign.reopen(trial)
     elif until_decided:
-        found = _asked_until_decided(opened, threshold, budget)
-        if found is None:
-            return _decided(opened, threshold, as_json)
+        limit = require_limit(opened.experiment, opened.settings, threshold, "--until-decided")
+        asked = _asked_until_decided(opened, limit, budget)
+        if asked is None:
+            return _decided(opened, limit, as_json)
+        found = asked
     else:
-        space = opened.experiment.validation.space
-        chosen = None if again is None else parameters_of_trial(opened.campaign, again)
-        if parameters:
-            chosen = parameters_from(parameters, space)
+        chosen = _chosen(opened, parameters, again)
         found = opened.campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
+    report = _asked(opened, found, out_folder)
+    if not as_json:
+        _print_asked(report, found)
+    return report
+
+
+def _require_one_choice(
+    parameters: list[str] | None, draw: bool, again: int | None, trial: int | None, until_decided: bool
+) -> None:
+    if sum((bool(parameters), draw, again is not None, trial is not None, until_decided)) > 1:
+        raise InputError("--set, --draw, --again, --trial and --until-decided cannot be combined.")
+
+
+def _chosen(opened: Opened, parameters: list[str] | None, again: int | None) -> Mapping[str, Any] | None:
+    """Return the task that the user names; None if the search is to choose it."""
+    if parameters:
+        return parameters_from(parameters, opened.experiment.validation.space)
+    return None if again is None else parameters_of_trial(opened.campaign, again)
+
+
+def _asked(opened: Opened, found: OpenTrial, out_folder: Path | None) -> dict[str, Any]:
+    """Write the files of a trial, and return what is said of it."""
     folder = opened.path.with_suffix(".trials") / str(found.number) if out_folder is None else out_folder
-    report = {
+    return {
         "trial": found.number,
         "task": found.trial.parameters,
         "origin": found.trial.origin,
@@ -139,9 +158,6 @@ def ask(
         "folder": str(folder),
         "files": write_files(folder, opened.experiment, found),
     }
-    if not as_json:
-        _print_asked(report, found)
-    return report
 
 
 @app.command()
@@ -252,6 +268,7 @@ def _opened(
         return open_store(Store.existing(path), path, experiment, trust, accept_change)
     if path.suffix in STORE_SUFFIXES:
         raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` creates one.")
+    require_target(target)
     if experiment is not None or trust:
         raise InputError(f"--experiment and --trust need a store as the first argument, and {target} is an experiment.")
     settings = read_settings(target, overrides)
@@ -260,24 +277,15 @@ def _opened(
     return Opened(settings, made, settings.campaign(made, where, accept_change=accept_change), where)
 
 
-def _asked_until_decided(opened: Opened, threshold: float | None, budget: int | None) -> OpenTrial | None:
+def _asked_until_decided(opened: Opened, limit: float, budget: int | None) -> OpenTrial | None:
     settings, experiment = opened.settings, opened.experiment
     total = next(one for one in (budget, settings.budget, experiment.budget) if one is not None)
     options = settings.certificate_options
-    return opened.campaign.ask_until_decided(_limit(opened, threshold), total, certificate=options, wait=_WAIT)
+    return opened.campaign.ask_until_decided(limit, total, certificate=options, wait=_WAIT)
 
 
-def _limit(opened: Opened, threshold: float | None) -> float:
-    """Return the threshold of the verdict: that of the option, or else of the experiment."""
-    limit = limit_of(opened.experiment, opened.settings) if threshold is None else require_threshold(threshold)
-    if limit is None:
-        raise InputError("--until-decided needs a threshold: give --threshold.")
-    return limit
-
-
-def _decided(opened: Opened, threshold: float | None, as_json: bool) -> tuple[dict[str, Any], int]:
+def _decided(opened: Opened, limit: float, as_json: bool) -> tuple[dict[str, Any], int]:
     """Return the verdict of a campaign that needs no further trial, and the exit status."""
-    limit = _limit(opened, threshold)
     verdict = opened.campaign.verdict(limit, certificate=opened.settings.certificate_options)
     if not as_json:
         print_verdict(verdict)

@@ -11,8 +11,8 @@ from rich.table import Table
 
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions
-from ctxval.certificates.verdict import require_threshold
 from ctxval.cli.base import FALSIFIED, app, command, out
+from ctxval.cli.model_options import Vectorized, print_parameters, require_writable, step_function
 from ctxval.cli.options import (
     TARGET,
     AsJson,
@@ -25,15 +25,14 @@ from ctxval.cli.options import (
     named_values,
 )
 from ctxval.cli.screen import line
-from ctxval.cli.trust import Named, Trust, limit_of, open_store
+from ctxval.cli.trust import Named, Trust, open_store, require_limit, require_target
 from ctxval.config.references import reference, require_function
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
-from ctxval.fitting.model_file import SUFFIXES
 from ctxval.refinement import Method, ParameterFit, Refinement, refine
-from ctxval.refinement.files import write_refined
+from ctxval.refinement.files import require_file_of, write_refined
 from ctxval.refinement.methods import NAMES, UserFit, method_of
 from ctxval.storage.other_stores import STORE_SUFFIXES
 from ctxval.storage.store import Store
@@ -82,11 +81,10 @@ Bounds = Annotated[
         "order of theta.",
     ),
 ]
-Vectorized = Annotated[bool, typer.Option("--vectorized", help="State that --step takes whole batches of x and u.")]
-Output = Annotated[
+Out = Annotated[
     Path | None,
     typer.Option(
-        "--output",
+        "--out",
         help="File for the last model: .onnx, which a robot can load without ctxval, .npz, or .toml for the parameters "
         "of --step. Its measured residual is written next to it, as .residual.json and .residual.txt.",
     ),
@@ -102,6 +100,13 @@ class _Opened:
     experiment: Experiment
     campaign: Campaign
 
+    def certified_as(self, confidence: float | None, stochastic: bool | None) -> _Opened:
+        """Return the same with other settings of the certificate, if they are given."""
+        settings = self.settings.certified_as({"stochastic": stochastic})
+        return replace(
+            self, settings=settings if confidence is None else settings.model_copy(update={"confidence": confidence})
+        )
+
 
 @app.command("refine")
 @command
@@ -114,7 +119,7 @@ def refine_model(
     step: StepFunction = None,
     parameter: Bounds = None,
     vectorized: Vectorized = False,
-    output: Output = None,
+    out_file: Out = None,
     confidence: Confidence = None,
     stochastic: Stochastic = None,
     seed: Seed = None,
@@ -132,26 +137,12 @@ def refine_model(
     was designed, and for no other one; what was recorded goes on teaching.
     """
     chosen = _method(method, fit, step, parameter, vectorized)
-    if output is not None and output.suffix not in SUFFIXES:
-        raise InputError(f"the file of a model must end in {', '.join(SUFFIXES)}, got {str(output)!r}.")
-    if output is not None and (output.is_dir() or not output.parent.is_dir()):  # before anything is executed
-        what = "it is a folder" if output.is_dir() else f"there is no folder {output.parent}"
-        raise InputError(f"{output} cannot be written: {what}.")
-    if Path(target).suffix in STORE_SUFFIXES:
-        if seed is not None or option:
-            raise InputError("--seed and --option are for an experiment; a store has its own.")
-        opened = _of_store(Path(target), experiment, trust)
-    else:
-        if experiment is not None or trust:
-            raise InputError("--experiment and --trust are for a store.")
-        opened = _of_experiment(target, seed, named_values(option))
-    stated = {"stochastic": stochastic}
-    settings = opened.settings.certified_as(stated)
-    settings = settings if confidence is None else settings.model_copy(update={"confidence": confidence})
-    opened = replace(opened, settings=settings)
-    limit = require_threshold(threshold) if threshold is not None else limit_of(opened.experiment, settings)
-    if limit is None:
-        raise InputError("a refinement needs a threshold: give --threshold.")
+    require_writable(out_file)
+    opened = _opened(target, seed, option, experiment, trust).certified_as(confidence, stochastic)
+    settings = opened.settings
+    limit = require_limit(opened.experiment, settings, threshold, "a refinement")
+    if out_file is not None:
+        require_file_of(out_file, chosen, opened.campaign.validation.model, step)
     found = refine(
         opened.campaign,
         limit,
@@ -162,9 +153,11 @@ def refine_model(
         workers=workers,
         timeout=timeout,
     )
-    files = [] if output is None or not found.last.number else write_refined(output, found, step)
     if not as_json:
-        _print(found, files)
+        _print(found)  # before the files are written, which may fail
+    files = [] if out_file is None or not found.last.number else write_refined(out_file, found, step)
+    if files and not as_json:
+        out.say(f"the model of round {found.last.number} is in {' and '.join(files)}")
     return {**found.to_dict(), "files": files}, FALSIFIED if found.answer == "falsified" else 0
 
 
@@ -179,8 +172,18 @@ def _method(name: str, fit: str | None, step: str | None, parameter: list[str] |
         return UserFit(require_function(f"--fit {fit}", reference(fit), "(data) -> model"))
     if name != "parameters":
         return method_of(name)
-    function = None if step is None else require_function(f"--step {step}", reference(step), "(x, u, theta) -> x_next")
-    return ParameterFit(named_values(parameter, "--parameter"), function, vectorized)
+    return ParameterFit(named_values(parameter, "--parameter"), step_function(step), vectorized)
+
+
+def _opened(target: str, seed: int | None, option: list[str] | None, experiment: str | None, trust: bool) -> _Opened:
+    if Path(target).suffix in STORE_SUFFIXES:
+        if seed is not None or option:
+            raise InputError("--seed and --option are for an experiment; a store has its own.")
+        return _of_store(Path(target), experiment, trust)
+    if experiment is not None or trust:
+        raise InputError("--experiment and --trust are for a store.")
+    require_target(target)
+    return _of_experiment(target, seed, named_values(option))
 
 
 def _of_store(path: Path, experiment: str | None, trust: bool) -> _Opened:
@@ -219,7 +222,7 @@ class _Rounds:
         return settings.model_copy(update=known).campaign(experiment, store)
 
 
-def _print(found: Refinement, files: list[str]) -> None:
+def _print(found: Refinement) -> None:
     table = Table(box=None, pad_edge=False)
     for name in (*found.head, "store"):
         table.add_column(line(name))
@@ -232,13 +235,8 @@ def _print(found: Refinement, files: list[str]) -> None:
     out.say((found.answer, "bold"), f" against {found.threshold:g}: {found.ended}.", wrap=True)
     out.say(found.last.verdict.reason, wrap=True)
     out.say(found.statement, wrap=True)
-    for parameter in found.parameters:
-        note = f"; {parameter.note}" if parameter.note else ""
-        between = f"between {parameter.low:.6g} and {parameter.high:.6g} with confidence 0.95{note}"
-        out.say((parameter.name, "bold"), f" = {parameter.value:.6g}, {between}")
+    print_parameters(found.parameters)
     _print_residual(found)
-    if files:
-        out.say(f"the model of round {found.last.number} is in {' and '.join(files)}")
 
 
 def _print_residual(found: Refinement) -> None:

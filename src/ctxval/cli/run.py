@@ -44,7 +44,7 @@ from ctxval.cli.options import (
     named_values,
 )
 from ctxval.cli.report import page_path
-from ctxval.cli.trust import AcceptChange, limit_of
+from ctxval.cli.trust import AcceptChange, limit_of, require_limit
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment
 from ctxval.core.truth import Truth
@@ -153,7 +153,7 @@ def run(
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
     total = experiment.budget if settings.budget is None else settings.budget
-    execute = _until_decided(campaign, limit, settings, audited) if until_decided else campaign.run
+    execute = _until_decided(campaign, experiment, settings, audited) if until_decided else campaign.run
     with worker_options(workers, dask, timeout) as execution:
         execute(budget=total, **execution)
     known = experiment.truth() if truth and experiment.truth is not None else None
@@ -176,12 +176,11 @@ def _status(campaign: Campaign, verdict: Verdict | None) -> int:
 
 
 def _until_decided(
-    campaign: Campaign, threshold: float | None, settings: Settings, audited: bool
+    campaign: Campaign, experiment: Experiment, settings: Settings, audited: bool
 ) -> Callable[..., Campaign]:
-    if threshold is None:
-        raise InputError("--until-decided needs a threshold: give --threshold.")
+    limit = require_limit(experiment, settings, None, "--until-decided")
     return functools.partial(
-        campaign.run_until_decided, threshold, certificate=settings.certificate_options, audited=audited
+        campaign.run_until_decided, limit, certificate=settings.certificate_options, audited=audited
     )
 
 

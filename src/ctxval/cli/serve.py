@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval.certificates.verdict import require_threshold
 from ctxval.cli.base import app, command, out
 from ctxval.cli.options import StoreArgument, Threshold
 from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, limit_of, open_store, settings_of
@@ -91,7 +90,7 @@ class _Reopening:
 
 
 def _served(opened: Opened, threshold: float | None) -> ServedCampaign:
-    limit = limit_of(opened.experiment, opened.settings) if threshold is None else require_threshold(threshold)
+    limit = limit_of(opened.experiment, opened.settings, threshold)
     return ServedCampaign(opened.experiment, opened.campaign, limit, opened.settings.certificate_options)
 
 

@@ -12,11 +12,12 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.certificates.verdict import require_threshold
 from ctxval.cli.base import err
 from ctxval.cli.options import TARGET
-from ctxval.config.settings import Settings
+from ctxval.config.settings import Settings, not_an_experiment
 from ctxval.config.signatures import code_named, verifies, why_no_key
 from ctxval.config.stored_settings import trusted_settings
 from ctxval.core.experiment import Experiment
 from ctxval.errors import InputError
+from ctxval.storage.other_stores import STORE_SUFFIXES
 from ctxval.storage.store import Store
 
 Trust = Annotated[
@@ -55,10 +56,33 @@ class Opened:
     path: Path
 
 
-def limit_of(experiment: Experiment, settings: Settings) -> float | None:
-    """Return the threshold of the verdict; None if neither the settings nor the experiment have one."""
-    threshold = experiment.threshold if settings.threshold is None else settings.threshold
+def limit_of(experiment: Experiment, settings: Settings, given: float | None = None) -> float | None:
+    """Return the threshold of the verdict: the given one, or else that of the settings, or else of the experiment."""
+    known = (one for one in (given, settings.threshold, experiment.threshold) if one is not None)
+    threshold = next(known, None)
     return None if threshold is None else require_threshold(threshold)
+
+
+def require_target(target: str) -> None:
+    """Check that an argument that names no store may name an experiment.
+
+    Raises:
+        InputError: if it is a file of another kind.
+    """
+    if Path(target).suffix not in ("", ".toml") and ":" not in target:
+        raise InputError(not_an_experiment(target, f"a store ({', '.join(STORE_SUFFIXES)})"))
+
+
+def require_limit(experiment: Experiment, settings: Settings, given: float | None, what: str) -> float:
+    """Return the threshold of the verdict.
+
+    Raises:
+        InputError: if there is none; the message says what needs one.
+    """
+    limit = limit_of(experiment, settings, given)
+    if limit is None:
+        raise InputError(f"{what} needs a threshold: give --threshold.")
+    return limit
 
 
 def settings_of(store: Store, experiment: str | None, trust: bool) -> Settings:

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ctxval._util.arrays import positive_count
+from ctxval._util.arrays import count_from_zero, positive_count
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import Campaign
 from ctxval.certificates.options import CONFIDENCE, require_confidence
@@ -73,7 +73,16 @@ def compare(
     if not isinstance(candidates, Mapping):
         raise InputError(f"candidates must be a mapping of names to validations, got {type(candidates).__name__}.")
     made = [Candidate(str(name), _campaign(str(name), one, stores, seed)) for name, one in candidates.items()]
-    race = race_of(made, question, budget, confidence, seed, largest_possible, stochastic, on_trial)
+    race = race_of(
+        made,
+        question,
+        budget=budget,
+        confidence=confidence,
+        seed=seed,
+        largest_possible=largest_possible,
+        stochastic=stochastic,
+        on_trial=on_trial,
+    )
     with progress_shown(progress):
         return race.run()
 
@@ -81,12 +90,13 @@ def compare(
 def race_of(
     candidates: list[Candidate],
     question: str,
+    *,
     budget: int,
     confidence: float,
     seed: int,
-    largest_possible: float | None,
-    stochastic: bool,
-    on_trial: OnTrial | None,
+    largest_possible: float | None = None,
+    stochastic: bool = False,
+    on_trial: OnTrial | None = None,
 ) -> Race:
     """Return the comparison of campaigns; the arguments are those of :func:`compare`.
 
@@ -97,8 +107,7 @@ def race_of(
     if question not in known:
         raise InputError(f"question must be worst, mean or both, got {question!r}.")
     total = positive_count("budget must be a positive integer", budget)
-    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
-        raise InputError(f"seed must be an integer >= 0, got {seed!r}.")
+    from_seed = count_from_zero("seed", seed)
     if largest_possible is not None and not 0 < largest_possible < np.inf:
         raise InputError(f"largest_possible must be a positive number, got {largest_possible!r}.")
     if stochastic and question != "mean":
@@ -108,7 +117,14 @@ def race_of(
         )
     require_confidence(confidence)
     return Race(
-        candidates, known[question], total, float(confidence), int(seed), largest_possible, stochastic, on_trial
+        candidates,
+        known[question],
+        budget=total,
+        confidence=float(confidence),
+        seed=from_seed,
+        largest_possible=largest_possible,
+        stochastic=stochastic,
+        on_trial=on_trial,
     )
 
 

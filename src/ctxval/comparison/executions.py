@@ -13,7 +13,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import call
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
-from ctxval.comparison.candidates import Candidate, TrialNote
+from ctxval.comparison.candidates import Candidate, TrialNote, is_shared
 from ctxval.core.plan import Plan, gives_inputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
@@ -69,11 +69,10 @@ class Executions:
             without: a task that is left out, a point of the unit cube ``(d,)``.
         """
         found = [
-            (note.step if note is not None else -1, row, trial, trajectory)
+            (-1 if (note := TrialNote.of(trial)) is None else note.step, row, trial, trajectory)
             for row, candidate in enumerate(self.candidates)
             for trial, trajectory in candidate.trajectories()
-            if (note := TrialNote.of(trial)) is None or note.shared is None
-            if without is None or not np.array_equal(trial.unit_point, without)
+            if not is_shared(trial) and (without is None or not np.array_equal(trial.unit_point, without))
         ]
         ordered = sorted(found, key=lambda one: (one[0], one[1], one[2].number))
         return [(trial, trajectory) for _, _, trial, trajectory in ordered]
@@ -165,13 +164,13 @@ class Executions:
 
     def elsewhere(self, candidate: Candidate) -> list[Trajectory]:
         """Return the executions that are in no trial of a candidate."""
-        own = {(note.shared) for trial in candidate.trials if (note := TrialNote.of(trial)) is not None and note.shared}
+        own = {note.shared for trial in candidate.trials if (note := TrialNote.of(trial)) is not None and note.shared}
         return [
             trajectory
             for other in self.candidates
             if other is not candidate
             for trial, trajectory in other.trajectories()
-            if ((note := TrialNote.of(trial)) is None or note.shared is None)
+            if not is_shared(trial)
             and (other.name, trial.number) not in own
             and (self._hidden is None or not np.array_equal(trial.unit_point, self._hidden))
         ]

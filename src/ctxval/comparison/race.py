@@ -45,6 +45,7 @@ class Race:
         self,
         candidates: Sequence[Candidate],
         questions: Sequence[Question],
+        *,
         budget: int,
         confidence: float,
         seed: int,

@@ -11,13 +11,11 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
-from ctxval.aspect1 import Aspect1Report, SimulatedTask
 from ctxval.campaign.costs import ThinkingCosts
-from ctxval.certificates.bounds import of_tasks
 from ctxval.core.experiment import Experiment, mixed_units_sentence
 from ctxval.core.labels import labels_of
 from ctxval.core.plan import Plan
-from ctxval.core.soundness import MISSED, SATURATED, goal_misses
+from ctxval.core.soundness import MISSED, goal_misses
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
@@ -40,7 +38,7 @@ FindingState = Literal["ok", "noted", "failed", "skipped"]
 
 
 @dataclass(frozen=True)
-class Finding:
+class Checked:
     """The result of one check.
 
     Attributes:
@@ -55,7 +53,7 @@ class Finding:
     text: str
 
 
-def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int = 0) -> list[Finding]:
+def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int = 0) -> list[Checked]:
     """Check that the parts of an experiment fit together.
 
     Args:
@@ -69,7 +67,7 @@ def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int
     findings += _guarded("tasks", lambda: _tasks(validation, seed, plans))
     if not plans:
         return findings
-    checks: list[tuple[str, Callable[[], Iterator[Finding]]]] = [
+    checks: list[tuple[str, Callable[[], Iterator[Checked]]]] = [
         ("names", lambda: _names(experiment, plans[0])),
         ("system", lambda: _system(validation, plans[0])),
         ("model", lambda: _model(validation, plans[0])),
@@ -83,28 +81,28 @@ def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int
     return findings
 
 
-def _guarded(name: str, check: Callable[[], Iterator[Finding]]) -> list[Finding]:
-    found: list[Finding] = []
+def _guarded(name: str, check: Callable[[], Iterator[Checked]]) -> list[Checked]:
+    found: list[Checked] = []
     try:
         found.extend(check())
     except CtxvalError as error:
-        found.append(Finding(name, "failed", str(error)))
+        found.append(Checked(name, "failed", str(error)))
     except Exception as error:
         # A user's own part may raise anything.
-        found.append(Finding(name, "failed", reason_of(error)))
+        found.append(Checked(name, "failed", reason_of(error)))
     return found
 
 
-def _space(validation: Validation) -> Finding:
+def _space(validation: Validation) -> Checked:
     space = validation.space
     without = [name for name, label in zip(space.names, space.labels, strict=True) if name == label]
     text = f"{space.dimension} task parameters: {', '.join(space.labels)}"
     if without:
-        return Finding("space", "noted", f"{text}; no unit for {', '.join(without)}")
-    return Finding("space", "ok", text)
+        return Checked("space", "noted", f"{text}; no unit for {', '.join(without)}")
+    return Checked("space", "ok", text)
 
 
-def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Finding]:
+def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Checked]:
     """Plan the lowest, the middle, the highest and random tasks, and check the paper's Aspect 1 on them."""
     space = validation.space
     points = np.concatenate(
@@ -117,7 +115,7 @@ def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Fin
     plans.extend(made)
     task = made[0].task
     n, m = made[0].model_trajectory.states.shape[-1], made[0].model_trajectory.inputs.shape[-1]
-    yield Finding(
+    yield Checked(
         "tasks",
         "ok",
         f"{len(made)} tasks planned: {n} states, {m} inputs, {task.horizon} steps of {task.dt:g} s",
@@ -125,7 +123,7 @@ def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Fin
     yield from _goals(validation, made)
 
 
-def _goals(validation: Validation, made: Sequence[Plan]) -> Iterator[Finding]:
+def _goals(validation: Validation, made: Sequence[Plan]) -> Iterator[Checked]:
     """State how far M ends from its goals: in the worst state if it is known which are to reach them, or in all."""
     if not made[0].task.has_goal:
         return
@@ -140,25 +138,26 @@ def _goals(validation: Validation, made: Sequence[Plan]) -> Iterator[Finding]:
         (row, column), reached = found.worst, not found.missed.any()
         names = labels_of(validation.names(on_model[0].states.shape[-1], on_model[0].inputs.shape[-1])[0])
         how = f"{found.misses[row, column]:.3g} from the goal in {names[int(found.states[column])]}"
-    text = f"ends at most {how}, at {_where(validation.space.describe_point(made[row].parameters.points))}"
+    text = f"ends at most {how}, at {task_text(validation.space.describe_point(made[row].parameters.points))}"
     if not reached:
         text += "; a controller that fails on the model itself cannot be expected to work on the system: see --aspect1"
-    yield Finding("controller on the model", "ok" if reached else "noted", text)
+    yield Checked("controller on the model", "ok" if reached else "noted", text)
 
 
-def _where(parameters: dict[str, Any]) -> str:
+def task_text(parameters: dict[str, Any]) -> str:
+    """Return the parameters of a task as a text."""
     return ", ".join(f"{name} = {_short(value)}" for name, value in parameters.items())
 
 
-def _cost(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]:
+def _cost(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked]:
     """State what designs, closed loops on M and a suggestion of ``auto`` cost in CPU time."""
     with stage("measuring what a suggestion costs"):
         thinking = ThinkingCosts.measured(validation, [plan.parameters.points for plan in plans[:_EXECUTED]])
     text = f"a design takes {thinking.design:.2g} s of CPU, a closed loop on the model {thinking.closed_loop:.2g} s"
     if thinking.suggestion is None:
-        yield Finding("cost", "ok", text)
+        yield Checked("cost", "ok", text)
         return
-    yield Finding(
+    yield Checked(
         "cost",
         "ok" if thinking.suggestion < _LONG else "noted",
         f"{text}; a suggestion of the search auto takes about {thinking.suggestion:.2g} s if it thinks thoroughly "
@@ -170,129 +169,53 @@ def _short(value: Any) -> str:
     return "[" + ", ".join(f"{v:.4g}" for v in value) + "]" if isinstance(value, list) else f"{value:.4g}"
 
 
-def aspect1_findings(report: Aspect1Report) -> list[Finding]:
-    """Return what simulations of M show of its tasks and controllers, as sentences."""
-    return [_completion(report), *_flips(report), *_saturated(report), *_unconverged(report)]
-
-
-def _completion(report: Aspect1Report) -> Finding:
-    count, worst = len(report.simulated), report.worst
-    if report.failed:
-        told = f"M has no closed loop in {len(report.failed)} of {count} tasks, for example at {_of(worst)}"
-        return Finding("tasks on the model", "failed", f"{told}: {worst.reason}")
-    ends = f"the worst of {count} tasks is {_of(worst)}, with an error of {_number(report, worst.error)}"
-    if report.threshold is None:
-        return Finding("tasks on the model", "noted", f"{ends}; give a threshold to judge it")
-    if report.exceeding:
-        many = f"M does not complete {report.exceeding} of {count} tasks within {_number(report, report.threshold)}"
-        return Finding("tasks on the model", "failed", f"{many}: {ends}")
-    bound = None if report.verdict is None else report.verdict.bound
-    held = f"; the error over all tasks is at most {_number(report, bound)}" if bound is not None else ""
-    share = f"; with confidence 0.95 it does not complete at most {100 * (report.share or 0):.3g} % {_of_all(report)}"
-    return Finding("tasks on the model", "ok", f"M completes all of them: {ends}{share}{held}")
-
-
-def _of_all(report: Aspect1Report) -> str:
-    return "of all tasks" if report.distribution is None else of_tasks(report.distribution)
-
-
-def _of(task: SimulatedTask) -> str:
-    return _where(task.parameters)
-
-
-def _number(report: Aspect1Report, value: float | None) -> str:
-    return f"{value:.4g} {report.units}".rstrip()
-
-
-def _flips(report: Aspect1Report) -> Iterator[Finding]:
-    found = report.flips
-    if found is None or report.flipped is None:
-        return
-    differ = f"by {100 * found.largest:.3g} % of the range of the inputs"
-    if not found.flipped:
-        text = f"the inputs on M of {found.pairs} pairs of neighbouring tasks differ by at most {differ[3:]}"
-        yield Finding("neighbouring tasks", "ok", text)
-        return
-    between = " and ".join(map(_where, report.flipped))
-    yield Finding(
-        "neighbouring tasks",
-        "noted",
-        f"{found.flipped} of {found.pairs} pairs of neighbouring tasks have controllers that differ abruptly, such as "
-        f"{between}, whose inputs on M differ {differ}",
-    )
-
-
-def _saturated(report: Aspect1Report) -> Iterator[Finding]:
-    if report.saturation is None:
-        return
-    at_limit = dict(zip(report.inputs, report.saturation.shares.tolist(), strict=True))
-    named = [f"{name} in {100 * share:.3g} %" for name, share in at_limit.items() if share >= SATURATED]
-    how = "" if report.saturation.known else "; the synthesizer states no limits, so repeated extreme values count"
-    if named:
-        yield Finding("limits of the inputs", "noted", f"at a limit: {', '.join(named)} of the steps on M{how}")
-    else:
-        yield Finding("limits of the inputs", "ok", "the inputs stay off their limits on M")
-
-
-def _unconverged(report: Aspect1Report) -> Iterator[Finding]:
-    count = len(report.not_converged)
-    if count:
-        examples = "; ".join(_where(one) for one in report.not_converged[:3])
-        text = f"{count} of {report.designs} designs did not converge, such as {examples}"
-        yield Finding("convergence of the designs", "noted", text)
-    elif report.designs:
-        yield Finding("convergence of the designs", "ok", f"all {report.designs} designs converged")
-    else:
-        yield Finding("convergence of the designs", "skipped", "the controllers do not tell whether they converged")
-
-
-def _names(experiment: Experiment, plan: Plan) -> Iterator[Finding]:
+def _names(experiment: Experiment, plan: Plan) -> Iterator[Checked]:
     counts = plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1]
     for kind, labels, count in zip(("states", "inputs"), (experiment.states, experiment.inputs), counts, strict=True):
         if labels and len(labels) != count:
             sentence = f"there are {count} {kind}, but the number of names is {len(labels)}: {', '.join(labels)}"
-            yield Finding("names", "failed", sentence)
+            yield Checked("names", "failed", sentence)
     for kind, named in zip(("states", "inputs"), experiment.names(*counts), strict=True):
         bare = [name for name, unit in named.items() if not unit]
         text = ", ".join(labels_of(named))
         missing = f"; no unit for {', '.join(bare)}" if bare else ""
-        yield Finding("names", "noted" if bare else "ok", f"{kind}: {text}{missing}")
+        yield Checked("names", "noted" if bare else "ok", f"{kind}: {text}{missing}")
     if experiment.mixed_units:
-        yield Finding("distance", "noted", mixed_units_sentence(experiment.mixed_units).removesuffix("."))
+        yield Checked("distance", "noted", mixed_units_sentence(experiment.mixed_units).removesuffix("."))
     if not experiment.units:
-        yield Finding("names", "noted", "the distance has no units")
+        yield Checked("names", "noted", "the distance has no units")
 
 
-def _system(validation: Validation, plan: Plan) -> Iterator[Finding]:
+def _system(validation: Validation, plan: Plan) -> Iterator[Checked]:
     """Compare the time step, the states and the inputs of the system with those of the task and the model."""
     system, task = validation.system, plan.task
     dt = getattr(system, "dt", None)
     if isinstance(dt, int | float) and not np.isclose(dt, task.dt, rtol=1e-9, atol=0):
-        yield Finding("system", "failed", f"the time step of the system is {dt:g} s, that of the task is {task.dt:g} s")
+        yield Checked("system", "failed", f"the time step of the system is {dt:g} s, that of the task is {task.dt:g} s")
     counts = plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1]
     for kind, count in zip(("states", "inputs"), counts, strict=True):
         own = getattr(system, kind, None)
         if isinstance(own, dict | list | tuple) and len(own) != count:
-            yield Finding(
+            yield Checked(
                 "system",
                 "failed",
                 f"the system has {len(own)} {kind}, the model has {count}: {', '.join(map(str, own))}",
             )
 
 
-def _model(validation: Validation, plan: Plan) -> Iterator[Finding]:
+def _model(validation: Validation, plan: Plan) -> Iterator[Checked]:
     states, inputs = plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1]
     try:
         check_model(validation.model, states=states, inputs=inputs)
-        yield Finding(
+        yield Checked(
             "model", "ok", "batches and single states give the same; the Jacobian, if there is one, is the derivative"
         )
     except ConformanceError:
         check_model(validation.model, states=states, inputs=inputs, tolerance=1e-5)
-        yield Finding("model", "noted", "its results for batches and single states agree only to single precision")
+        yield Checked("model", "noted", "its results for batches and single states agree only to single precision")
 
 
-def _batches(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]:
+def _batches(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked]:
     points = np.stack([plan.parameters.points for plan in plans])
     try:
         batch = validation.task(validation.space.parameters(points))
@@ -300,28 +223,28 @@ def _batches(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]
     except Exception:
         same = False
     if not same:
-        yield Finding("batches", "noted", "the task function takes one point at a time, so --truth is slower")
+        yield Checked("batches", "noted", "the task function takes one point at a time, so --truth is slower")
         return
     for index, plan in enumerate(plans):
         one = batch[index]
         if not np.array_equal(one.reference, plan.task.reference) or not np.array_equal(
             one.initial_state, plan.task.initial_state
         ):
-            yield Finding(
+            yield Checked(
                 "batches",
                 "failed",
                 f"task {index} of a batch differs from the same task alone: check the task function",
             )
             return
     check_synthesizer(validation.synthesizer, _first(batch, 4), validation.model)
-    yield Finding("batches", "ok", "task function and synthesizer give the same results in a batch as alone")
+    yield Checked("batches", "ok", "task function and synthesizer give the same results in a batch as alone")
 
 
 def _first(batch: Task, count: int) -> Task:
     return Task(batch.initial_state[:count], horizon=batch.horizon, dt=batch.dt, reference=batch.reference[:count])
 
 
-def _distance(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding]:
+def _distance(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked]:
     trajectories = [plan.model_trajectory for plan in plans]
     model = _stacked(trajectories, 0.0)
     task = Task(
@@ -332,14 +255,14 @@ def _distance(validation: Validation, plans: Sequence[Plan]) -> Iterator[Finding
     )
     try:
         check_distance(validation.distance, model, _stacked(trajectories, 0.01), task)
-        yield Finding("distance", "ok", "finite, not negative, and the same in a batch as alone")
+        yield Checked("distance", "ok", "finite, not negative, and the same in a batch as alone")
     except Exception:
         for plan, trajectory in zip(plans, trajectories, strict=True):
             validation.measure(plan, trajectory)
-        yield Finding("distance", "noted", "the distance takes one task at a time, so --truth is slower")
+        yield Checked("distance", "noted", "the distance takes one task at a time, so --truth is slower")
     own = [validation.measure(plan, trajectory) for plan, trajectory in zip(plans, trajectories, strict=True)]
     if max(own) > 0:
-        yield Finding(
+        yield Checked(
             "distance", "noted", f"the distance between a trajectory and itself is up to {max(own):.3g}, not 0"
         )
 
@@ -349,27 +272,27 @@ def _stacked(trajectories: Sequence[Trajectory], shift: float) -> Trajectory:
     return Trajectory(trajectories[0].times, states + shift, np.stack([one.inputs for one in trajectories]))
 
 
-def _executions(validation: Validation, plan: Plan, execute: bool) -> Iterator[Finding]:
+def _executions(validation: Validation, plan: Plan, execute: bool) -> Iterator[Checked]:
     """Execute one task twice, and check the initial state and the repeatability."""
     if getattr(validation.system, "manual", False):
-        yield Finding("execution", "skipped", "people execute this system: see `ctxval ask`")
+        yield Checked("execution", "skipped", "people execute this system: see `ctxval ask`")
         return
     if not execute:
-        yield Finding("execution", "skipped", "give --execute to execute one task twice")
+        yield Checked("execution", "skipped", "give --execute to execute one task twice")
         return
     first, second = validation.execute(plan), validation.execute(plan)
     for trajectory in (first, second):
         gap = float(np.abs(trajectory.states[0] - plan.task.initial_state).max())
         if gap > _SAME_START:
-            yield Finding(
+            yield Checked(
                 "execution", "failed", f"the execution starts {gap:.3g} away from the initial state of the task"
             )
     noise = float(np.abs(first.states - second.states).max())
     distances = [validation.measure(plan, trajectory) for trajectory in (first, second)]
     if noise == 0:
-        yield Finding("execution", "ok", f"two executions of one task are the same; the distance is {distances[0]:.4g}")
+        yield Checked("execution", "ok", f"two executions of one task are the same; the distance is {distances[0]:.4g}")
         return
-    yield Finding(
+    yield Checked(
         "execution",
         "noted",
         f"two executions of one task differ by up to {noise:.3g} in a state and {abs(distances[0] - distances[1]):.3g} "

@@ -299,6 +299,8 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
         InputError: if the file cannot be read, or a value is not allowed; the message names it.
     """
     is_file = target.endswith(".toml")
+    if not is_file and ":" not in target and Path(target).suffix:
+        raise InputError(not_an_experiment(target))
     content = _read_toml(Path(target)) if is_file else {"experiment": target}
     if "folder" in content:
         raise InputError(
@@ -321,6 +323,13 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
         return Settings.model_validate(whole)
     except ValidationError as error:
         raise InputError(sentence_of(target, error)) from error
+
+
+def not_an_experiment(target: str, *others: str) -> str:
+    """Return the sentence that another file is no experiment, with what else it may be."""
+    said = ", ".join(("neither a case", "an experiment file (.toml)", *others))
+    attribute = f" (here {Path(target).stem}:NAME)" if Path(target).suffix == ".py" else ""
+    return f"{target} is {said} nor a reference module:attr{attribute}."
 
 
 def _table(content: dict[str, Any], key: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ctxval._util.arrays import Array, as_finite, as_floats
-from ctxval._util.files import read_bytes, read_json
+from ctxval._util.files import read_bytes, read_json, written_whole
 from ctxval._util.npz import Archive
 from ctxval._util.representation import record
 from ctxval.core.controller import AffineFeedback, Limits
@@ -143,18 +143,15 @@ def read_task(path: str | Path) -> Task:
 
 
 def _write(path: Path, about: dict[str, Any], arrays: Mapping[str, Array]) -> None:
-    try:
+    if path.suffix not in (".npz", ".json"):
+        raise InputError(f"the file must end in .json or .npz, got {str(path)!r}.")
+    with written_whole(path) as file:
         if path.suffix == ".npz":
-            with path.open("wb") as file:
-                np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
-        elif path.suffix == ".json":
+            np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
+        else:
             content = about | {name: _listed(array) for name, array in arrays.items()}
             lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in content.items())
-            path.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
-        else:
-            raise InputError(f"the file must end in .json or .npz, got {str(path)!r}.")
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+            file.write(f"{{\n{lines}\n}}\n".encode())
 
 
 def _read(path: Path, expected: str, build: Callable[[Mapping[str, Any]], Content]) -> Content:

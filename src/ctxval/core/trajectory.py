@@ -51,7 +51,15 @@ class Transitions:
 
     @staticmethod
     def joined(parts: Sequence[Transitions]) -> Transitions:
-        """Return several sets of transitions as one set."""
+        """Return several sets of transitions as one set.
+
+        Raises:
+            ShapeError: if they have different numbers of states or inputs.
+        """
+        sizes = sorted({(part.x.shape[1], part.u.shape[1]) for part in parts})
+        if len(sizes) > 1:
+            said = " and ".join(f"{n} states and {m} inputs" for n, m in sizes)
+            raise ShapeError(f"recorded steps must have the same numbers of states and inputs, got {said}.")
         return Transitions(
             np.concatenate([part.x for part in parts]),
             np.concatenate([part.u for part in parts]),

@@ -6,8 +6,6 @@ import hashlib
 import inspect
 import json
 import math
-import os
-import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,6 +18,7 @@ from scipy.optimize import Bounds, differential_evolution
 from ctxval._util.arrays import Array
 from ctxval._util.boxes import climb
 from ctxval._util.describe import describe, rounded
+from ctxval._util.files import written_whole
 from ctxval._util.progress import stage
 from ctxval._util.representation import call, line, lines
 from ctxval.core.space import Parameters
@@ -237,7 +236,7 @@ def cached_truth(
         return stored
     truth = compute(validation)
     # If the folder cannot be written, this call still returns the truth; the next call must find it again.
-    with suppress(OSError):
+    with suppress(OSError, InputError):
         _write_truth(path, truth, validation)
     return truth
 
@@ -261,15 +260,8 @@ def _read_truth(path: Path, validation: Validation) -> Truth | None:
 
 
 def _write_truth(path: Path, truth: Truth, validation: Validation) -> None:
-    """Write the file atomically: it is complete or missing, even if two processes write it at once."""
     parameters = validation.space.describe_point(truth.parameters.points)
     content = {"distance": truth.distance, "parameters": parameters, "method": truth.method}
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump(content, file, indent=1)
-        os.replace(temporary, path)
-    except OSError:
-        os.unlink(temporary)
-        raise
+    with written_whole(path) as file:
+        file.write(json.dumps(content, indent=1).encode())

@@ -142,7 +142,9 @@ def fit(
 
     Raises:
         UnknownNameError: if there is no such kind.
-        InputError: if no kind is given, if too little is recorded, or if ``step`` or ``bounds`` is missing.
+        InputError: if no kind is given, if too little is recorded, if ``step`` or ``bounds`` is missing, or if the
+            given model has another time step.
+        ModelError: if the given model cannot predict the recordings.
     """
     _require_kinds(kinds, step, bounds)
     learned_from, held_out = split(recordings, hold_out, seed)
@@ -158,21 +160,23 @@ def fit(
         "gaussian-process": lambda: (GaussianProcessModel.fit(data, _POINTS, seed=seed), (), ()),
         "parameters": parameters,
     }
-    if given is not None:
-        makers["given"] = lambda: (_with_step(given, recordings.dt), (), ())
     fitted: list[FittedModel] = []
     failed: list[FailedFit] = []
     recorded = RecordedSteps(held_out, range(len(held_out.runs)))
-    for kind in dict.fromkeys((*kinds, *(name for name in makers if name == "given"))):
-        try:
-            with single_threaded():
+
+    def errors_of(model: Model) -> tuple[StepError, ...]:
+        return step_errors(model, recorded, sorted(set(steps)))
+
+    with single_threaded():
+        # Before anything is learned, because what is named must be usable.
+        known = [] if given is None else [FittedModel("given", given, errors_of(_with_step(given, recordings.dt)))]
+        for kind in dict.fromkeys(kinds):
+            try:
                 model, found, notes = makers[kind]()
-                errors = step_errors(model, recorded, sorted(set(steps)))
-        except (InputError, ModelError) as error:
-            failed.append(FailedFit(kind, str(error)))
-            continue
-        fitted.append(FittedModel(kind, model, errors, found, notes))
-    return FitReport(tuple(sorted(fitted, key=_rank)), tuple(failed), learned_from, held_out)
+                fitted.append(FittedModel(kind, model, errors_of(model), found, notes))
+            except (InputError, ModelError) as error:
+                failed.append(FailedFit(kind, str(error)))
+    return FitReport(tuple(sorted([*fitted, *known], key=_rank)), tuple(failed), learned_from, held_out)
 
 
 def _require_kinds(

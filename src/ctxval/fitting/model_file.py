@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ctxval._util.files import written_whole
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.fitting.onnx_file import write_onnx
@@ -25,14 +26,23 @@ SUFFIXES: dict[str, tuple[type, ...]] = {
 """The models that a file of each suffix can hold."""
 
 
+def require_suffix(path: Path) -> None:
+    """Check that the name of the file of a model ends as one that can be written.
+
+    Raises:
+        InputError: if it does not.
+    """
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"the file of a model must end in {', '.join(SUFFIXES)}, got {str(path)!r}.")
+
+
 def require_file_for(path: Path, model: Model) -> None:
     """Check that a file of this suffix can hold a model.
 
     Raises:
         InputError: if it cannot.
     """
-    if path.suffix not in SUFFIXES:
-        raise InputError(f"the file of a model must end in {', '.join(SUFFIXES)}, got {str(path)!r}.")
+    require_suffix(path)
     if not isinstance(model, SUFFIXES[path.suffix]):
         raise InputError(f"the model {model!r} cannot be written to a file that ends in {path.suffix}.")
 
@@ -63,14 +73,23 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
     return [str(path)]
 
 
-def _write_parameters(path: Path, model: Parametric, step: str | None) -> None:
+def require_reference(step: str | None) -> str:
+    """Return the reference ``module:attr`` to the user's function, without which its parameters cannot be written.
+
+    Raises:
+        InputError: if there is none.
+    """
     if step is None:
-        raise InputError("the parameters of a function can only be written with the reference module:attr to it.")
+        raise InputError(
+            "the parameters of a function can only be written with the reference module:attr to it (--step)."
+        )
+    return step
+
+
+def _write_parameters(path: Path, model: Parametric, step: str | None) -> None:
     values = ", ".join(f"{name} = {value!r}" for name, value in model.theta.items())
-    text = f'[model]\ntype = "Parametric"\nstep = {{ ref = "{step}" }}\ntheta = {{ {values} }}\n'
+    text = f'[model]\ntype = "Parametric"\nstep = {{ ref = "{require_reference(step)}" }}\ntheta = {{ {values} }}\n'
     if model.vectorized:
         text += "vectorized = true\n"
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+    with written_whole(path) as file:
+        file.write(text.encode())

@@ -9,6 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.extras import require_extra
+from ctxval._util.files import written_whole
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear
@@ -27,7 +28,7 @@ def write_onnx(path: str | Path, model: Model) -> None:
     Raises:
         InputError: if onnx is not installed, the model is another one, or the file cannot be written.
     """
-    onnx = require_extra("onnx", "fit", "ONNX files")
+    onnx = require_onnx(model)
     graph = _Graph(onnx)
     n, m = _model(graph, model, "x_next")
     value = onnx.helper.make_tensor_value_info
@@ -36,10 +37,29 @@ def write_onnx(path: str | Path, model: Model) -> None:
         graph.nodes, "step", [value("z", kind, ["N", n + m])], [value("x_next", kind, ["N", n])], graph.tensors
     )
     opset = [onnx.helper.make_opsetid("", _OPSET)]
-    try:
-        onnx.save(onnx.helper.make_model(made, opset_imports=opset, ir_version=_IR), str(path))
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+    content = onnx.helper.make_model(made, opset_imports=opset, ir_version=_IR)
+    with written_whole(path) as file:
+        file.write(content.SerializeToString())
+
+
+def require_onnx(model: Model | None) -> Any:
+    """Return the module onnx, if it is installed and a model can be written.
+
+    Args:
+        model: the model; None if it is one of those that can be written.
+
+    Raises:
+        InputError: if onnx is not installed, or the model cannot be written.
+    """
+    onnx = require_extra("onnx", "fit", "ONNX files")
+    while isinstance(model, Corrected):
+        model = model.model
+    if model is not None and not isinstance(model, Linear | FeedforwardReLU | GaussianProcessModel):
+        raise InputError(
+            f"only linear models, networks, Gaussian processes and corrections of these can be written as ONNX, got "
+            f"{model!r}."
+        )
+    return onnx
 
 
 def _model(graph: _Graph, model: Model, output: str) -> tuple[int, int]:
@@ -55,15 +75,11 @@ def _model(graph: _Graph, model: Model, output: str) -> tuple[int, int]:
         n = len(model.scaling.shift_out)
         m = len(model.scaling.shift_in) - n
         _gaussian_process(graph, model, n, output)
-    elif isinstance(model, Corrected):
+    else:
+        assert isinstance(model, Corrected)  # require_onnx has checked it
         n, m = _model(graph, model.model, "before")
         _correction(graph, model.correction, "correction")
         graph.node("Add", ["before", "correction"], output)
-    else:
-        raise InputError(
-            f"only linear models, networks, Gaussian processes and corrections of these can be written as ONNX, got "
-            f"{model!r}."
-        )
     return n, m
 
 

@@ -29,6 +29,7 @@ from ctxval.learning.hyperparameters import (
     learning_rows,
 )
 from ctxval.learning.kernel_expansion import KernelExpansion
+from ctxval.learning.recorded import affordable_centres
 from ctxval.learning.residual_data import ResidualData, residual_data
 from ctxval.learning.without_model import smoother_than
 
@@ -38,8 +39,6 @@ _NEGLIGIBLE = 1e-6
 """Share of the largest posterior variance below which a pivot adds nothing to those chosen before it."""
 _ROUNDING = 1e-13
 """Posterior variances below this share of the prior variance are rounding errors."""
-_WORK = 30_000
-"""Number of centres times the horizon; it bounds the time of a closed loop."""
 _CENTRES = (150, 400)
 """Least and largest number of centres."""
 _LARGEST = 1e6
@@ -69,7 +68,7 @@ class PosteriorSettings:
     @classmethod
     def for_horizon(cls, horizon: int) -> PosteriorSettings:
         """Return settings in which a closed loop of many steps has fewer centres, so that it does not take longer."""
-        return cls(centres=int(np.clip(_WORK // horizon, *_CENTRES)))
+        return cls(centres=affordable_centres(horizon, *_CENTRES))
 
     def without_model(self) -> PosteriorSettings:
         """Return settings for learning S itself, which is smoother than the error of M and takes more transitions."""

@@ -32,7 +32,7 @@ from ctxval.learning.dynamics import (
 )
 from ctxval.learning.error_vectors import ErrorVectors, Executed, executions_of
 from ctxval.learning.plan_memory import PlanMemory
-from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
+from ctxval.learning.recorded import affordable_centres, closed_loops_on_model, recorded_transitions
 from ctxval.learning.vector import predict_composed
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
@@ -44,8 +44,6 @@ _CENTRES = (100, 450)
 """Least and largest number of transitions that the residual is conditioned on."""
 _ROUGH_CENTRES = 64
 """The same for the rough prediction, with which a search screens many points."""
-_WORK = 30_000
-"""Number of these transitions times the horizon; it bounds the time of a closed loop."""
 _DESIGNS = 2000
 """Number of designs for one suggestion, if the synthesizer takes batches."""
 _SLOW_DESIGNS = 150
@@ -164,7 +162,7 @@ def predict_distance(validation: Validation, executed: Executed) -> Prediction |
 
 def _centres(loops: Trajectory) -> int:
     """Return the largest number of transitions that the residual is conditioned on."""
-    return int(np.clip(_WORK // loops.horizon, *_CENTRES))
+    return affordable_centres(loops.horizon, *_CENTRES)
 
 
 def _scheduled(count: int) -> int:

@@ -25,6 +25,18 @@ _LOOPS = 64
 """Number of closed loops on M that show which transitions the tasks need."""
 _SLOW_LOOPS = 3
 """Number of tasks that are tried one by one, if loops cannot be computed in a batch."""
+_WORK = 30_000
+"""Number of centres of a residual times the horizon; it bounds the time of a closed loop."""
+
+
+def affordable_centres(horizon: int, least: int, most: int) -> int:
+    """Return the number of transitions that a residual is conditioned on: fewer if closed loops have many steps.
+
+    Args:
+        horizon: the number of steps of a closed loop.
+        least, most: the least and the largest number.
+    """
+    return int(np.clip(_WORK // horizon, least, most))
 
 
 def recorded_transitions(

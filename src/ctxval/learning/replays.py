@@ -25,13 +25,11 @@ from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.dynamics import Residual, ResidualsWithout, learn_covariance
 from ctxval.learning.error_vectors import Executed, executions_of
-from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
+from ctxval.learning.recorded import affordable_centres, closed_loops_on_model, recorded_transitions
 from ctxval.models.corrected import before_refinement
 
 _CENTRES = (100, 300)
 """Least and largest number of transitions that the residual is conditioned on."""
-_WORK = 30_000
-"""Number of these transitions times the horizon; it bounds the time of a closed loop."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +78,7 @@ def _corrected(validation: Validation, executed: Executed) -> tuple[Model, Resid
         if loops is None:
             return None
         recorded = recorded_transitions(validation.model, [trajectory for _, trajectory in executed], loops)
-        centres = int(np.clip(_WORK // loops.horizon, *_CENTRES))
+        centres = affordable_centres(loops.horizon, *_CENTRES)
         model = before_refinement(validation.model)
         learned = None if recorded is None else learn_covariance(model, *recorded, centres)
         return None if learned is None else (learned.model, learned.residual)

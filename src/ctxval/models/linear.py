@@ -42,6 +42,11 @@ class Linear:
                 "a linear model needs A (n, n), B (n, m) and c (n,), "
                 f"got {self.A.shape}, {self.B.shape} and {self.c.shape}."
             )
+        if data is not None and (data.x.shape[1], data.u.shape[1]) != self.B.shape:
+            raise ShapeError(
+                f"the model has {n} states and {self.B.shape[1]} inputs, and its data have {data.x.shape[1]} states "
+                f"and {data.u.shape[1]} inputs."
+            )
 
     @classmethod
     def fit(cls, data: Transitions, *, intercept: bool = True) -> Linear:
@@ -71,8 +76,18 @@ class Linear:
         return cls(weights[:n].T, weights[n : n + m].T, weights[n + m] if intercept else None, data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
-        return np.asarray(x @ self.A.T + u @ self.B.T + self.c)
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
+
+        Raises:
+            ShapeError: if the shapes do not fit.
+        """
+        try:
+            return np.asarray(x @ self.A.T + u @ self.B.T + self.c)
+        except ValueError as error:
+            raise ShapeError(
+                f"the model has {len(self.A)} states and {self.B.shape[1]} inputs, got states of shape {np.shape(x)} "
+                f"and inputs of shape {np.shape(u)}."
+            ) from error
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A and B, which are the same for all states and inputs."""

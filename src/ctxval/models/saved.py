@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.files import read_bytes
+from ctxval._util.files import read_bytes, written_whole
 from ctxval._util.npz import Archive
 from ctxval._util.registry import part
 from ctxval.core.model import Model
@@ -90,13 +90,8 @@ def write_transitions(path: str | Path, data: Transitions | None) -> None:
 
 
 def _write(path: str | Path, arrays: dict[str, Any]) -> None:
-    beside = Path(f"{path}.part")
-    try:
-        with beside.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-        beside.replace(path)  # a process that is killed leaves no half of a model
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+    with written_whole(path) as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 @part("Saved", files=("source",))

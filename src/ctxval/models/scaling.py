@@ -9,7 +9,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import record
 from ctxval.core.trajectory import Transitions
-from ctxval.errors import InputError
+from ctxval.errors import InputError, ShapeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +69,19 @@ class IncrementScaling:
 
 
 def standardised_pairs(x: Array, u: Array, shift: Array, scale: Array) -> Array:
-    """Return ``((x, u) - shift) / scale``, shape ``(..., n + m)``, for states ``(..., n)`` and inputs ``(..., m)``."""
+    """Return ``((x, u) - shift) / scale``, shape ``(..., n + m)``, for states ``(..., n)`` and inputs ``(..., m)``.
+
+    Raises:
+        ShapeError: if the number of states and inputs is not n + m.
+    """
     batch = x.shape[:-1] if x.shape[:-1] == u.shape[:-1] else np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
     n = x.shape[-1]
     z = np.empty((*batch, n + u.shape[-1]))
     z[..., :n], z[..., n:] = x, u
+    if z.shape[-1:] != shift.shape:
+        raise ShapeError(
+            f"the model has {len(shift)} states and inputs together, got {n} states and {u.shape[-1]} inputs."
+        )
     z -= shift
     z /= scale
     return z

@@ -118,7 +118,7 @@ def _typical_cost(validation: Validation) -> float:
             points = space.from_unit(np.random.default_rng(0).random((len(loops.states), space.dimension)))
             costs = _cost(validation, validation.task(space.parameters(points)), loops)
             return float(np.median(costs)) if np.isfinite(costs).all() else np.inf
-    except Exception:  # the user's own parts, on tasks that may never be executed
+    except Exception:  # users' tasks, synthesizers and costs may raise anything, on tasks that may never be executed
         return np.inf
 
 
@@ -156,5 +156,5 @@ def _known_distance(validation: Validation, trial: Trial, recorded: Trajectory) 
     try:
         plan = validation.plan(validation.space.from_unit(trial.unit_point))
         return validation.accept(plan, recorded).distance if gives_inputs(plan, recorded, _SAME) else None
-    except Exception:  # the user's own parts: what cannot be compared is not the same
+    except Exception:  # users' tasks, synthesizers and distances may raise anything: what cannot be compared differs
         return None

@@ -6,9 +6,44 @@ import json
 from pathlib import Path
 
 from ctxval._util.describe import describe
+from ctxval._util.files import written_whole
+from ctxval.core.model import Model
 from ctxval.errors import InputError
-from ctxval.fitting.model_file import write_model_file
+from ctxval.fitting.model_file import SUFFIXES, require_reference, require_suffix, write_model_file
+from ctxval.fitting.onnx_file import require_onnx
+from ctxval.models import Corrected, Parametric
+from ctxval.models.corrected import before_refinement
+from ctxval.refinement.methods import Method
 from ctxval.refinement.rounds import Refinement
+
+
+def require_file_of(path: Path, method: Method, model: Model, step: str | None = None) -> None:
+    """Check that a file can hold the model that a method will learn, before executions are paid for.
+
+    A function of the user may return any model, so what it returns is checked when it is written.
+
+    Args:
+        path: the file.
+        method: the method.
+        model: the first model.
+        step: ``module:attr`` of the user's function, for its parameters.
+
+    Raises:
+        InputError: if a file of this suffix cannot hold the model.
+    """
+    require_suffix(path)
+    if method.makes is None:
+        return
+    suitable = [suffix for suffix, held in SUFFIXES.items() if issubclass(method.makes, held)]
+    if path.suffix not in suitable:
+        raise InputError(
+            f"the model of the method {method.name!r} cannot be written to a file that ends in {path.suffix}: give one "
+            f"that ends in {' or '.join(suitable)}."
+        )
+    if issubclass(method.makes, Parametric):
+        require_reference(step)
+    if path.suffix == ".onnx":
+        require_onnx(before_refinement(model) if issubclass(method.makes, Corrected) else None)
 
 
 def write_refined(path: str | Path, found: Refinement, step: str | None = None) -> list[str]:
@@ -42,10 +77,8 @@ def write_refined(path: str | Path, found: Refinement, step: str | None = None) 
     }
     for suffix, text in texts.items():
         beside = target.with_suffix(suffix)
-        try:
-            beside.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"{beside} cannot be written: {error.strerror}.") from error
+        with written_whole(beside) as file:
+            file.write(text.encode())
         written.append(str(beside))
     return written
 

@@ -35,7 +35,11 @@ class HeldOut:
 
     @property
     def better(self) -> Mask:
-        """The states whose error became smaller, in the root mean square, shape ``(n,)``."""
+        """The states whose error became smaller, in the root mean square, shape ``(n,)``.
+
+        A correction of the states that are chosen by these errors is also reported with them, so the reported errors
+        are slightly too small. Those of the last round's executions, which chose nothing, are not.
+        """
         return np.asarray((self.errors**2).mean(axis=0) < (self.before**2).mean(axis=0))
 
     @property

@@ -65,9 +65,11 @@ class Method(ABC):
 
     Attributes:
         name: its name.
+        makes: the type of the models that it learns; None if it may be any.
     """
 
     name: str
+    makes: type[Model] | None = None
 
     @abstractmethod
     def learn(self, model: Model, records: Records) -> Learned:
@@ -96,6 +98,7 @@ class ResidualCorrection(Method):
 
     centres: int = _CENTRES
     name: str = field(default="residual", init=False)
+    makes = Corrected
 
     def learn(self, model: Model, records: Records) -> Learned:
         """Return the corrected model."""
@@ -180,6 +183,11 @@ class Refit(Method):
         """Its kind."""
         return self.kind
 
+    @property
+    def makes(self) -> type[Model]:  # type: ignore[override]
+        """The type of the models of its kind."""
+        return {"linear": Linear, "network": FeedforwardReLU, "gaussian-process": GaussianProcessModel}[self.kind]
+
     def learn(self, model: Model, records: Records) -> Learned:
         """Return the new model."""
         made: dict[str, Callable[[Transitions], Model]] = {
@@ -217,6 +225,7 @@ class ParameterFit(Method):
     vectorized: bool = False
     seed: int = 0
     name: str = field(default="parameters", init=False)
+    makes = Parametric
 
     def __post_init__(self) -> None:
         as_bounds(self.bounds)
@@ -288,8 +297,8 @@ def _usable(model: Model, records: Records) -> Model:
     try:
         with np.errstate(all="ignore"):
             found = np.asarray(model.step(data.x[rows], data.u[rows]), dtype=np.float64)
-    except CtxvalError:
-        raise
+    except CtxvalError as error:
+        raise ModelError(f"the learned model cannot predict the recorded steps: {error}") from error
     except (Exception, SystemExit) as error:
         raise ModelError(f"the learned model failed on recorded states and inputs: {reason_of(error)}.") from error
     if found.shape != data.x[rows].shape:

@@ -174,7 +174,9 @@ class Refinement:
         return (
             f"{said}. Its confidence is {self.last.confidence:.6g}: the k-th refined model may be validated wrongly "
             f"with probability {1 - self.confidence:.3g} / (k (k + 1)), so the whole sequence is wrong with "
-            f"probability at most {1 - self.confidence:.3g}, however many models were tried."
+            f"probability at most {1 - self.confidence:.3g}, however many models were tried. This holds for one "
+            "refinement: if several refinements begin with the same stores or executions, the probability that any of "
+            "them validates a model wrongly is larger."
         )
 
     @property

@@ -11,7 +11,7 @@ from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import call
 from ctxval.core.model import Model
 from ctxval.data.recordings import Recordings
-from ctxval.errors import ModelError
+from ctxval.errors import CtxvalError, ModelError
 
 _MOST = 40_000
 """Largest number of predictions of one kind; of more, every second, third, ... one is made."""
@@ -146,6 +146,8 @@ def stepped(model: Model, x: Array, u: Array) -> Array:
     try:
         with np.errstate(all="ignore"):
             found = np.asarray(model.step(x, u), dtype=np.float64)
+    except CtxvalError as error:
+        raise _unusable(x, u, str(error)) from error
     except Exception as error:  # the user's model
         raise _unusable(x, u, f"{type(error).__name__}: {str(error)[:200]}") from error
     if found.shape != x.shape:

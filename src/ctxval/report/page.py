@@ -17,7 +17,6 @@ from markupsafe import Markup
 
 from ctxval._util.representation import call
 from ctxval._util.texts import reason_of, visible
-from ctxval.errors import InputError
 from ctxval.report.context import ReportContext
 from ctxval.report.markup import paragraph, text
 from ctxval.report.sections import SECTIONS, Section, sections_of
@@ -103,15 +102,11 @@ def write_page(context: ReportContext, path: str | Path, sections: Sequence[Sect
 
 
 def write_content(content: str, path: str | Path) -> Path:
-    """Write a page as one HTML file, in a new folder if there is none.
+    """Write a page as one HTML file; its folder is made if there is none.
 
     Raises:
         InputError: if the file cannot be written or is a store.
     """
-    try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
     return write_text(path, content)
 
 

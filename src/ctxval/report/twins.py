@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ctxval._util.describe import describe
+from ctxval._util.files import make_folder_of
 from ctxval._util.texts import markdown_text, shortened, visible
 from ctxval.errors import InputError
 from ctxval.report.context import ReportContext, distance_of
@@ -161,12 +162,13 @@ def _worst_rows(context: ReportContext, units: str) -> list[str]:
 
 
 def write_text(path: str | Path, content: str) -> Path:
-    """Write a report or a twin of it.
+    """Write a report or a twin of it; its folder is made if there is none.
 
     Raises:
         InputError: if the file cannot be written, or is a store, whose executions were paid for.
     """
     target = Path(path)
+    make_folder_of(target)
     try:
         if _begins_with(target, _DATABASE):
             raise InputError(f"{path} is a store or another database, and a report must not replace it.")

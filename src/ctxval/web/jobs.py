@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 _WAIT = 60.0
 """Seconds to wait for another process that chooses a task or runs the store."""
 
-_AHEAD = 100
-"""Number of executions that the posterior bound may plan with; a bound that needs more is not aimed at."""
+_FURTHER = 100
+"""Largest number of further executions for a verdict: no task is chosen for a bound that needs more."""
 
 Files = dict[str, bytes]
 """The files of a trial by name."""
@@ -135,7 +135,7 @@ def _ask_until_decided(served: ServedCampaign) -> OpenTrial:
     if threshold is None:
         raise InputError("there is no threshold, so no task decides a verdict: start the server with --threshold.")
     # At a rig people decide when to stop, so the budget is never what ends the campaign.
-    budget = len(campaign.trials) + _AHEAD
+    budget = len(campaign.trials) + _FURTHER
     opened = campaign.ask_until_decided(threshold, budget, certificate=served.certificate)
     if opened is None:
         raise InputError(

@@ -1,0 +1,29 @@
+"""The command line, as tests of its commands call it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from typer.testing import CliRunner, Result
+
+from ctxval.cli import app
+
+Invoke = Callable[..., Result]
+
+
+def calling(*before: str) -> Invoke:
+    """Return a function that calls ``ctxval`` with arguments that follow these."""
+
+    def called(*arguments: str) -> Result:
+        return CliRunner().invoke(app, [*before, *arguments])
+
+    return called
+
+
+def report(result: Result) -> dict[str, Any]:
+    """Return the JSON object that a command has printed; it must have ended well."""
+    assert result.exit_code == 0, result.stdout + result.stderr
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
