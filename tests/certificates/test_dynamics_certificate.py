@@ -197,6 +197,22 @@ def test_many_coordinates_are_said_not_to_be_covered_jointly() -> None:
     assert any("not all combinations" in one for one in found.assumptions)
 
 
+@pytest.mark.parametrize(
+    ("jumps", "what"),
+    [({"sharpness": 0.07}, "distances falls by 7 %"), ({"jump": 0.02}, "jumps by up to 2 % of the bound")],
+)
+def test_it_is_withdrawn_if_the_distance_jumps_between_tasks(jumps: dict[str, float], what: str) -> None:
+    wide = replace(GOOD, points=np.zeros((40, 3)), **jumps)
+    doubt = certify_dynamics(sample(), wide).doubt
+    assert doubt is not None
+    assert what in doubt
+    assert "use a smoother model, or an audit" in doubt
+    # Two task parameters are searched densely.
+    assert certify_dynamics(sample(), replace(GOOD, **jumps)).doubt is None
+    small = {name: 0.1 * value for name, value in jumps.items()}
+    assert certify_dynamics(sample(), replace(GOOD, points=np.zeros((40, 3)), **small)).doubt is None
+
+
 def test_it_says_that_the_system_was_learned_without_its_model() -> None:
     found = certify_dynamics(sample(), replace(GOOD, without_model=True))
     assert any("the system is learned without M" in one for one in found.assumptions)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -28,6 +29,30 @@ def make_planner(dimension: int) -> LoopPlanner:
             system=systems.Simulated(truth, vectorized=True),
             model=MODEL,
             synthesizer=controllers.LQR([1.0, 0.1], [0.1]),
+            distance=distances.MeanDeviation(),
+        )
+    )
+
+
+def weights(height: float) -> Callable[[int, Array, Task], Array]:
+    """Return a controller whose gain is larger in bands of the initial state that are far narrower than the space."""
+
+    def act(t: int, x: Array, task: Task) -> Array:
+        gain = 1 + height * (np.sin(2000 * task.initial_state[..., :1]) > 0.9)
+        return np.asarray(-gain * (0.5 * x[..., :1] + 0.5 * x[..., 1:]))
+
+    return act
+
+
+def jumping(height: float) -> LoopPlanner:
+    smooth = make_planner(2).validation
+    return LoopPlanner(
+        Validation(
+            space=smooth.space,
+            task=smooth.task,
+            system=smooth.system,
+            model=MODEL,
+            synthesizer=controllers.Policy(weights(height), vectorized=True),
             distance=distances.MeanDeviation(),
         )
     )
@@ -95,6 +120,18 @@ def test_maxima_are_distances_at_their_points() -> None:
         planner.distances(posterior.mean, planner.plan(found.elites[:1]), 1), found.of_mean, rtol=1e-7
     )
     assert found.left_out == max(posterior.taken[0].left_out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("height", "jumps"), [(0.0, False), (1.0, True)])
+def test_controllers_that_jump_from_task_to_task_are_seen(height: float, jumps: bool) -> None:
+    search = WorstCaseSearch(jumping(height), 0, WorstCaseSettings.for_dimension(2))
+    found = search.maxima(learned(), np.empty((0, 2)), np.random.default_rng(0))
+    share = search.largest_jump(learned()) / found.of_mean
+    assert (found.sharpness > 0.05) == jumps
+    assert (share > 0.01) == jumps
+    if not jumps:
+        assert share < 1e-3
 
 
 FEW = WorstCaseSettings(pool=64, evaluations=300, elites=6, shared=6, moves=4, relevant=100)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from ctxval._util.describe import rounded
 from ctxval._util.progress import stage
 from ctxval._util.representation import call
 from ctxval.campaign.history import executed_trials
-from ctxval.certificates.dynamics import PREDICTIONS
+from ctxval.certificates.dynamics import PREDICTIONS, bound_of, doubt_of
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
     DynamicsEvidence,
@@ -113,13 +114,18 @@ class CampaignDynamics:
         draws = min(_MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
         with stage("searching the learned dynamics", self._study.search.expected_loops(draws), "closed loops"):
             learned = self.learned(trials)
-            return None if learned is None else self._evidence_or_none(learned, trials, draws)
+            return None if learned is None else self._evidence_or_none(learned, trials, draws, confidence)
 
     def _evidence_or_none(
-        self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int
+        self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int, confidence: float
     ) -> DynamicsEvidence | None:
         try:
-            return self._evidence(learned, trials, draws)
+            found = self._evidence(learned, trials, draws)
+            best = max((trial.distance or 0.0 for trial in trials), default=0.0)
+            if doubt_of(found, best, bound_of(found, best, confidence)) is None:
+                # Many closed loops, which only matter to a bound that nothing else withdraws.
+                found = replace(found, jump=learned.largest_jump)
+            return found
         except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
             return None
 

@@ -64,6 +64,12 @@ LEFT_OUT = 0.5
 SHARP = 0.05
 """Largest share by which a large predicted distance may exceed the median of those of nearly the same tasks."""
 
+JUMP = 0.01
+"""Largest jump of the predicted distance between nearly equal tasks, as a share of the bound."""
+
+DENSE = 2
+"""Largest number of task parameters in which a search finds the largest distance in spite of jumps."""
+
 TESTED = 0.8
 """Least share of the largest distance on the posterior mean that must have been executed: the bound is tested there."""
 
@@ -268,13 +274,24 @@ def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
             f"the draws of the dynamics leave out {100 * evidence.left_out:.0f} % of the largest variance, more than "
             f"{100 * LEFT_OUT:g} %; more executions reduce this variance"
         )
+    return uncovered(evidence) or untested(evidence, best, bound) or _jumps(evidence, bound)
+
+
+def _jumps(evidence: DynamicsEvidence, bound: float) -> str | None:
+    """Return that the distance is no smooth function of the task, so that a search may miss the largest one."""
+    if evidence.points.shape[1] <= DENSE:
+        return None
     if evidence.sharpness > SHARP:
-        return (
-            f"one of the largest predicted distances falls by {100 * evidence.sharpness:.0f} % if its task changes by "
-            "a thousandth of its ranges, so a search may miss larger ones: the controllers change abruptly from task "
-            "to task, as those of a model with kinks do, or the closed loop does; use a smoother model, or an audit"
-        )
-    return uncovered(evidence) or untested(evidence, best, bound)
+        what = f"one of the largest predicted distances falls by {100 * evidence.sharpness:.0f} %"
+    elif evidence.jump > JUMP * bound:
+        what = f"the predicted distance jumps by up to {100 * evidence.jump / bound:.2g} % of the bound"
+    else:
+        return None
+    return (
+        f"{what} if a task changes by a thousandth of its ranges, so a search may miss the largest distance: the "
+        "controllers change abruptly from task to task, as those of a model with kinks do, or the closed loop does; "
+        "use a smoother model, or an audit"
+    )
 
 
 def _failed_predictions(failed: Sequence[CheckedPrediction], last: int) -> str:
@@ -396,6 +413,7 @@ def _details(sample: Sample, evidence: DynamicsEvidence, bound: float, error: fl
         "noise": evidence.noise,
         "without_model": evidence.without_model,
         "sharpness": evidence.sharpness,
+        "jump": evidence.jump,
         "variance_left_out": evidence.left_out,
         "failures": sample.failures,
     }

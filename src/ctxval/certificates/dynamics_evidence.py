@@ -138,6 +138,8 @@ class DynamicsEvidence:
         untried: a parameter that M's loops do not depend on; None if there is none.
         without_model: whether the system was learned without M, because M is rougher than the system.
         sharpness: largest share by which a large distance on the mean exceeds those of tasks that are nearly the same.
+        jump: largest jump of the distance on the mean between tasks that are nearly the same, at random tasks; 0 if it
+            was not computed, because the bound is withdrawn anyway.
     """
 
     maxima: Array
@@ -155,6 +157,7 @@ class DynamicsEvidence:
     untried: UntriedParameter | None = None
     without_model: bool = False
     sharpness: float = 0.0
+    jump: float = 0.0
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""

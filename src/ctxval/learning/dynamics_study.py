@@ -132,6 +132,11 @@ class LearnedDynamics:
             self._worst_cases[functions] = found
         return self._worst_cases[functions]
 
+    @functools.cached_property
+    def largest_jump(self) -> float:
+        """The largest jump of the distance on the posterior mean between nearly equal tasks."""
+        return self.study.search.largest_jump(self.posterior)
+
     @property
     def untried_parameter(self) -> tuple[int, float, Array] | None:
         """A parameter that M's loops do not depend on, its largest gap between executions, and a task in the gap.

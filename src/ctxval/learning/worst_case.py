@@ -36,7 +36,7 @@ _SHOWN = 16
 _SAME = 0.02
 """Least distance of two of them, as a share of the cube's diagonal."""
 _NEARBY = 1e-3
-"""Largest change of each coordinate by which tasks next to the best ones differ from them."""
+"""Largest change of each coordinate to a task that is nearly the same."""
 _APART = 0.15
 """Least distance of two tasks that are not next to each other, as a share of the cube's diagonal."""
 
@@ -149,6 +149,27 @@ class WorstCaseSearch:
     def plans(self) -> list[PlannedTasks]:
         """The plans of the pool."""
         return self.planner.plan(self.pool)
+
+    @functools.cached_property
+    def _in_rows(self) -> tuple[Array, list[PlannedTasks]]:
+        """Three nearly equal tasks in a row from each task of the pool, points ``(N, 3, d)``, and their plans."""
+        moves = np.random.default_rng([self._seed, 1]).uniform(-_NEARBY, _NEARBY, self.pool.shape)
+        outside = (self.pool + 2 * moves < 0) | (self.pool + 2 * moves > 1)
+        steps = np.arange(3)[:, None] * np.where(outside, -moves, moves)[:, None]
+        tasks = self.pool[:, None] + steps
+        return tasks, self.planner.plan(tasks.reshape(-1, self.dimension))
+
+    def largest_jump(self, posterior: DynamicsPosterior) -> float:
+        """Return by how much the mean's distance of a task differs at most from the middle of those on both sides.
+
+        The tasks are those of the pool. If the distance is a smooth function of the task, this is hardly anything.
+        """
+        with single_threaded():
+            tasks, planned = self._in_rows
+            found = self.planner.distances(posterior.mean, planned, tasks.shape[0] * tasks.shape[1])[0]
+        first, middle, last = found.reshape(tasks.shape[:2]).T
+        jumps = np.abs(middle - 0.5 * (first + last))
+        return float(jumps[np.isfinite(jumps)].max(initial=0.0))
 
     @functools.cached_property
     def _unplanned(self) -> float:
