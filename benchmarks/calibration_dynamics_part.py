@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibrate_dynamics import BUDGETS, FALSE, GROUPS, STORED, TRUE, rule_of, wanted
+from calibrate_dynamics import BUDGETS, FALSE, FEW, GROUPS, STORED, TRUE, rule_of, wanted
 from calibration_verdicts_part import false_of, table
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import dynamics as rule
@@ -48,6 +48,22 @@ is true of these systems as well; the column says how often it was given. Execut
 
 {false}
 
+### Models that are rougher than the system
+
+These systems have a network or a Gaussian process of few points in the place of another model
+(`benchmarks/dynamics_rough.py`, at most {rough_seeds} seeds). If the records prefer it, the certificate learns the
+system without M. The condition was chosen with the paper's arm. The controllers of such a model can jump from task to
+task. The first campaign on `sliding-tyres-network` was falsely validated for this reason at 0.95 d*: its largest
+distance is a needle, on which eight deep searches of the true system, of 80,000 evaluations each, disagree by a factor
+of two. `sharpness` and `jump` were added then, with limits from the distances of all systems of these lists, seeds 0
+and 1, and without certificates. The table is of campaigns after this.
+
+At 0.95 d*: {rough_95}. At 1.1 d*, {rough_11} of the campaigns on systems that do not mislead are validated.
+
+{rough}
+
+{rough_false}
+
 ### Dynamics that change with time
 
 The certificate assumes that the dynamics do not change with time. Here they do: a mass with drag is moved to a goal in
@@ -68,13 +84,15 @@ below all 19 draws and 5 % above them. The spread is the variance of the ranks a
 ### The paper's cases
 
 These campaigns have at most {budget_paper} executions. No threshold was chosen with these cases, but the method was
-tried on them while it was written. Each has ten seeds.
+tried on them while it was written; that of models that are rougher than the system, on seeds 0 to 2 of `arm-gp` and
+`arm-fnn`. Each has ten seeds.
 
 {paper}
 
 ### Development systems
 
-The thresholds of the certificate were chosen with seeds 0 to 2 of these systems, so this table is not evidence.
+The thresholds of the certificate were chosen with seeds 0 to 2 of these systems, so this table is not evidence. These
+campaigns and those of the reporting systems are from before `sharpness` and `jump`, which can only withdraw a bound.
 
 {development}
 """
@@ -99,6 +117,7 @@ Result = dict[str, Any]
 def by_dynamics() -> str:
     """Return the part of the page."""
     reported = _of("reporting")
+    rough = _of("rough")
     mild = [one for one in reported if not _entry(one).misleading]
     return TEXT.format(
         budget=BUDGETS["reporting"],
@@ -116,6 +135,11 @@ def by_dynamics() -> str:
         **_decided(mild, TRUE[1], "125"),
         reporting=_table(reported),
         false=_false(reported),
+        rough=_table(rough),
+        rough_seeds=FEW,
+        rough_95=false_of(_at(rough, FALSE[0]))[1],
+        rough_11=_decided([one for one in rough if not _entry(one).misleading], TRUE[0], "11")["campaigns_11"],
+        rough_false=_false(rough),
         fresh=f"with seeds from {FRESH} on",
         timed=table(["push", "when", *TIMED_HEADER], time_varying_rows()),
         timed_seeds=TIMED_SEEDS,
