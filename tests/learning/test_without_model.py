@@ -77,6 +77,7 @@ def test_the_linear_model_has_the_least_squared_errors() -> None:
     assert data is not None
     found = smoother_than(data, 80)
     assert found is not None
+    assert isinstance(found[0], models.Linear)
     expected = models.Linear.fit(known)
     np.testing.assert_allclose(found[0].A, expected.A, atol=1e-12)
     np.testing.assert_allclose(found[0].B, expected.B, atol=1e-12)
@@ -90,6 +91,7 @@ def test_an_input_that_never_varies_has_no_weight() -> None:
     assert data is not None
     found = smoother_than(data, 80)
     assert found is not None
+    assert isinstance(found[0], models.Linear)
     np.testing.assert_array_equal(found[0].B, 0)
     assert np.abs(found[1].outputs * found[1].units).max() < 0.3
 

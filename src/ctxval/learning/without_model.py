@@ -2,7 +2,8 @@
 
 The residual ``S - M`` is as rough as the rougher one of S and M. The kinks of a network, or the waves of a Gaussian
 process between its data, make it rough although S is smooth. Such a residual takes many executions to learn, and S
-itself only few. The data decide: both models explain the same recorded transitions, with some probability density.
+itself only few. The data decide: both models explain the same recorded transitions, with some probability density. The
+search ``auto``, which needs a mean and no draws, compares errors instead (:func:`~.dynamics.learn_covariance`).
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
+from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
+from ctxval.learning.dynamics import Identity
 from ctxval.learning.hyperparameters import highest_log_posterior, learning_rows
 from ctxval.learning.residual_data import NEGLIGIBLE, ResidualData, residual_data
 from ctxval.models.linear import Linear
@@ -26,7 +29,7 @@ _LINEAR = 1e-3
 """M is linear if it differs from a linear model by less than this share of its residual in every state."""
 
 
-def smoother_than(data: ResidualData, count: int) -> tuple[Linear, ResidualData] | None:
+def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] | None:
     """Return a linear model and its residuals if with them the transitions are far more probable than with M's.
 
     Args:
@@ -37,9 +40,9 @@ def smoother_than(data: ResidualData, count: int) -> tuple[Linear, ResidualData]
         return None
     rows = learning_rows(data.pairs, data.inputs, count)
     needed = _log_density(data, rows) + PREFERRED * len(rows) * len(data.sizes)
-    known, n, m = data.transitions, len(data.sizes), data.inputs
+    known = data.transitions
     # If S itself is linear, its linear model leaves no residual. The change of its state has the same prior.
-    for linear in (_fitted(known, known.x_next), Linear(np.eye(n), np.zeros((n, m)))):
+    for linear in (_fitted(known, known.x_next), Identity()):
         other = residual_data(linear, known, data.sources)
         if other is not None and len(other.pairs) == len(data.pairs):
             return (linear, other) if _log_density(other, rows) > needed else None
