@@ -12,17 +12,17 @@ import time
 import numpy as np
 
 from ctxval import Campaign, cases, searches
-from landed import beside_landed, report
+from landed import Ratio, add_store_option, beside_landed, report
 
 EXECUTIONS = 25
 SUGGESTIONS = 4
 REPEATS = 3
-# The case, its options, the number of known executions, and the ratio that is asked for.
-CASES: dict[str, tuple[str, dict[str, int], int, float]] = {
+# The case, its options, the number of known executions, and the least ratio that is asked for.
+CASES: dict[str, tuple[str, dict[str, int], int, float | None]] = {
     "demo": ("pendulum", {}, 0, 8.0),
     "Dubins, 20 known": ("dubins", {}, 20, 5.0),
     "Dubins, 100 known": ("dubins", {}, 100, 5.0),
-    "linear 20-D, 22 known": ("linear", {"dim": 10}, 22, 1.0),
+    "linear 20-D, 22 known": ("linear", {"dim": 10}, 22, None),
 }
 
 
@@ -43,15 +43,14 @@ def seconds(name: str) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--case", choices=list(CASES), help="report the seconds of one case")
+    add_store_option(parser)
     options = parser.parse_args()
     if options.case is not None:
         report(seconds(options.case))
         return
     for name, (*_, asked) in CASES.items():
-        pairs = [beside_landed(__file__, "--case", name) for _ in range(REPEATS)]
-        earlier, now = (min(figures) for figures in zip(*pairs, strict=True))
-        wanted = f" (asked: at least {asked:g})" if asked > 1 else ""
-        print(f"{name}: {earlier:.3f} CPU s a suggestion before, {now:.3f} now, ratio {earlier / now:.1f}{wanted}")
+        earlier, now = beside_landed(__file__, "--case", name, repeats=REPEATS)
+        Ratio("bench_auto", f"a suggestion, {name}", earlier, now, least=asked).tell(options.store)
 
 
 if __name__ == "__main__":

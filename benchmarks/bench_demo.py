@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from landed import beside_landed, report
+from landed import Ratio, add_store_option, beside_landed, report
 
 COMMAND = ("ctxval", "run", "pendulum")
 PARTS = ("imports and start", "campaign of 25 executions", "verdict", "report and pictures")
@@ -58,14 +58,20 @@ def parts() -> list[float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parts", action="store_true", help="report the parts of one run")
-    if parser.parse_args().parts:
+    add_store_option(parser)
+    options = parser.parse_args()
+    if options.parts:
         report(parts())
         return
-    pairs = [beside_landed(__file__, "--parts") for _ in range(REPEATS)]
-    earlier, now = (min(figures, key=sum) for figures in zip(*pairs, strict=True))
-    rows = [*zip(PARTS, earlier, now, strict=True), ("together", sum(earlier), sum(now))]
-    for part, before, after in rows:
-        print(f"{part}: {before:.2f} CPU s before, {after:.2f} now, ratio {before / after:.1f}")
+    earlier, now = beside_landed(__file__, "--parts", repeats=REPEATS)
+    for k, part in enumerate(PARTS):
+        tell(part, [one[k] for one in earlier], [one[k] for one in now], options.store)
+    tell("together", [sum(one) for one in earlier], [sum(one) for one in now], options.store)
+
+
+def tell(part: str, earlier: list[float], now: list[float], store: bool) -> None:
+    """Print the CPU times of a part, and store them if it is asked for."""
+    Ratio("bench_demo", f"`make demo`: {part}", earlier, now).tell(store)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
 import time
 import warnings
@@ -36,6 +36,8 @@ from ctxval.core.rollout import rollout
 
 DT = 0.05
 TASKS = 40
+REPEATS = 3
+"""Of the figures for which a ratio is asked."""
 FEW = 4
 """Number of tasks for the earlier revision, whose time is proportional to it because it plans one task at a time."""
 
@@ -135,21 +137,28 @@ COMPARED = {f"network (tanh), {TASKS} distances": (f"network (tanh), {FEW} dista
 ASKED = {"quadrotor with limits, second suggestion": 10, f"network (tanh), {TASKS} distances": 20}
 
 
+def compared(name: str) -> landed.Ratio:
+    """Return one figure of the earlier revision and of this checkout."""
+    other, factor = COMPARED.get(name, (name, 1))
+    before, now = [], []
+    for _ in range(REPEATS if name in ASKED else 1):
+        before.append(factor * landed.figures(__file__, other, revision=landed.LANDED))
+        now.append(landed.figures(__file__, name))
+    return landed.Ratio("bench_designs", name, before, now, least=ASKED.get(name))
+
+
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("figure", nargs="?", choices=list(FIGURES), help="report one figure of the package in use")
+    landed.add_store_option(parser)
+    options = parser.parse_args()
+    if options.figure is not None:
+        landed.report(FIGURES[options.figure]())
+        return
     for name in FIGURES:
-        if name in [other for other, _ in COMPARED.values()]:
-            continue
-        other, factor = COMPARED.get(name, (name, 1))
-        before = factor * landed.figures(__file__, other, revision=landed.LANDED)
-        now = landed.figures(__file__, name)
-        asked = f" (asked: at least {ASKED[name]})" if name in ASKED else ""
-        print(
-            f"{name}: {1e3 * before:.1f} ms before, {1e3 * now:.1f} ms now, ratio {before / now:.1f}{asked}", flush=True
-        )
+        if name not in [other for other, _ in COMPARED.values()]:
+            compared(name).tell(options.store)
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
-        landed.report(FIGURES[sys.argv[1]]())
-    else:
-        main()
+    main()

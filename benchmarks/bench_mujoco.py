@@ -69,7 +69,7 @@ def report(name: str, xml: str, system: systems.MuJoCo, starts: Array, gain: Arr
 
 def main() -> None:
     rng = np.random.default_rng(0)
-    for count in (100, 4000):
+    for count in (100, 1000):
         reacher = arm.arm(arm.Settings())
         starts = reacher.state(rng.uniform(-1, 1, (count, 2)))
         name = f"arm, Runge-Kutta, {reacher.substeps} substeps, a site"

@@ -20,10 +20,10 @@ from ctxval import (
     Store,
     Task,
     TaskSpace,
+    Trajectory,
     Trial,
     Validation,
     controllers,
-    distances,
     models,
     searches,
     systems,
@@ -41,12 +41,22 @@ def validation() -> Validation:
     model = models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]])
     return Validation(
         space=TaskSpace(goal=(0.5, 2.0, "m"), speed=(-1.0, 1.0, "m/s")),
-        task=lambda p: Task([0, p.speed], goal=[p.goal, 0], horizon=20, dt=0.1),
+        task=lambda p: Task(
+            np.stack([0 * p.speed, p.speed], axis=-1),
+            goal=np.stack([p.goal, 0 * p.goal], axis=-1),
+            horizon=20,
+            dt=0.1,
+        ),
         system=systems.Simulated(model),
         model=model,
         synthesizer=controllers.LQR([10, 1], [0.1]),
-        distance=distances.FinalState(),
+        distance=landscape,
     )
+
+
+def landscape(model: Trajectory, system: Trajectory, task: Task) -> np.ndarray:
+    """Return a distance that depends on the task alone, so that many trials can be stored without an execution."""
+    return height(np.stack([(task.goal[..., 0] - 0.5) / 1.5, (task.initial_state[..., 1] + 1.0) / 2.0], axis=-1))
 
 
 def campaign(path: Path, search: str) -> Campaign:
@@ -54,26 +64,27 @@ def campaign(path: Path, search: str) -> Campaign:
 
 
 def height(points: np.ndarray) -> np.ndarray:
-    """Return a smooth distance with a flank for the searches to climb, at points ``(n, d)``."""
-    return np.exp(-4 * ((points - 0.7) ** 2).mean(axis=1)) + 0.3 * np.abs(np.sin(7 * points[:, 0]) * points[:, -1])
+    """Return a smooth distance with a flank for the searches to climb, at points ``(..., d)``."""
+    flank = 0.3 * np.abs(np.sin(7 * points[..., 0]) * points[..., -1])
+    return np.asarray(np.exp(-4 * ((points - 0.7) ** 2).mean(axis=-1)) + flank)
 
 
 def fill(path: Path, search: str, count: int = TRIALS) -> None:
     """Put many completed trials into a store, in one transaction."""
     first = campaign(path, search)
-    plan = first.ask().plan
-    first.tell(0, distance=0.0)
+    asked = first.ask()
+    first.tell(asked, distance=float(height(asked.trial.unit_point)))
     store, space = first.store, first.validation.space
     points = np.random.default_rng(0).random((count, 2))
-    values = height(points)
+    plans, values = first.validation.plans(space.from_unit(points)), height(points)
     with store._database.transaction():
         for number in range(1, count):
             point = points[number]
             names = space.describe_point(space.from_unit(point))
             trial = Trial(number, "acquisition", "completed", point, names, 1, True, float(values[number]), seconds=1.0)
             store._insert(trial)
-            store._write_trajectory(number, "model", plan.model_trajectory)
-            store._write_trajectory(number, "system", plan.model_trajectory)
+            for party in ("model", "system"):
+                store._write_trajectory(number, party, plans[number].model_trajectory)
     store.close()
 
 
@@ -91,7 +102,7 @@ def measure(path: Path, search: str) -> dict[str, float]:
         began = time.perf_counter()
         asked = again.ask()
         suggestions.append(time.perf_counter() - began)
-        again.tell(asked, distance=float(height(asked.trial.unit_point[None])[0]))
+        again.tell(asked, distance=float(height(asked.trial.unit_point)))
     again.store.close()
     began = time.perf_counter()
     command = [sys.executable, "-m", "ctxval.cli", "status", str(path), "--json"]

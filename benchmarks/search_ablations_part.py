@@ -8,8 +8,9 @@ import numpy as np
 
 import misleading
 from calibration_page import table
+from plants import DEVELOPMENT, REPORTING
 from search_cells import ENDS, cells, reached, results
-from study_ablations import ABLATIONS, BUDGET, ON_PLANTS
+from study_ablations import ABLATIONS, BUDGET, CHOSEN_BY, ON_PLANTS, OTHERS
 from study_ablations import CASES as ABLATED
 from study_auto import WITHIN, Result, first_within, repeated, shown
 
@@ -20,7 +21,7 @@ SHOWN = {"no climbs": "no trust region"}
 
 def of_ablation(case: str, without: str) -> dict[int, Result]:
     """Return the campaigns without a part, or those of `auto` itself."""
-    if without != "auto" or case in ON_PLANTS:
+    if without != "auto" or case not in ABLATED:
         return results("ablations", case, without, ABLATION_SEEDS)
     return results("misleading" if case in misleading.CASES else "auto", case, "auto", ABLATION_SEEDS)
 
@@ -73,6 +74,40 @@ def together(campaigns: list[Result]) -> list[str]:
         f"{100 * np.mean([average_share(result) for result in campaigns]):.1f} %",
         f"{wasted} of {executions}",
     ]
+
+
+def summary_table() -> str:
+    """Return, over all campaigns that were repeated without a part, how often the part saves executions."""
+    groups = {"chosen by": [*ABLATED, *CHOSEN_BY, *_plants(DEVELOPMENT)], "others": [*OTHERS, *_plants(REPORTING)]}
+    rows = []
+    for name in ABLATIONS:
+        for group, systems in groups.items():
+            pairs = [pair for case in systems for pair in _pairs(case, name)]
+            rows += [[SHOWN.get(name, name), group, *_compared(pairs)]] if pairs else []
+    return table(["without", "systems", "campaigns", "the same", *(f"{percent:g} %" for percent in ENDS_OF)], rows)
+
+
+ENDS_OF = (WITHIN[0], WITHIN[-1])
+
+
+def _plants(kind: str) -> list[str]:
+    return [name for name, plant in ON_PLANTS.items() if plant.kind == kind]
+
+
+def _pairs(case: str, without: str) -> list[tuple[Result, Result]]:
+    """Return the campaigns of `auto` and those without a part, on the seeds that both have."""
+    whole = of_ablation(case, "auto")
+    return [(whole[seed], run) for seed, run in of_ablation(case, without).items() if seed in whole]
+
+
+def _compared(pairs: list[tuple[Result, Result]]) -> list[str]:
+    """Return in how many campaigns nothing differs, and in how many `auto` needs fewer and more executions."""
+    same = sum(whole["distances"] == run["distances"] for whole, run in pairs)
+    cells = []
+    for percent in ENDS_OF:
+        counts = [(first_within(whole, percent), first_within(run, percent)) for whole, run in pairs]
+        cells.append(f"{sum(a < b for a, b in counts)} / {sum(a > b for a, b in counts)}")
+    return [str(len(pairs)), str(same), *cells]
 
 
 def average_share(result: Result) -> float:

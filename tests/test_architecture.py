@@ -114,3 +114,11 @@ def test_importing_ctxval_loads_nothing_heavy() -> None:
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.strip() == "[]"
+
+
+@pytest.mark.slow
+def test_the_command_line_starts_without_what_is_slow_to_load() -> None:
+    heavy = ["matplotlib", "scipy.stats", "mujoco", "sklearn", "torch"]
+    code = f"import sys, ctxval.cli; print([m for m in {heavy} if m in sys.modules])"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.strip() == "[]"

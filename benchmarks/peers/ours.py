@@ -20,7 +20,7 @@ def auto(values: Recorder, dimension: int, budget: int, seed: int) -> None:
     campaign = Campaign(validation, search=searches.Auto("thorough"), seed=seed)
     for known in values.outcomes:
         named = validation.space.describe_point(known.plan.parameters.points)
-        campaign.tell(campaign.ask(named), known.system_trajectory)
+        campaign.add(named, trajectory=known.system_trajectory)
     while len(values.points) < budget:
         opened = campaign.ask()
         campaign.tell(opened, values.execute(opened.trial.unit_point).system_trajectory)

@@ -115,6 +115,18 @@ def test_methods_begin_with_what_is_known() -> None:
     assert len(recorder.seconds) == 1
 
 
+def test_a_function_that_differs_from_that_of_the_stored_runs_is_an_error() -> None:
+    run.require_same("arm, seed 9", 1.0005, 1.0)
+    for here in (1.002, float("nan")):
+        with pytest.raises(SystemExit, match="seed 9 is another function here"):
+            run.require_same("arm, seed 9", here, 1.0)
+
+
+def test_the_function_of_the_stored_runs_is_recognised() -> None:
+    found = run.the_function("linear-5", 0)
+    assert found.maximum == pytest.approx(run.STORED["linear-5", "auto", 0]["maximum"])
+
+
 def test_regret_and_first_within() -> None:
     result = {"maximum": 2.0, "improvements": [[1, 1.0], [3, 1.9], [4, 1.99]], "executions": 4}
     np.testing.assert_allclose(page.regret(result, 6), [50.0, 50.0, 5.0, 0.5, 0.5, 0.5])

@@ -13,6 +13,7 @@ BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 import search_page  # noqa: E402
+import search_versions_part  # noqa: E402
 from ctxval._util.json_lines import JsonLines  # noqa: E402
 from study_auto import CASES, KEY, first_within, results_of, stored  # noqa: E402
 
@@ -78,3 +79,12 @@ def test_what_is_missing_goes_on_flat_where_a_campaign_ended() -> None:
     result = {"truth": 2.0, "budget": 4, "distances": [1.0, None, 2.0]}
     np.testing.assert_allclose(search_page.missing([result]), [[50.0, 50.0, 1.0, 1.0]])
     assert first_within(result, 1.0) == 3
+
+
+def test_campaigns_of_the_earlier_code_are_compared_seed_by_seed() -> None:
+    def campaign(*distances: float) -> dict[str, object]:
+        return {"truth": 1.0, "budget": 4, "distances": list(distances)}
+
+    earlier = [campaign(0.5, 1.0), campaign(1.0), campaign(0.5, 0.5, 0.5, 0.5)]
+    now = [campaign(1.0), campaign(0.5, 1.0), campaign(0.5, 0.5, 0.5, 0.5)]
+    assert search_versions_part.fewer_and_more(earlier, now) == "1 / 1"

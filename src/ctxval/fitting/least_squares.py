@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import record
@@ -163,7 +163,7 @@ def _intervals(
     undetermined = (np.abs(weak) > 0.1).any(axis=0) if len(weak) else np.zeros(len(theta), dtype=bool)
     with np.errstate(all="ignore"):
         deviations = width * np.sqrt(variance * ((V / singular[:, None]) ** 2).sum(axis=0))
-    reach = np.where(undetermined, np.inf, deviations * student.ppf(0.5 + confidence / 2, degrees))
+    reach = np.where(undetermined, np.inf, deviations * stdtrit(degrees, 0.5 + confidence / 2))
     found = []
     for i, name in enumerate(names):
         at = [

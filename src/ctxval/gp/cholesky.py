@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
 
 
@@ -60,6 +60,12 @@ class CholeskyFactor:
     def precisions(self) -> Array:
         """The diagonal of ``K^-1``, shape ``(n,)``: inverse variances of each observation given all others."""
         return np.asarray((self.inverse_factor**2).sum(axis=0))
+
+    def precisions_of(self, rows: Rows) -> Array:
+        """Return some entries of the diagonal of ``K^-1``, which takes less time than all of them."""
+        units = np.zeros((len(self.L), len(rows)), order="F")
+        units[rows, np.arange(len(rows))] = 1.0
+        return np.asarray((self.whiten(units) ** 2).sum(axis=0))
 
     def half_log_determinant(self) -> float:
         """Return ``log(det K) / 2``."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
 from ctxval.gp.cholesky import CholeskyFactor, factorise
@@ -139,9 +139,13 @@ class MultiOutputProcess:
         variance = self.kernel.diagonal(self.theta, X) - (half**2).sum(axis=0)
         return k @ self.weights, np.maximum(variance, 0.0)
 
-    def left_out(self) -> Array:
-        """Return the mean ``(n, k)`` of each observation given all others."""
-        return self.Y - self.factor.left_out_errors(self.weights)
+    def left_out(self, rows: Rows) -> Array:
+        """Return the means ``(m, k)`` of some observations, each given all others.
+
+        Source:
+            Rasmussen and Williams 2006, eq. 5.12.
+        """
+        return np.asarray(self.Y[rows] - self.weights[rows] / self.factor.precisions_of(rows)[:, None])
 
     def __repr__(self) -> str:
         return call(self, self.kernel, points=len(self.X), dimension=self.X.shape[1], outputs=self.Y.shape[1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -19,9 +19,10 @@ Executed = Sequence[tuple[Array, Trajectory]]
 """Points of the unit cube ``(d,)`` with the system's trajectories there."""
 
 
-def executions_of(executed: Executed, point: Array) -> list[int]:
-    """Return the numbers of the executions of a point ``(d,)``."""
-    return [number for number, (other, _) in enumerate(executed) if np.array_equal(other, point)]
+def executions_of(executed: Executed, points: Iterable[Array]) -> list[list[int]]:
+    """Return the numbers of the executions of each of some points ``(d,)``."""
+    known = np.array([point for point, _ in executed])
+    return [np.flatnonzero((known.reshape(-1, len(point)) == point).all(axis=1)).tolist() for point in points]
 
 
 class ErrorVectors:

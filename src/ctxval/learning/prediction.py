@@ -225,7 +225,7 @@ class _PredictedDistance:
     def left_out(self, rows: Rows) -> Array:
         """Return the distances predicted at executed points, each from the executions of other points, ``(k,)``."""
         points = np.array([self.executed[k][0] for k in rows.tolist()])
-        without = self.residual.without([executions_of(self.executed, point) for point in points])
+        without = self.residual.without(executions_of(self.executed, points))
         with single_threaded():
             return self._looped(points, lambda rows: without[rows])[0]
 

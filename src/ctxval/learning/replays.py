@@ -65,7 +65,7 @@ def replay_executed(validation: Validation, executed: Executed, wanted: Sequence
         corrected = _corrected(validation, executed)
         if corrected is None:
             return [_replayed(validation, None, point) for point in wanted]
-        without = corrected[1].without([executions_of(executed, point) for point in wanted])
+        without = corrected[1].without(executions_of(executed, wanted))
         rows = np.arange(len(wanted))
         models = [_OneCorrected(corrected[0], without[rows[k : k + 1]]) for k in range(len(wanted))]
         return [_replayed(validation, model, point) for model, point in zip(models, wanted, strict=True)]

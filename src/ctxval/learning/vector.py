@@ -66,7 +66,7 @@ class _ComposedPosterior:
 
     def left_out(self, rows: Rows) -> Array:
         """Return the values composed of vectors that are predicted from all others, ``(len(rows),)``."""
-        return np.asarray(self.compose(self.scale * self.vectors.left_out()[rows]))
+        return np.asarray(self.compose(self.scale * self.vectors.left_out(rows)))
 
 
 def predict_composed(points: Array, vectors: Array, compose: Compose) -> Prediction | None:

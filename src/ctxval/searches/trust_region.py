@@ -11,6 +11,8 @@ known point, unless a value larger than all known ones is predicted there.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -155,9 +157,10 @@ class TrustRegion(SequentialSearch):
     def propose(self, rng: np.random.Generator) -> Array:
         """Return the next point: by the first good prediction or, if there is none, by Bayesian optimisation."""
         prediction, why = self._prediction, "there is no prediction"
+        surrogate_error = functools.cache(self._surrogate_error)  # all predictions are compared with the same one
         while prediction is not None:
             with single_threaded():
-                doubtful = self._why_not(prediction)
+                doubtful = self._why_not(prediction, surrogate_error)
                 point = self._promising(prediction, rng) if doubtful is None else None
             if point is not None:
                 return point
@@ -179,22 +182,26 @@ class TrustRegion(SequentialSearch):
 
     # How good the prediction is
 
-    def _why_not(self, prediction: Prediction) -> str | None:
+    def _why_not(self, prediction: Prediction, surrogate_error: Callable[[], float]) -> str | None:
         """Return why the prediction is not used; None if it is."""
-        known = np.isfinite(self.values)
-        values = self.values[known]
+        values = self.values[np.isfinite(self.values)]
         if not self._settings.compare_with_surrogate or len(values) < self._settings.compared_from:
             return None
         rows = np.arange(len(values))[-self._settings.compared_on :]
         error = log_error(prediction.left_out(rows), values[rows])
-        if error <= self._settings.good_enough:
+        if error <= self._settings.good_enough or error <= surrogate_error():
             return None
-        kept = represented(self.points[known], values)  # it ends with the latest values, which are compared
-        by_surrogate = left_out_by_surrogate(self.points[known][kept], values[kept])[-len(rows) :]
-        surrogate = log_error(by_surrogate, values[rows])
-        if error <= surrogate:
-            return None
-        return f"leaving one out, the prediction errs by {error:.2g} where the surrogate errs by {surrogate:.2g}"
+        return (
+            f"leaving one out, the prediction errs by {error:.2g} where the surrogate errs by {surrogate_error():.2g}"
+        )
+
+    def _surrogate_error(self) -> float:
+        """Return the error of leave-one-out predictions by the surrogate, on the latest values."""
+        known = np.isfinite(self.values)
+        points, values = self.points[known], self.values[known]
+        kept = represented(points, values)  # it ends with the latest values, which are compared
+        latest = slice(-min(len(values), self._settings.compared_on), None)
+        return log_error(left_out_by_surrogate(points[kept], values[kept])[latest], values[latest])
 
     # Where to execute next
 
