@@ -44,6 +44,9 @@ of their seeds, and {campaigns_11} of the campaigns on them; at 1.25 d*, {decide
 `misleading`: the state is not complete, or the dynamics jump, or there is noise. At a threshold above d*, `validated`
 is true of these systems as well; the column says how often it was given. Executions: median and quartiles.
 
+These campaigns are from before `sharpness` and `jump` ([theory](theory.md#what-withdraws-it)), which can only withdraw
+a bound.
+
 ### False verdicts
 
 {false}
@@ -91,8 +94,7 @@ tried on them while it was written; that of models that are rougher than the sys
 
 ### Development systems
 
-The thresholds of the certificate were chosen with seeds 0 to 2 of these systems, so this table is not evidence. These
-campaigns and those of the reporting systems are from before `sharpness` and `jump`, which can only withdraw a bound.
+The thresholds of the certificate were chosen with seeds 0 to 2 of these systems, so results on them are not evidence.
 
 {development}
 """
@@ -145,7 +147,7 @@ def by_dynamics() -> str:
         timed_seeds=TIMED_SEEDS,
         ranks=table_of_ranks(JsonLines(RANKS, RANK_KEY), range(FRESH, FRESH + 1000)),
         paper=_table(_of("paper")),
-        development=_table(_of("development")),
+        development=_table(development) if (development := _of("development")) else "None was run by the present rule.",
     ).rstrip()
 
 
@@ -224,7 +226,7 @@ def _false(results: list[Result]) -> str:
         if one["answer"] == "validated" and one["share"] < 1
     ]  # fmt: skip
     if not rows:
-        return "There are none."
+        return "No verdict is false."
     why = [f"- `{name}`: {EXPLAINED.get(name, 'not explained yet.')}" for name in dict.fromkeys(row[0] for row in rows)]
     header = ["system", "seed", "tau / d*", "executions", "bound / d*", "best / d*", "gap"]
     return "\n".join([table(header, rows), "", *why])
