@@ -114,3 +114,14 @@ def test_a_smooth_model_is_that_of_the_posterior() -> None:
     assert not posterior.without_model
     assert posterior.model is model
     assert posterior.settings == SETTINGS
+
+
+def test_numbers_that_are_too_large_for_a_linear_model_keep_the_model() -> None:
+    known = transitions(system)
+    huge = Transitions(known.x.copy(), known.u, known.x_next.copy())
+    huge.x[:5] *= 1e90
+    huge.x_next[:5] *= 1e90
+    model, sources = rough(system), np.zeros(len(known), dtype=np.intp)
+    with np.errstate(all="ignore"):
+        posterior = learn_posterior(model, huge, sources, np.random.default_rng(1), SETTINGS)
+    assert posterior is None or posterior.model is model

@@ -330,7 +330,9 @@ def learn_posterior(
     if data is None:
         return None
     with single_threaded():
-        smoother = smoother_than(data, chosen.learned_from)
+        smoother = None
+        with contextlib.suppress(InputError, np.linalg.LinAlgError):  # numbers too large for a linear model
+            smoother = smoother_than(data, chosen.learned_from)
         if smoother is not None:
             model, data = smoother
             chosen = chosen.without_model()
