@@ -207,10 +207,23 @@ def test_it_is_withdrawn_if_the_distance_jumps_between_tasks(jumps: dict[str, fl
     assert doubt is not None
     assert what in doubt
     assert "use a smoother model, or an audit" in doubt
-    # Two task parameters are searched densely.
-    assert certify_dynamics(sample(), replace(GOOD, **jumps)).doubt is None
+    # Few task parameters are searched more deeply instead.
+    assert certify_dynamics(sample(), replace(wide, dense=True)).doubt is None
     small = {name: 0.1 * value for name, value in jumps.items()}
     assert certify_dynamics(sample(), replace(GOOD, points=np.zeros((40, 3)), **small)).doubt is None
+
+
+@pytest.mark.parametrize("found", [{"missed": 1.07}, {"disagreement": 0.07}])
+def test_it_is_withdrawn_if_searches_disagree(found: dict[str, float]) -> None:
+    doubt = certify_dynamics(sample(), replace(GOOD, dense=True, **found)).doubt
+    assert doubt is not None
+    assert "largest distances that differ by 7 %" in doubt
+
+
+def test_it_is_raised_by_what_a_deeper_search_finds() -> None:
+    usual, raised = (certify_dynamics(sample(), replace(GOOD, dense=True, missed=one)) for one in (1.0, 1.04))
+    assert raised.doubt is None
+    assert raised.upper_bound == pytest.approx(1.04 * usual.upper_bound)
 
 
 def test_it_says_that_the_system_was_learned_without_its_model() -> None:

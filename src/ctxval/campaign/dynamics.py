@@ -15,7 +15,7 @@ from ctxval._util.describe import rounded
 from ctxval._util.progress import stage
 from ctxval._util.representation import call
 from ctxval.campaign.history import executed_trials
-from ctxval.certificates.dynamics import PREDICTIONS, bound_of, doubt_of
+from ctxval.certificates.dynamics import DENSE, JUMP, PREDICTIONS, SHARP, bound_of, doubt_of
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
     DynamicsEvidence,
@@ -122,10 +122,9 @@ class CampaignDynamics:
         try:
             found = self._evidence(learned, trials, draws)
             best = max((trial.distance or 0.0 for trial in trials), default=0.0)
-            if doubt_of(found, best, bound_of(found, best, confidence)) is None:
-                # Many closed loops, which only matter to a bound that nothing else withdraws.
-                found = replace(found, jump=learned.largest_jump)
-            return found
+            bound = bound_of(found, best, confidence)
+            # Many closed loops, which only matter to a bound that nothing else withdraws.
+            return found if doubt_of(found, best, bound) else _with_jumps(found, learned, bound)
         except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
             return None
 
@@ -223,6 +222,21 @@ class CampaignDynamics:
 
     def __repr__(self) -> str:
         return call(self, self._study)
+
+
+def _with_jumps(found: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:
+    """Return evidence with the largest jump between tasks; if there are jumps, with what deeper searches have found."""
+    few = learned.executed.shape[1] <= DENSE and learned.study.planner.batched
+    found = replace(found, jump=learned.largest_jump, dense=few)
+    if not few or (found.jump <= JUMP * bound and found.sharpness <= SHARP):
+        return found
+    values, points = learned.deeper
+    low, high = values.min(), values.max()
+    found = replace(found, disagreement=float(1 - low / high) if high > 0 else 0.0)
+    if high <= found.highest:
+        return found
+    elites = np.concatenate([points[values.argmax()][None], found.elites])
+    return replace(found, missed=float(high / found.highest), highest=float(high), elites=elites)
 
 
 def _coverage(found: Coverage, names: Sequence[str]) -> StateInputCoverage:

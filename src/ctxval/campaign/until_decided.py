@@ -172,7 +172,8 @@ def next_task(
 
     These come first: a task whose predicted distance exceeds the threshold; the task of the draw that sets the bound,
     while the bound exceeds the threshold; the task that leads farthest from the records, while they leave gaps; and
-    the task with the largest predicted distance, while no similar distance was executed. Further tasks test the
+    the task with the largest predicted distance, while no similar distance was executed or a deeper search has found it.
+    Further tasks test the
     predictions.
 
     Args:
@@ -198,7 +199,7 @@ def next_task(
         candidates = [farthest, highest, largest]
         if untried is not None and untried.gap > GAP:
             candidates = [untried.task[None], *candidates]
-    elif untested(evidence, best, threshold) is not None:
+    elif evidence.missed > 1 or untested(evidence, best, threshold) is not None:
         candidates = [largest, highest, farthest]
     else:
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]

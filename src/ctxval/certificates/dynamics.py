@@ -68,7 +68,10 @@ JUMP = 0.01
 """Largest jump of the predicted distance between nearly equal tasks, as a share of the bound."""
 
 DENSE = 2
-"""Largest number of task parameters in which a search finds the largest distance in spite of jumps."""
+"""Largest number of task parameters in which deeper searches may find the largest distance in spite of jumps."""
+
+AGREE = 0.05
+"""Largest share by which the results of two deeper searches may differ, and by which they may exceed the usual one."""
 
 TESTED = 0.8
 """Least share of the largest distance on the posterior mean that must have been executed: the bound is tested there."""
@@ -200,7 +203,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: flo
 
 
 def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> float:
-    """Return the bound: the order statistic of the maxima, raised by what executions exceeded their predictions.
+    """Return the bound: the order statistic of the maxima, raised by what searches and predictions have missed.
 
     Args:
         evidence: what the learned dynamics say.
@@ -208,7 +211,7 @@ def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> floa
         confidence: the probability with which the bound holds.
     """
     excess = max((one.excess for one in evidence.predictions[-PREDICTIONS:]), default=0.0)
-    return max(evidence.upper(confidence), best) + _RAISE * excess
+    return max(evidence.upper(confidence) * evidence.missed, best) + _RAISE * excess
 
 
 def held(prediction: CheckedPrediction, bound: float) -> bool:
@@ -279,8 +282,8 @@ def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
 
 def _jumps(evidence: DynamicsEvidence, bound: float) -> str | None:
     """Return that the distance is no smooth function of the task, so that a search may miss the largest one."""
-    if evidence.points.shape[1] <= DENSE:
-        return None
+    if evidence.dense:
+        return _disagree(evidence)
     if evidence.sharpness > SHARP:
         what = f"one of the largest predicted distances falls by {100 * evidence.sharpness:.0f} %"
     elif evidence.jump > JUMP * bound:
@@ -291,6 +294,18 @@ def _jumps(evidence: DynamicsEvidence, bound: float) -> str | None:
         f"{what} if a task changes by a thousandth of its ranges, so a search may miss the largest distance: the "
         "controllers change abruptly from task to task, as those of a model with kinks do, or the closed loop does; "
         "use a smoother model, or an audit"
+    )
+
+
+def _disagree(evidence: DynamicsEvidence) -> str | None:
+    """Return that deeper searches find different distances; None if they agree."""
+    share = max(evidence.missed - 1, evidence.disagreement)
+    if share <= AGREE:
+        return None
+    return (
+        f"searches of the learned dynamics find largest distances that differ by {100 * share:.0f} %, because the "
+        "controllers or the closed loop change abruptly from task to task; an execution of the task of the largest one "
+        "helps (--until-decided executes it), or use a smoother model, or an audit"
     )
 
 
@@ -414,6 +429,8 @@ def _details(sample: Sample, evidence: DynamicsEvidence, bound: float, error: fl
         "without_model": evidence.without_model,
         "sharpness": evidence.sharpness,
         "jump": evidence.jump,
+        "missed": evidence.missed,
+        "disagreement": evidence.disagreement,
         "variance_left_out": evidence.left_out,
         "failures": sample.failures,
     }

@@ -140,6 +140,9 @@ class DynamicsEvidence:
         sharpness: largest share by which a large distance on the mean exceeds those of tasks that are nearly the same.
         jump: largest jump of the distance on the mean between tasks that are nearly the same, at random tasks; 0 if it
             was not computed, because the bound is withdrawn anyway.
+        dense: whether there are so few task parameters that deeper searches can find what lies between jumps.
+        missed: factor by which the largest distance on the mean is larger in two deeper searches; at least 1.
+        disagreement: share by which the smaller result of these searches is below the larger one.
     """
 
     maxima: Array
@@ -158,6 +161,9 @@ class DynamicsEvidence:
     without_model: bool = False
     sharpness: float = 0.0
     jump: float = 0.0
+    dense: bool = False
+    missed: float = 1.0
+    disagreement: float = 0.0
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""

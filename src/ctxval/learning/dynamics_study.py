@@ -137,6 +137,11 @@ class LearnedDynamics:
         """The largest jump of the distance on the posterior mean between nearly equal tasks."""
         return self.study.search.largest_jump(self.posterior)
 
+    @functools.cached_property
+    def deeper(self) -> tuple[Array, Array]:
+        """The largest distances on the posterior mean ``(2,)`` in two deeper searches, and their points ``(2, d)``."""
+        return self.study.search.deeper(self.posterior, self._rng(3))
+
     @property
     def untried_parameter(self) -> tuple[int, float, Array] | None:
         """A parameter that M's loops do not depend on, its largest gap between executions, and a task in the gap.

@@ -37,6 +37,8 @@ _SAME = 0.02
 """Least distance of two of them, as a share of the cube's diagonal."""
 _NEARBY = 1e-3
 """Largest change of each coordinate to a task that is nearly the same."""
+_DEEPER = 4
+"""Factor of the number of tasks in a deeper search."""
 _APART = 0.15
 """Least distance of two tasks that are not next to each other, as a share of the cube's diagonal."""
 
@@ -76,7 +78,7 @@ class WorstCaseSettings:
             batched: whether controllers are designed in batches; if not, there are far fewer tasks.
         """
         if not batched:
-            return cls(pool=48, evaluations=240, elites=6, shared=12, moves=2, rounds=0, peaks=1, nearby=8)
+            return cls(pool=64, evaluations=256, elites=6, shared=12, moves=2, rounds=0, peaks=1, nearby=8)
         evaluations = _EVALUATIONS[min(dimension, len(_EVALUATIONS)) - 1]
         return cls(pool=min(1024, evaluations // 4), evaluations=evaluations)
 
@@ -170,6 +172,24 @@ class WorstCaseSearch:
         first, middle, last = found.reshape(tasks.shape[:2]).T
         jumps = np.abs(middle - 0.5 * (first + last))
         return float(jumps[np.isfinite(jumps)].max(initial=0.0))
+
+    def deeper(self, posterior: DynamicsPosterior, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Return the largest distances on the mean ``(2,)`` in two separate searches, and their points ``(2, d)``.
+
+        Each of them has four times as many tasks as the usual one, and none of its tasks.
+
+        Args:
+            posterior: the posterior of the dynamics.
+            rng: the source of all random numbers.
+        """
+
+        def distance(points: Array) -> Array:
+            return np.asarray(_finite(self.planner.distances(mean, self.planner.plan(points), len(points)))[0])
+
+        mean, evaluations, none = posterior.mean, _DEEPER * self.settings.evaluations, np.empty((0, self.dimension))
+        with single_threaded():
+            found = [search_globally(distance, self.dimension, none, rng, evaluations=evaluations) for _ in range(2)]
+        return np.array([one.values[0] for one in found]), np.array([one.points[0] for one in found])
 
     @functools.cached_property
     def _unplanned(self) -> float:
