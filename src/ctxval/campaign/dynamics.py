@@ -147,6 +147,7 @@ class CampaignDynamics:
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
             without_model=learned.posterior.without_model,
             sharpness=worst.sharpness,
+            dense=worst.points.shape[1] <= DENSE and self._study.planner.batched,
         )
 
     def _coordinates(self, learned: LearnedDynamics) -> tuple[str, ...]:
@@ -226,9 +227,8 @@ class CampaignDynamics:
 
 def _with_jumps(found: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:
     """Return evidence with the largest jump between tasks; if there are jumps, with what deeper searches have found."""
-    few = learned.executed.shape[1] <= DENSE and learned.study.planner.batched
-    found = replace(found, jump=learned.largest_jump, dense=few)
-    if not few or (found.jump <= JUMP * bound and found.sharpness <= SHARP):
+    found = replace(found, jump=learned.largest_jump)
+    if not found.dense or (found.jump <= JUMP * bound and found.sharpness <= SHARP):
         return found
     values, points = learned.deeper
     low, high = values.min(), values.max()

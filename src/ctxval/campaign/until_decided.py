@@ -172,9 +172,8 @@ def next_task(
 
     These come first: a task whose predicted distance exceeds the threshold; the task of the draw that sets the bound,
     while the bound exceeds the threshold; the task that leads farthest from the records, while they leave gaps; and
-    the task with the largest predicted distance, while no similar distance was executed or a deeper search has found it.
-    Further tasks test the
-    predictions.
+    the task with the largest predicted distance, while no similar distance was executed or a deeper search found it.
+    Further tasks test the predictions.
 
     Args:
         evidence: what the learned dynamics say.
