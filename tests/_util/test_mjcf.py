@@ -59,13 +59,19 @@ def test_a_file_that_the_text_names_is_part_of_the_model(tmp_path: Path) -> None
     assert "compiled.body_inertia" in str(first_difference(first, identity(path)))
 
 
+def identities_including(folder: Path, *contents: str) -> list[Any]:
+    """Return the identities of one model with each of some contents of a file that it includes."""
+    path, included, found = folder / "model.xml", folder / "included.xml", []
+    path.write_text(MJCF.replace("<worldbody>", '<include file="included.xml"/><worldbody>'))
+    for content in contents:
+        included.write_text(f"<mujoco>{content}</mujoco>")
+        found.append(identity(path))
+    return found
+
+
 def test_an_included_file_is_part_of_the_model(tmp_path: Path) -> None:
-    path, included = tmp_path / "model.xml", tmp_path / "options.xml"
-    path.write_text(MJCF.replace("<worldbody>", '<include file="options.xml"/><worldbody>'))
-    included.write_text('<mujoco><option gravity="0 0 -9.81"/></mujoco>')
-    first = identity(path)
-    included.write_text('<mujoco><option gravity="0 0 -1.62"/></mujoco>')
-    assert "compiled.gravity" in str(first_difference(first, identity(path)))
+    earth, moon = ('<option gravity="0 0 -9.81"/>', '<option gravity="0 0 -1.62"/>')
+    assert "compiled.gravity" in str(first_difference(*identities_including(tmp_path, earth, moon)))
 
 
 def test_the_identity_is_the_same_in_another_process(tmp_path: Path) -> None:
@@ -81,9 +87,5 @@ def test_the_identity_is_the_same_in_another_process(tmp_path: Path) -> None:
 
 
 def test_drawings_are_not_part_of_the_dynamics(tmp_path: Path) -> None:
-    path, included = tmp_path / "model.xml", tmp_path / "look.xml"
-    path.write_text(MJCF.replace("<worldbody>", '<include file="look.xml"/><worldbody>'))
-    included.write_text('<mujoco><default><geom rgba="1 0 0 1"/></default></mujoco>')
-    first = identity(path)
-    included.write_text('<mujoco><default><geom rgba="0 1 0 1"/></default></mujoco>')
-    assert first_difference(first, identity(path)) is None
+    red, green = (f'<default><geom rgba="{colour} 0 1"/></default>' for colour in ("1 0", "0 1"))
+    assert first_difference(*identities_including(tmp_path, red, green)) is None

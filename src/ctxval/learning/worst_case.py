@@ -182,11 +182,8 @@ class WorstCaseSearch:
             posterior: the posterior of the dynamics.
             rng: the source of all random numbers.
         """
-
-        def distance(points: Array) -> Array:
-            return np.asarray(_finite(self.planner.distances(mean, self.planner.plan(points), len(points)))[0])
-
-        mean, evaluations, none = posterior.mean, _DEEPER * self.settings.evaluations, np.empty((0, self.dimension))
+        distance, none = functools.partial(self._distances, posterior.mean), np.empty((0, self.dimension))
+        evaluations = _DEEPER * self.settings.evaluations
         with single_threaded():
             found = [search_globally(distance, self.dimension, none, rng, evaluations=evaluations) for _ in range(2)]
         return np.array([one.values[0] for one in found]), np.array([one.points[0] for one in found])
@@ -228,16 +225,16 @@ class WorstCaseSearch:
         """Return the largest distance on the posterior mean, tasks with large distances, and the number of loops."""
         of_pool = _finite(self.planner.distances(mean, self.plans, len(self.pool)))[0]
         best = self.pool[np.argsort(-of_pool, kind="stable")[: self.settings.elites * 4]]
-
-        def distance(points: Array) -> Array:
-            planned = self.planner.plan(points)
-            return np.asarray(_finite(self.planner.distances(mean, planned, len(points)))[0])
-
         evaluations = max(len(best) + len(known) + 50, self.settings.evaluations - len(self.pool))
         starts = np.concatenate([known, best])
+        distance = functools.partial(self._distances, mean)
         found = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
         elites = np.concatenate([found.points[:1], found.elites[: self.settings.elites]])
         return float(found.values[0]), elites, len(self.pool) + found.evaluations
+
+    def _distances(self, mean: DynamicsDraws, points: Array) -> Array:
+        """Return the distances ``(m,)`` on one draw, such as the posterior mean, as a search takes them."""
+        return np.asarray(_finite(self.planner.distances(mean, self.planner.plan(points), len(points)))[0])
 
     def _sharpness(self, mean: DynamicsDraws, elites: Array, rng: np.random.Generator) -> float:
         """Return the largest share that the distance of an elite loses at the median of the tasks next to it.
@@ -247,8 +244,7 @@ class WorstCaseSearch:
         peaks = elites[: self.settings.peaks]
         moves = rng.uniform(-_NEARBY, _NEARBY, (len(peaks), self.settings.nearby, self.dimension))
         tasks = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
-        planned = self.planner.plan(tasks.reshape(-1, self.dimension))
-        found = _finite(self.planner.distances(mean, planned, tasks.shape[0] * tasks.shape[1]))
+        found = self._distances(mean, tasks.reshape(-1, self.dimension))
         distances = np.maximum(found.reshape(tasks.shape[:2]), 0.0)
         peak, next_to_it = distances[:, 0], np.median(distances[:, 1:], axis=1)
         lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
