@@ -225,6 +225,51 @@ def test_a_timeout_alone_is_one_worker(tmp_path: Path) -> None:
     assert [trial.state for trial in campaign.trials] == ["failed", "completed", "completed"]
 
 
+SIGNALLED_AT_ITS_END = """
+import os, signal
+from multiprocessing.util import Finalize
+from pathlib import Path
+from conftest import make_validation
+from ctxval import Campaign
+
+pid = os.getpid
+
+def pid_after_a_signal():
+    os.kill(pid(), signal.SIGTERM)
+    return pid()
+
+def signal_at_the_end():
+    Path(f"ended-{pid()}").touch()
+    os.getpid = pid_after_a_signal
+
+class System:
+    def execute(self, controller, task):
+        Finalize(None, signal_at_the_end, exitpriority=0)
+        raise RuntimeError
+
+try:
+    Campaign(make_validation(system=System())).run(2, workers=2)
+finally:
+    print("campaign left", flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_signalled_while_it_ends_does_not_go_on_as_the_campaign(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SIGNALLED_AT_ITS_END],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path])},
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "campaign left\n"
+    assert len(list(tmp_path.glob("ended-*"))) == 2
+
+
 def test_a_model_that_fails_stops_the_campaign_after_what_is_running(tmp_path: Path) -> None:
     class Late:
         calls = 0

@@ -92,6 +92,14 @@ def _function_of(handler: object) -> FunctionType | None:
     return function if isinstance(function, FunctionType) else None
 
 
+_leave = os._exit
+
+
+def allow_exits() -> None:
+    """Let ``os._exit`` end this process again, although it may be inside `exits_as_exceptions`."""
+    os._exit = _leave
+
+
 @contextmanager
 def exits_as_exceptions() -> Iterator[None]:
     """Turn ``os._exit`` of this process into an exception; forked processes may exit.

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.connection import wait as wait_for
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
 from ctxval._util.cores import can_fork, forking
-from ctxval._util.interrupts import exits_as_exceptions, raised_by_signal
+from ctxval._util.interrupts import allow_exits, exits_as_exceptions, raised_by_signal
 from ctxval._util.progress import mute
 from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller
@@ -203,6 +203,9 @@ class ProcessPool(WorkerPool):
     def _stop(self, worker: _Worker) -> None:
         """End a worker, with some time to clean up, because it must end the process of a command too."""
         worker.process.terminate()
+        self._await_end(worker)
+
+    def _await_end(self, worker: _Worker) -> None:
         worker.process.join(_GRACE_PERIOD)
         if worker.process.is_alive():
             worker.process.kill()
@@ -215,7 +218,7 @@ class ProcessPool(WorkerPool):
         for worker in self._workers:
             worker.process.terminate()
         for worker in list(self._workers):
-            self._stop(worker)
+            self._await_end(worker)
 
 
 def _run_worker(system: System, pipe: Connection, others: list[Connection], parent: int) -> None:
@@ -223,6 +226,7 @@ def _run_worker(system: System, pipe: Connection, others: list[Connection], pare
     # Ctrl-C reaches every process of a terminal, but the campaign decides which executions end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _exit_on_signal)
+    allow_exits()
     for other in others:
         other.close()
     mute()  # a forked worker would draw over the progress of the campaign, and may wait for its lock for ever
@@ -249,7 +253,16 @@ def _result_of_exit(status: int | None) -> ExecutionResult:
     return ExecutionResult(failure=f"the system ended its process with status {status}")
 
 
-def _exit_on_signal(_signal: int, _frame: FrameType | None) -> NoReturn:
+_leaving = False
+
+
+def _exit_on_signal(_signal: int, _frame: FrameType | None) -> None:
+    """Leave once. An exception while a forked process ends would let it go on where it was forked, as the campaign."""
+    global _leaving
+    if _leaving:
+        return
+    _leaving = True
+    allow_exits()
     raise SystemExit(_TERMINATED)
 
 
