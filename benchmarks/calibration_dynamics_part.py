@@ -10,7 +10,7 @@ import numpy as np
 from calibrate_dynamics import BUDGETS, FALSE, FEW, GROUPS, STORED, TRUE, rule_of, wanted
 from calibration_verdicts_part import false_of, table
 from ctxval._util.json_lines import JsonLines
-from ctxval.certificates import dynamics as rule
+from ctxval.certificates import dynamics_diagnostics as rule
 from study_posterior_ranks import FRESH
 from study_posterior_ranks import KEY as RANK_KEY
 from study_posterior_ranks import STORED as RANKS

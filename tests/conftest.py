@@ -28,6 +28,8 @@ from ctxval.certificates import (
     StateInputGap,
     draw_maxima,
 )
+from ctxval.core.controller import Controller
+from ctxval.core.model import Model
 
 # A shell starts what is in the background deaf to Ctrl-C, and tests may run there.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -69,6 +71,29 @@ def make_validation(
         model=model or models.Linear.fit(pendulum.record(rod, settings_, seed=1)),
         synthesizer=controllers.LQR([1.0, 0.1], [1e-2], [10.0, 1.0]),
         distance=distance or distances.FinalState(norm=1),
+    )
+
+
+@dataclass(frozen=True)
+class NoInput:
+    """Designs the controllers of systems without inputs."""
+
+    batched: bool = True
+
+    def design(self, task: Task, model: Model) -> Controller:
+        return lambda t, x: np.empty((*np.shape(x)[:-1], 0))
+
+
+def make_validation_without_inputs(batched: bool = True) -> Validation:
+    """Return a validation of an autonomous linear system against a linear model, whose tasks are initial states."""
+    A, M = np.array([[0.97, 0.1], [-0.12, 0.9]]), np.array([[0.95, 0.1], [-0.1, 0.9]])
+    return Validation(
+        space=TaskSpace(a=(0.0, 1.0), b=(0.5, 1.0)),
+        task=lambda p: Task(np.stack([p.a, p.b], axis=-1), goal=[0.0, 0.0], horizon=20, dt=0.1),
+        system=systems.Simulated(lambda x, u: x @ A.T, vectorized=True),
+        model=lambda x, u: x @ M.T,
+        synthesizer=NoInput(batched),
+        distance=distances.MaximumDeviation(),
     )
 
 

@@ -13,6 +13,7 @@ from ctxval._util.arrays import (
     as_norm_order,
     as_weight,
     require_shape,
+    rows_of,
     single_threaded,
     vector_norm,
 )
@@ -60,7 +61,7 @@ def test_a_weight_is_a_diagonal_or_a_matrix() -> None:
 
 @pytest.mark.parametrize("value", [1.0, [], [[1, 2]], np.zeros((2, 2, 2))])
 def test_a_weight_of_another_shape_is_refused(value: object) -> None:
-    with pytest.raises(ShapeError, match=r"Q must be a diagonal or a square matrix, got shape"):
+    with pytest.raises(ShapeError, match=r"Q must be a diagonal or a square matrix, not empty, got shape"):
         as_weight("Q", value)
 
 
@@ -101,6 +102,14 @@ def test_another_norm_is_refused_by_value(value: object) -> None:
 @pytest.mark.parametrize("value", [1, 2, np.inf])
 def test_the_three_norms_are_taken(value: float) -> None:
     assert as_norm_order(value) == value
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3), (0,)])
+def test_rows_may_have_no_columns(shape: tuple[int, ...]) -> None:
+    count = int(np.prod(shape))
+    rows = np.arange(2.0 * count).reshape(count, 2)
+    np.testing.assert_array_equal(rows_of(rows.reshape(*shape, 2)), rows)
+    assert rows_of(np.empty((*shape, 0))).shape == (count, 0)
 
 
 def test_algebra_is_bound_to_one_thread_and_released_again() -> None:

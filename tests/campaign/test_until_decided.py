@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import interrupt_at_once, make_validation
+from conftest import interrupt_at_once, make_validation, make_validation_without_inputs
 from ctxval import Campaign, cases
 from ctxval.campaign.dynamics import AUDIT, PREDICTION
 from ctxval.campaign.until_decided import next_task
@@ -24,7 +24,7 @@ from ctxval.certificates import (
     StateInputGap,
     UntriedParameter,
 )
-from ctxval.certificates.dynamics import AUDITED
+from ctxval.certificates.dynamics_diagnostics import AUDITED
 from ctxval.errors import InputError
 
 
@@ -56,6 +56,19 @@ def test_a_threshold_below_the_maximum_is_falsified() -> None:
     campaign = Campaign(validation).run_until_decided(0.95 * largest, 12)
     assert campaign.verdict(0.95 * largest).answer == "falsified"
     assert campaign.executions <= 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("batched", [True, False])
+def test_a_system_without_inputs_is_validated(batched: bool) -> None:
+    validation = make_validation_without_inputs(batched)
+    campaign = Campaign(validation)
+    verdict = campaign.run_until_decided(1.0, 6).verdict(1.0)
+    assert verdict.answer == "validated"
+    assert verdict.certificate is not None
+    assert verdict.certificate.kind == "dynamics"
+    corners = validation.distances(np.array([[0.0, 0.5], [0.0, 1.0], [1.0, 0.5], [1.0, 1.0]]))
+    assert verdict.certificate.upper_bound == pytest.approx(corners.max(), rel=0.01)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
-from conftest import make_validation
+from conftest import make_validation, make_validation_without_inputs
 from ctxval import Experiment, Store, Task, TaskSpace, Trajectory, distances, systems
 from ctxval.cli import app
 from ctxval.config.check import check_experiment
@@ -321,6 +321,13 @@ def test_a_model_whose_batches_differ_is_found() -> None:
 
     state, text = findings(make_validation(model=Sloppy()))["model"]
     assert (state, "differs from the steps one by one" in text) == ("failed", True)
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_a_system_without_inputs_has_none_to_name(batched: bool) -> None:
+    found = check_experiment(Experiment("x", make_validation_without_inputs(batched)), execute=True)
+    assert ("names", "ok", "inputs: none") in [(one.check, one.state, one.text) for one in found]
+    assert not [one for one in found if one.state == "failed"]
 
 
 def test_dimensions_names_and_units_are_held_against_each_other() -> None:

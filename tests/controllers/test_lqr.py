@@ -158,3 +158,13 @@ def test_weights_of_other_inputs_than_the_model_has_are_refused() -> None:
     for synthesizer in (LQR([1, 1], [1, 2]), StationaryLQR([1, 1], [1, 2])):
         with pytest.raises(InputError, match="R must weigh the model's 1 inputs, got a weight of 2"):
             synthesizer.design(task, model)
+
+
+def test_a_model_without_inputs_needs_another_synthesizer() -> None:
+    task = Task([1.0, 0.0], goal=[0.0, 0.0], horizon=3, dt=0.1)
+    model = Linear([[1.0, 0.1], [0.0, 1.0]], np.zeros((2, 0)))
+    for synthesizer in (LQR([1, 1], [1]), StationaryLQR([1, 1], [1])):
+        with pytest.raises(InputError, match=r"the model has 0 inputs; use a synthesizer of your own"):
+            synthesizer.design(task, model)
+    with pytest.raises(ShapeError, match=r"R must be a diagonal or a square matrix, not empty, got shape \(0,\)"):
+        LQR([1, 1], [])

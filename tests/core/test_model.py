@@ -35,6 +35,12 @@ def test_a_plain_function_is_looped_over_a_batch(shape: tuple[int, ...]) -> None
     np.testing.assert_array_equal(Function(bend, vectorized=True).step(x, u), bend(x, u))
 
 
+@pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3)])
+def test_a_plain_function_may_have_no_input(shape: tuple[int, ...]) -> None:
+    x = batch(shape)[0]
+    np.testing.assert_array_equal(Function(lambda x, u: 2 * x).step(x, x[..., :0]), 2 * x)
+
+
 def test_one_input_serves_a_batch_of_states() -> None:
     x, u = batch((4,))
     expected = bend(x, np.broadcast_to(u[0], (4, 1)))

@@ -141,3 +141,15 @@ def test_executions_teach_the_residual_of_the_model_before() -> None:
 def test_arrays_that_do_not_fit_are_refused(change: dict[str, np.ndarray], error: type[Exception]) -> None:
     with pytest.raises(error):
         replace(correction(), **change)
+
+
+def test_a_correction_may_be_of_states_alone_and_has_at_least_one() -> None:
+    alone, first = correction(), np.arange(2)
+    of_pairs = ("shift", "scale", "centres", "length_scales", "low", "high", "fade")
+    parts = {name: getattr(alone, name)[..., first] for name in of_pairs}
+    found = replace(alone, **parts, linear=alone.linear[[0, 1, 3]])
+    x = pairs()[0]
+    assert found(x, np.empty((len(x), 0))).shape == x.shape
+    assert found.jacobian(x, np.empty((len(x), 0))).shape == (*x.shape, 2)
+    with pytest.raises(ShapeError, match="a correction of pairs of 3 states and inputs has 1 to 3 states, got 4"):
+        replace(alone, limit=np.ones(4))

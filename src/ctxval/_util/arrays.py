@@ -6,6 +6,7 @@ Small dense algebra is slower on many BLAS threads, and its last bits depend on 
 from __future__ import annotations
 
 import functools
+import math
 import reprlib
 from contextlib import AbstractContextManager
 from typing import Any
@@ -120,13 +121,18 @@ def as_weight(name: str, value: ArrayLike) -> Array:
     if array.ndim == 1:
         array = np.diag(array)
     if array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
-        raise ShapeError(f"{name} must be a diagonal or a square matrix, got shape {array.shape}.")
+        raise ShapeError(f"{name} must be a diagonal or a square matrix, not empty, got shape {np.shape(value)}.")
     scale = max(1.0, float(np.abs(array).max(initial=0.0)))
     if not np.allclose(array, array.T, rtol=0, atol=1e-10 * scale):
         raise InputError(f"{name} must be symmetric, got {array.tolist()}.")
     if np.linalg.eigvalsh(array).min() < -1e-10 * scale:
         raise InputError(f"{name} must have no negative eigenvalue, got {array.tolist()}.")
     return array
+
+
+def rows_of(array: Array) -> Array:
+    """Return the vectors ``(..., k)`` of an array as rows ``(N, k)``; k may be 0, as a system may have no inputs."""
+    return array.reshape(math.prod(array.shape[:-1]), array.shape[-1])
 
 
 def vector_norm(vectors: Array, order: float) -> Array:

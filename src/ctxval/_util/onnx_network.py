@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, rows_of
 from ctxval._util.files import read_bytes
 from ctxval._util.representation import call
 from ctxval.errors import InputError, ModelError, ShapeError
@@ -76,7 +76,7 @@ class OnnxNetwork:
             if width not in (None, array.shape[-1]):
                 raise ShapeError(f"the network's input {name!r} takes {width} numbers, got {array.shape[-1]}.")
         batch = np.broadcast_shapes(*(array.shape[:-1] for array in inputs))
-        rows = [np.broadcast_to(array, (*batch, array.shape[-1])).reshape(-1, array.shape[-1]) for array in inputs]
+        rows = [rows_of(np.broadcast_to(array, (*batch, array.shape[-1]))) for array in inputs]
         count = len(rows[0])
         if not self._looped:
             output = self._run(rows)

@@ -15,7 +15,8 @@ from ctxval._util.describe import rounded
 from ctxval._util.progress import stage
 from ctxval._util.representation import call
 from ctxval.campaign.history import executed_trials
-from ctxval.certificates.dynamics import DENSE, JUMP, PREDICTIONS, SHARP, bound_of, doubt_of
+from ctxval.certificates.dynamics import bound_of
+from ctxval.certificates.dynamics_diagnostics import DENSE, PREDICTIONS, doubt_of, jumps
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
     DynamicsEvidence,
@@ -228,7 +229,7 @@ class CampaignDynamics:
 def _with_jumps(found: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:
     """Return evidence with the largest jump between tasks; if there are jumps, with what deeper searches have found."""
     found = replace(found, jump=learned.largest_jump)
-    if not found.dense or (found.jump <= JUMP * bound and found.sharpness <= SHARP):
+    if not found.dense or not jumps(found, bound):
         return found
     values, points = learned.deeper
     low, high = values.min(), values.max()

@@ -21,7 +21,8 @@ from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, St
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.covering import RESOLUTION
-from ctxval.certificates.dynamics import AUDITED, FEWEST, GAP, Dynamics, certify_dynamics, held, uncovered, untested
+from ctxval.certificates.dynamics import Dynamics, certify_dynamics
+from ctxval.certificates.dynamics_diagnostics import AUDITED, FEWEST, held, uncovered, untested, untried_parameter
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.verdict import counterexample, require_threshold
 from ctxval.core.trial import Trial
@@ -193,11 +194,10 @@ def next_task(
         candidates = [largest, highest, farthest]
     elif exceeds:
         candidates = [highest, farthest]
-    elif uncovered(evidence) is not None:
-        untried = evidence.untried
+    elif uncovered(evidence, best, threshold) is not None:
         candidates = [farthest, highest, largest]
-        if untried is not None and untried.gap > GAP:
-            candidates = [untried.task[None], *candidates]
+        if evidence.untried is not None and untried_parameter(evidence, best, threshold) is not None:
+            candidates = [evidence.untried.task[None], *candidates]
     elif evidence.missed > 1 or untested(evidence, best, threshold) is not None:
         candidates = [largest, highest, farthest]
     else:

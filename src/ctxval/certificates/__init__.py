@@ -16,7 +16,6 @@ from ctxval.certificates.covering import (
     most_contested,
     require_resolution,
 )
-from ctxval.certificates.diagnostics import Diagnosis, diagnose
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
@@ -31,6 +30,7 @@ from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.mean import Mean, certify_mean
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.posterior import Posterior, certify_posterior, instantaneous_bound
+from ctxval.certificates.posterior_diagnostics import Diagnosis, diagnose
 from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.region import Region, certify_region
 from ctxval.certificates.registry import KINDS, Options, certify, require_possible, require_use

@@ -8,7 +8,8 @@ from typing import ClassVar
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION
-from ctxval.certificates.dynamics import FEWEST, Dynamics
+from ctxval.certificates.dynamics import Dynamics
+from ctxval.certificates.dynamics_diagnostics import FEWEST
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.sample import Sample

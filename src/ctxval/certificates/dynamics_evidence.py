@@ -182,3 +182,9 @@ class DynamicsEvidence:
 
     def __repr__(self) -> str:
         return call(self, draws=len(self.maxima), executions=self.executions, evaluations=self.evaluations)
+
+
+def with_units(values: dict[str, float]) -> str:
+    """Return numbers with their names; the unit of a label ``name [unit]`` follows its number."""
+    parts = ((*name.partition(" [")[::2], value) for name, value in values.items())
+    return ", ".join(f"{name} {value:.2g} {unit.removesuffix(']')}".rstrip() for name, unit, value in parts)

@@ -4,7 +4,7 @@ The bound is an order statistic of draws of d*. Under the prior, S independent d
 the truth is at most the k-th smallest draw with probability ``k / (S + 1)``. Here groups of draws share
 hyperparameters, so this holds approximately. Bayes' rule does not depend on why a task was chosen or why the campaign
 stopped, so the bound holds after adaptive sampling. It rests on the prior;
-:mod:`ctxval.certificates.diagnostics` finds trials that contradict it.
+:mod:`ctxval.certificates.posterior_diagnostics` finds trials that contradict it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
 from ctxval.certificates.bounds import require_probability, with_error
 from ctxval.certificates.covering import RESOLUTION, require_resolution, resolved_volume
-from ctxval.certificates.diagnostics import diagnose
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
+from ctxval.certificates.posterior_diagnostics import diagnose
 from ctxval.certificates.sample import Sample
 from ctxval.core.space import TaskSpace
 from ctxval.errors import InputError

@@ -25,7 +25,7 @@ from ctxval.campaign.until_decided import UntilDecided
 from ctxval.certificates import CertificateOptions
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.bounds import ERRORS
-from ctxval.certificates.dynamics import TESTED
+from ctxval.certificates.dynamics_diagnostics import TESTED
 from ctxval.comparison.candidates import Candidate, TrialNote
 from ctxval.comparison.executions import Executions
 from ctxval.comparison.predictions import Predictions

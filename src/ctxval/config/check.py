@@ -177,7 +177,7 @@ def _names(experiment: Experiment, plan: Plan) -> Iterator[Checked]:
             yield Checked("names", "failed", sentence)
     for kind, named in zip(("states", "inputs"), experiment.names(*counts), strict=True):
         bare = [name for name, unit in named.items() if not unit]
-        text = ", ".join(labels_of(named))
+        text = ", ".join(labels_of(named)) or "none"
         missing = f"; no unit for {', '.join(bare)}" if bare else ""
         yield Checked("names", "noted" if bare else "ok", f"{kind}: {text}{missing}")
     if experiment.mixed_units:

@@ -123,6 +123,11 @@ class StationaryLQR:
 
 
 def _require_inputs(cost: QuadraticCost, B: Array) -> None:
+    if not B.shape[-1]:
+        raise InputError(
+            "LQR designs inputs, and the model has 0 inputs; use a synthesizer of your own, whose controllers return "
+            "inputs of shape (..., 0)."
+        )
     if B.shape[-1] != len(cost.R):
         raise InputError(f"R must weigh the model's {B.shape[-1]} inputs, got a weight of {len(cost.R)} inputs.")
 

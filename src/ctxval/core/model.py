@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, rows_of
 from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.errors import InputError, ModelError
@@ -54,8 +54,8 @@ class Function:
         if self.vectorized or x.ndim == 1:
             return np.asarray(self.function(x, u), dtype=np.float64)
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        states = np.broadcast_to(x, (*batch, x.shape[-1])).reshape(-1, x.shape[-1])
-        inputs = np.broadcast_to(u, (*batch, u.shape[-1])).reshape(-1, u.shape[-1])
+        states = rows_of(np.broadcast_to(x, (*batch, x.shape[-1])))
+        inputs = rows_of(np.broadcast_to(u, (*batch, u.shape[-1])))
         rows = [np.asarray(self.function(xi, ui), dtype=np.float64) for xi, ui in zip(states, inputs, strict=True)]
         return np.stack(rows).reshape(*batch, -1)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, as_floats
+from ctxval._util.arrays import Array, Mask, as_floats, rows_of
 from ctxval._util.files import MOST_BYTES, read_bytes
 from ctxval._util.npz import Archive
 from ctxval._util.representation import Shown, call, counted, number
@@ -126,10 +126,7 @@ class Trajectory:
 
     def transitions(self) -> Transitions:
         """Return all steps of all tasks of the batch as one set of transitions."""
-        n, m = self.states.shape[-1], self.inputs.shape[-1]
-        count = int(np.prod(self.inputs.shape[:-1]))  # a system may have no input
-        before, after = self.states[..., :-1, :].reshape(-1, n), self.states[..., 1:, :].reshape(-1, n)
-        return Transitions(before, self.inputs.reshape(count, m), after)
+        return Transitions(rows_of(self.states[..., :-1, :]), rows_of(self.inputs), rows_of(self.states[..., 1:, :]))
 
     # Files
 

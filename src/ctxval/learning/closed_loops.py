@@ -230,7 +230,7 @@ class _OwnStep:
         whole = [np.zeros((len(self._needed) * self.tasks, part.shape[-1])) for part in (x, u)]
         for all_rows, part in zip(whole, (x, u), strict=True):
             all_rows[self.rows - first] = part
-        states, inputs = (part.reshape(len(self._needed), self.tasks, -1) for part in whole)
+        states, inputs = (part.reshape(len(self._needed), self.tasks, part.shape[-1]) for part in whole)
         return np.asarray(self._needed.step(states, inputs).reshape(-1, x.shape[-1])[self.rows - first])
 
     @property

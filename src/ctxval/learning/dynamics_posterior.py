@@ -14,7 +14,7 @@ from itertools import groupby
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.arrays import Array, Rows, rows_of, single_threaded
 from ctxval._util.representation import call
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
@@ -299,8 +299,7 @@ class DrawnModel:
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
-        states, inputs = x.reshape(1, -1, x.shape[-1]), u.reshape(1, -1, u.shape[-1])
-        return np.asarray(self._draws.step(states, inputs).reshape(x.shape))
+        return np.asarray(self._draws.step(rows_of(x)[None], rows_of(u)[None]).reshape(x.shape))
 
     def __repr__(self) -> str:
         return call(self, self._draws.model)

@@ -54,13 +54,15 @@ class Correction:
     def __post_init__(self) -> None:
         n, k = len(self.limit), len(self.shift)
         M = len(self.centres)
+        if not 0 < n <= k:
+            raise ShapeError(f"a correction of pairs of {k} states and inputs has 1 to {k} states, got {n}.")
         wanted = {
             **dict.fromkeys(("shift", "scale", "length_scales", "low", "high", "fade"), (k,)),
             **{"centres": (M, k), "weights": (M, n), "linear": (k + 1, n), "limit": (n,)},
         }
         for name, shape in wanted.items():
             value = getattr(self, name)
-            if value.shape != shape or not 0 < n < k:
+            if value.shape != shape:
                 raise ShapeError(f"{name} of a correction must have shape {shape}, got {value.shape}.")
             if not np.isfinite(value).all():
                 raise InputError(f"{name} of a correction must be finite.")

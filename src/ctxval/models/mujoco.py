@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, rows_of
 from ctxval._util.extras import require_extra
 from ctxval._util.mjcf import compile_mjcf, identity_of_mjcf, is_mjcf_text
 from ctxval._util.registry import part
@@ -68,8 +68,8 @@ class MuJoCo:
                 f"got {x.shape[-1]} states and {u.shape[-1]} inputs."
             )
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        states = np.broadcast_to(x, (*batch, x.shape[-1])).reshape(-1, x.shape[-1])
-        inputs = np.broadcast_to(u, (*batch, u.shape[-1])).reshape(-1, u.shape[-1])
+        states = rows_of(np.broadcast_to(x, (*batch, x.shape[-1])))
+        inputs = rows_of(np.broadcast_to(u, (*batch, u.shape[-1])))
         reached = np.full(states.shape, np.nan)
         data = self._mujoco.MjData(model)
         for k in np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1)).tolist():

@@ -11,7 +11,7 @@ from ctxval.campaign.dynamics import PREDICTION
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.bounds import at_most, of_tasks
 from ctxval.certificates.covering import bare_corners, farthest_task
-from ctxval.certificates.dynamics import ACCURATE
+from ctxval.certificates.dynamics_diagnostics import ACCURATE, agrees
 from ctxval.core.trial import Trial
 from ctxval.learning import ExecutionPrediction
 from ctxval.report.context import ReportContext, distance_of
@@ -133,7 +133,7 @@ def _predictions(context: ReportContext) -> Finding | None:
     if not found:
         return None
     size = max(float(context.distances.max()), context.bound or 0.0)
-    held = sum(abs(distance_of(trial) - one.median) <= ACCURATE * size for trial, one in found)
+    held = sum(agrees(distance_of(trial), one.median, size) for trial, one in found)
     text = (
         f"{held} of {counted(len(found), 'execution')} that were predicted beforehand came out within "
         f"{quantity(ACCURATE * size, context.labels.units)} of the prediction, which is {percent(ACCURATE)} of the "

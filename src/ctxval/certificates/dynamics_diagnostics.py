@@ -1,0 +1,337 @@
+"""Diagnostics that withdraw the bound from learned dynamics: they do not believe the prior on the dynamics.
+
+Each diagnostic is a function of the evidence, the largest executed distance and the bound. It returns a sentence, which
+says what is wrong and what would help, or None. The first sentence of :data:`DIAGNOSTICS` withdraws the bound. The
+limits were chosen on development systems. Those of the posterior bound are in
+:mod:`ctxval.certificates.posterior_diagnostics`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputGap, with_units
+
+Diagnostic = Callable[[DynamicsEvidence, float, float], str | None]
+"""Returns why a bound is withdrawn, from the evidence, the largest executed distance and the bound; None if it is not.
+"""
+
+
+def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    """Return why the bound is withdrawn, and what would help; None if it is not.
+
+    Args:
+        evidence: what the learned dynamics say.
+        best: the largest executed distance.
+        bound: the bound.
+    """
+    return _first(DIAGNOSTICS, evidence, best, bound)
+
+
+def uncovered(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    """Return what the records and executions do not cover; None if nothing.
+
+    Args:
+        evidence: what the learned dynamics say.
+        best: the largest executed distance.
+        bound: the bound.
+    """
+    return _first(COVERAGE, evidence, best, bound)
+
+
+def untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    """Return that the bound is not tested where distances are large; None if it is.
+
+    Args:
+        evidence: what the learned dynamics say.
+        best: the largest executed distance.
+        bound: the bound.
+    """
+    return _first(LARGE_DISTANCES, evidence, best, bound)
+
+
+def _first(diagnostics: Iterable[Diagnostic], evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    found = (one(evidence, best, bound) for one in diagnostics)
+    return next((sentence for sentence in found if sentence is not None), None)
+
+
+FEWEST = 3
+"""The fewest executions for a bound: the data that M was made from are no executions."""
+
+
+def _few_executions(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    if evidence.executions < FEWEST:
+        return (
+            f"the dynamics are learned from {evidence.executions} executed trajectories, and the bound needs at least "
+            f"{FEWEST}; execute more tasks"
+        )
+    return None
+
+
+def _unplanned(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    if evidence.unplanned:
+        return (
+            f"for {100 * evidence.unplanned:.2g} % of the tasks no controller can be designed, or the model diverges: "
+            "nothing is known there; make the task space smaller, so that every task can be executed"
+        )
+    return None
+
+
+AUDITED = 8
+"""Number of fresh random tasks of a prediction audit."""
+
+TOLERATED = 0.02
+"""Largest excess of an audited distance over the 0.95 quantile of its prediction, as a share of the bound."""
+
+
+def _audit_failed(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    exceeding = [one for one in evidence.predictions if one.audit and one.distance > one.upper + TOLERATED * bound]
+    if exceeding:
+        return (
+            f"the prediction audit failed: the distance of trial {exceeding[0].trial} is {exceeding[0].distance:.4g}, "
+            f"and at most {exceeding[0].upper:.4g} was predicted. A state that is not recorded or a jump is the likely "
+            "cause: record more states, or use --kind posterior or an audit"
+        )
+    return None
+
+
+PREDICTIONS = 3
+"""Number of the last predictions that must have held."""
+
+ACCURATE = 0.05
+"""Largest difference between a distance and its prediction that held, as a share of the bound."""
+
+
+def agrees(distance: float, predicted: float, bound: float) -> bool:
+    """Return whether a distance agrees with the median of its prediction, as far as it matters for a bound.
+
+    A vague prediction that covers the distance does not suffice: hidden states make predictions vague.
+    """
+    return abs(distance - predicted) <= ACCURATE * bound
+
+
+def held(prediction: CheckedPrediction, bound: float) -> bool:
+    """Return whether an execution agrees with its prediction; see :func:`agrees`."""
+    return agrees(prediction.distance, prediction.median, bound)
+
+
+def counted(evidence: DynamicsEvidence, bound: float) -> list[CheckedPrediction]:
+    """Return the predictions that count: those that failed, and those that held where they could have failed.
+
+    A prediction of a task like an earlier one tells nothing. Nor does one of a run that a person chose to import, if it
+    was made afterwards.
+    """
+    return [one for one in evidence.predictions if not held(one, bound) or (one.new and (one.stored or not one.chosen))]
+
+
+def _failed_predictions(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    last = counted(evidence, bound)[-PREDICTIONS:]
+    failed = [one for one in last if not held(one, bound)]
+    if not failed:
+        return None
+    worst = max(failed, key=lambda one: abs(one.distance - one.median))
+    return (
+        f"of the last {len(last)} predictions {len(failed)} failed (trial {worst.trial}: distance {worst.distance:.4g} "
+        f"where {worst.median:.4g} was predicted); {PREDICTIONS} must hold in a row. After few executions, more of "
+        "them help. If predictions go on failing, a state that is not recorded, a jump such as a contact or dry "
+        "friction, or noise is the likely cause: record more states, or use --kind posterior or an audit"
+    )
+
+
+def _few_predictions(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    checked = counted(evidence, bound)
+    if len(checked) < PREDICTIONS:
+        return (
+            f"{len(checked)} executions of different tasks were predicted from earlier ones, and the bound needs "
+            f"{PREDICTIONS} predictions that hold; execute more tasks"
+        )
+    return None
+
+
+NOISE = 0.01
+"""Largest learned variance of noise, as a share of the mean square of the residual: with more, the next state does not
+follow from the recorded state and input."""
+
+
+def _noisy(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    if evidence.noise > NOISE:
+        return (
+            f"noise is learned with {100 * evidence.noise:.2g} % of the variance of the residual, and at most "
+            f"{100 * NOISE:g} % is allowed: the system is not deterministic in the recorded state and input; record "
+            "more states or reduce the noise, or use --kind posterior with --stochastic"
+        )
+    return None
+
+
+LEFT_OUT = 0.5
+"""Largest share of the posterior variance that the draws may leave out between their pivots: with more, they vary too
+little there."""
+
+
+def _variance_left_out(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    if evidence.left_out > LEFT_OUT:
+        return (
+            f"the draws of the dynamics leave out {100 * evidence.left_out:.0f} % of the largest variance, more than "
+            f"{100 * LEFT_OUT:g} %; more executions reduce this variance"
+        )
+    return None
+
+
+GAP = 0.25
+"""Largest gap of the records in a state or an input, as a share of the range that closed loops visit: what happens in a
+gap is a guess of the prior."""
+
+BEYOND = 0.02
+"""Largest excess of a state or an input over its largest record, or below its smallest one, as a share of that range.
+Contacts, end stops and saturation lie beyond what is recorded more often than between records. With too many
+coordinates for a comparison of pairs, it is the same as ``GAP``: each extreme would take an execution of its own."""
+
+PAIR_GAP = 0.5
+"""The same as ``GAP`` for two of them together."""
+
+
+def _beyond_the_records(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    coverage = evidence.coverage
+    if coverage.beyond.size > (GAP if coverage.pair is None else BEYOND):
+        return _gap(coverage.beyond, "of its range beyond all records of")
+    return None
+
+
+def _coverage_gap(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    found = evidence.coverage.marginal
+    return _gap(found, "of its range away from every record of") if found.size > GAP else None
+
+
+def _coverage_gap_of_pairs(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    found = evidence.coverage.pair
+    if found is not None and found.size > PAIR_GAP:
+        return _gap(found, "of their ranges away from every record of")
+    return None
+
+
+def _gap(gap: StateInputGap, what: str) -> str:
+    return (
+        f"closed loops of the tasks lead {100 * gap.size:.2g} % {what} {' and '.join(gap.coordinates)}, such as to "
+        f"{with_units(gap.place)}; an execution of a task that leads there helps (--until-decided executes it)"
+    )
+
+
+def untried_parameter(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    """Return which task parameter has values far from all executed ones, though M does not tell what it changes.
+
+    Args:
+        evidence: what the learned dynamics say.
+        best: the largest executed distance.
+        bound: the bound.
+    """
+    untried = evidence.untried
+    if untried is not None and untried.gap > GAP:
+        return (
+            f"the parameter {untried.name} hardly changes the closed loops of the model, so what it changes in the "
+            "system cannot be learned from states and inputs, and some of its values are "
+            f"{100 * untried.gap:.0f} % of its range away from every executed one; an execution there helps "
+            "(--until-decided executes it)"
+        )
+    return None
+
+
+TESTED = 0.8
+"""Least share of the largest distance on the posterior mean that must have been executed: the bound is tested there."""
+
+
+def _largest_untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    if best < TESTED * evidence.highest:
+        return (
+            f"the largest distance is predicted to be {evidence.highest:.4g}, but the largest executed one is "
+            f"{best:.4g}: the prediction is not tested where it matters; an execution of that task helps "
+            "(--until-decided executes it)"
+        )
+    return None
+
+
+MATTERS = 0.3
+"""Least distance, as a share of the bound, at which a prediction must have held: small distances hardly test it."""
+
+
+def _only_small_distances(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    if any(one.distance >= MATTERS * bound and held(one, bound) for one in counted(evidence, bound)):
+        return None
+    return (
+        f"no prediction held at a distance of at least {100 * MATTERS:g} % of the bound: small distances hardly "
+        "test it; an execution of another task with a large distance helps (--until-decided executes it)"
+    )
+
+
+SHARP = 0.05
+"""Largest share by which a large predicted distance may exceed the median of those of nearly the same tasks: if large
+distances are narrow, a search finds the largest one by chance."""
+
+JUMP = 0.01
+"""Largest jump of the predicted distance between nearly equal tasks, as a share of the bound: larger distances can hide
+between jumps."""
+
+DENSE = 2
+"""Largest number of task parameters in which deeper searches may find the largest distance in spite of jumps."""
+
+
+def jumps(evidence: DynamicsEvidence, bound: float) -> bool:
+    """Return whether the distance is no smooth function of the task, so that a search may miss the largest one."""
+    return evidence.sharpness > SHARP or evidence.jump > JUMP * bound
+
+
+def _distance_jumps(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    if evidence.dense or not jumps(evidence, bound):
+        return None
+    if evidence.sharpness > SHARP:
+        what = f"one of the largest predicted distances falls by {100 * evidence.sharpness:.0f} %"
+    else:
+        what = f"the predicted distance jumps by up to {100 * evidence.jump / bound:.2g} % of the bound"
+    return (
+        f"{what} if a task changes by a thousandth of its ranges, so a search may miss the largest distance: the "
+        "controllers change abruptly from task to task, as those of a model with kinks do, or the closed loop does; "
+        "use a smoother model, or an audit"
+    )
+
+
+AGREE = 0.05
+"""Largest share by which the results of two deeper searches may differ, and by which they may exceed the usual one:
+otherwise an even deeper one may find a larger distance."""
+
+
+def _searches_disagree(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    share = max(evidence.missed - 1, evidence.disagreement)
+    if not evidence.dense or share <= AGREE:
+        return None
+    return (
+        f"searches of the learned dynamics find largest distances that differ by {100 * share:.0f} %, because the "
+        "controllers or the closed loop change abruptly from task to task; an execution of the task of the largest one "
+        "helps (--until-decided executes it), or use a smoother model, or an audit"
+    )
+
+
+COVERAGE: tuple[Diagnostic, ...] = (
+    _beyond_the_records,
+    _coverage_gap,
+    _coverage_gap_of_pairs,
+    untried_parameter,
+)
+"""Diagnostics of what the records and executions do not cover."""
+
+LARGE_DISTANCES: tuple[Diagnostic, ...] = (_largest_untested, _only_small_distances)
+"""Diagnostics of whether predictions were tested at large distances."""
+
+DIAGNOSTICS: tuple[Diagnostic, ...] = (
+    _few_executions,
+    _unplanned,
+    _audit_failed,
+    _failed_predictions,
+    _few_predictions,
+    _noisy,
+    _variance_left_out,
+    *COVERAGE,
+    *LARGE_DISTANCES,
+    _distance_jumps,
+    _searches_disagree,
+)
+"""All diagnostics, in the order of their sentences. Jumps come last: many closed loops are run to find them, but only
+if nothing else withdraws the bound."""

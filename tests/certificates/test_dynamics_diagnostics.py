@@ -1,0 +1,128 @@
+"""What withdraws the bound from learned dynamics, from evidence in plain numbers."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ctxval.certificates import DynamicsEvidence, UntriedParameter
+from ctxval.certificates.dynamics_diagnostics import (
+    ACCURATE,
+    AGREE,
+    BEYOND,
+    DIAGNOSTICS,
+    FEWEST,
+    GAP,
+    JUMP,
+    LEFT_OUT,
+    MATTERS,
+    NOISE,
+    PAIR_GAP,
+    SHARP,
+    TESTED,
+    TOLERATED,
+    doubt_of,
+    uncovered,
+    untested,
+)
+from rig_evidence import COVERED, GOOD, gap, prediction
+
+BEST, BOUND = 0.8, 1.0
+
+
+def doubt(evidence: DynamicsEvidence = GOOD, **changed: Any) -> str | None:
+    return doubt_of(replace(evidence, **changed), BEST, BOUND)
+
+
+AUDITED = replace(prediction(4, 0.5, 0.55 + 1.1 * TOLERATED), audit=True)
+BAD: list[tuple[dict[str, Any], str]] = [
+    ({"executions": FEWEST - 1}, "needs at least 3"),
+    ({"unplanned": 0.01}, "for 1 % of the tasks no controller can be designed"),
+    ({"predictions": (*GOOD.predictions, AUDITED)}, "audit failed: the distance of trial 4"),
+    ({"predictions": (prediction(1), prediction(2, 0.5, 0.5 + 1.1 * ACCURATE), prediction(3))}, "trial 2: distance"),
+    ({"predictions": GOOD.predictions[:2]}, "2 executions of different tasks were predicted"),
+    ({"noise": 2 * NOISE}, "2 % of the variance of the residual"),
+    ({"left_out": 1.1 * LEFT_OUT}, "leave out 55 % of the largest variance"),
+    ({"coverage": replace(COVERED, beyond=gap(2 * BEYOND))}, "4 % of its range beyond all records of u[0]"),
+    ({"coverage": replace(COVERED, marginal=gap(1.1 * GAP))}, "28 % of its range away from every record of u[0]"),
+    (
+        {"coverage": replace(COVERED, pair=gap(1.1 * PAIR_GAP, "x[0]", "u[0]"))},
+        "55 % of their ranges away from every record of x[0] and u[0], such as to x[0] 1, u[0] 3",
+    ),
+    ({"untried": UntriedParameter("load", 1.1 * GAP, np.zeros(2))}, "the parameter load hardly changes"),
+    ({"highest": 1.1 * BEST / TESTED}, "predicted to be 1.1, but the largest executed one is 0.8"),
+    ({"predictions": (prediction(1, 0.9 * MATTERS, 0.9 * MATTERS),) * 3}, "small distances hardly test it"),
+    ({"sharpness": 1.4 * SHARP}, "one of the largest predicted distances falls by 7 %"),
+    ({"jump": 2 * JUMP}, "the predicted distance jumps by up to 2 % of the bound"),
+    ({"dense": True, "missed": 1 + 1.4 * AGREE}, "largest distances that differ by 7 %"),
+    ({"dense": True, "disagreement": 1.4 * AGREE}, "largest distances that differ by 7 %"),
+]
+"""What withdraws the bound, and what is said then, in the order in which it is said."""
+
+
+def test_good_evidence_withdraws_nothing() -> None:
+    assert doubt() is None
+    assert uncovered(GOOD, BEST, BOUND) is None
+    assert untested(GOOD, BEST, BOUND) is None
+
+
+@pytest.mark.parametrize(("changed", "said"), BAD)
+def test_each_diagnostic_withdraws_the_bound_and_says_what_helps(changed: dict[str, Any], said: str) -> None:
+    found = doubt(**changed)
+    assert found is not None
+    assert said in found
+    assert re.search("execut|record more|smaller|smoother", found)
+
+
+def test_every_diagnostic_has_an_example() -> None:
+    evidence = [replace(GOOD, **changed) for changed, _ in BAD]
+    assert all(any(diagnostic(one, BEST, BOUND) for one in evidence) for diagnostic in DIAGNOSTICS)
+
+
+def test_the_first_sentence_wins() -> None:
+    for (first, said), (second, _) in combinations(BAD[:-2], 2):  # searches are deeper instead of jumps
+        assert said in (doubt(**{**second, **first}) or "")
+
+
+def test_predictions_that_could_not_fail_do_not_count() -> None:
+    same = replace(prediction(4), new=False)
+    imported = replace(prediction(4), chosen=True, stored=False)
+    for one in (same, imported):
+        said = doubt(predictions=(*GOOD.predictions[:2], one)) or ""
+        assert "2 executions of different tasks were predicted" in said
+        assert "failed" in (doubt(predictions=(*GOOD.predictions, replace(one, distance=0.9))) or "")
+
+
+def test_a_prediction_that_was_too_high_has_failed_as_well() -> None:
+    too_high = (prediction(1), prediction(2, 0.9, 0.5), prediction(3))
+    assert "contact or dry friction" in (doubt(predictions=too_high) or "")
+
+
+def test_an_audited_distance_above_its_prediction_withdraws_the_bound() -> None:
+    fresh = tuple(replace(prediction(k, 0.5, 0.54), audit=True) for k in range(4, 8))
+    assert doubt(predictions=(*GOOD.predictions, *fresh)) is None
+    worse = (*GOOD.predictions, replace(prediction(4, 0.5, 0.6), audit=True), *fresh)
+    said = "the prediction audit failed: the distance of trial 4 is 0.6, and at most 0.55 was predicted"
+    assert said in (doubt(predictions=worse) or "")
+
+
+def test_a_failure_long_ago_is_forgiven() -> None:
+    assert doubt(predictions=(prediction(0, 0.1, 0.5), *GOOD.predictions)) is None
+
+
+def test_many_coordinates_may_leave_their_ranges_as_far_as_they_may_leave_gaps() -> None:
+    wide = replace(COVERED, pair=None, beyond=gap(0.9 * GAP))
+    assert doubt(coverage=wide) is None
+    assert "beyond all records" in (doubt(coverage=replace(wide, beyond=gap(1.1 * GAP))) or "")
+
+
+@pytest.mark.parametrize("jumps", [{"sharpness": 1.4 * SHARP}, {"jump": 2 * JUMP}])
+def test_jumps_withdraw_nothing_if_they_are_small_or_searched_more_deeply(jumps: dict[str, float]) -> None:
+    assert "use a smoother model, or an audit" in (doubt(**jumps) or "")
+    assert doubt(dense=True, **jumps) is None
+    assert doubt(**{name: 0.1 * value for name, value in jumps.items()}) is None
