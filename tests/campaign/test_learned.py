@@ -10,7 +10,7 @@ from ctxval import Campaign, Labels, searches
 from ctxval.campaign.history import predict_from
 from ctxval.certificates import LearnedDistance, Sample, require_learned
 from ctxval.errors import CertificateError
-from ctxval.learning import DistancePredictor
+from ctxval.learning import DistancePredictor, DynamicsStudy
 
 POINTS = np.linspace(0.05, 0.95, 7)[:, None]
 
@@ -75,3 +75,18 @@ def test_evidence_names_states_and_inputs_as_the_experiment_does(labels: Labels,
     assert evidence is not None
     assert list(evidence.coverage.resolution) == coordinates
     assert set(evidence.coverage.marginal.coordinates) <= set(coordinates)
+
+
+def test_a_fault_while_learning_is_named_and_not_taken_for_dynamics_that_cannot_be_learned(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def learn(*_: object) -> None:
+        raise ZeroDivisionError("no scale")
+
+    campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(3)
+    learned = campaign.provenance.learned
+    assert learned is not None
+    monkeypatch.setattr(DynamicsStudy, "learn", learn)
+    for _ in range(2):
+        with pytest.raises(CertificateError, match=r"no dynamics can be learned: ZeroDivisionError: no scale\.$"):
+            learned.dynamics(0.5)

@@ -14,6 +14,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.describe import rounded
 from ctxval._util.progress import stage
 from ctxval._util.representation import call
+from ctxval._util.texts import reason_of
 from ctxval.campaign.history import executed_trials
 from ctxval.certificates.dynamics import bound_of
 from ctxval.certificates.dynamics_diagnostics import DENSE, PREDICTIONS, doubt_of, jumps
@@ -64,6 +65,7 @@ class CampaignDynamics:
         experiment: a digest of the description; a stored prediction belongs to one experiment.
         elsewhere: returns recordings of the same system that belong to no trial of this campaign. They teach the
             dynamics, and they are no executions of this model's controllers.
+        failure: the exception that ended the last :meth:`evidence`, in words; None if there was none.
     """
 
     def __init__(self, validation: Validation, store: Store, seed: int, description: Mapping[str, Any]) -> None:
@@ -72,7 +74,8 @@ class CampaignDynamics:
         self._study = DynamicsStudy(validation, seed)
         self._store = store
         self.elsewhere: Callable[[], Sequence[Trajectory]] = tuple
-        self._learned: dict[tuple[int, ...], tuple[Sequence[Trajectory], LearnedDynamics | None]] = {}
+        self.failure: str | None = None
+        self._learned: dict[tuple[int, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]] = {}
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials teach; None if they teach nothing.
@@ -87,8 +90,9 @@ class CampaignDynamics:
         if key not in self._learned:
             if len(self._learned) == _REMEMBERED:
                 del self._learned[next(iter(self._learned))]
-            self._learned[key] = others, self._learn(executed, others)
-        return self._learned[key][1]
+            self._learned[key] = others, *self._learn(executed, others)
+        _, found, self.failure = self._learned[key]
+        return found
 
     def predict(self, trials: Sequence[Trial], point: Array, *, alone: bool = False) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task from completed trials; None if nothing can be predicted.
@@ -126,7 +130,8 @@ class CampaignDynamics:
             bound = bound_of(found, best, confidence)
             # Many closed loops, which only matter to a bound that nothing else withdraws.
             return found if doubt_of(found, best, bound) else _with_jumps(found, learned, bound)
-        except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
+        except Exception as error:  # the user's parts, at states that no execution has reached, must not end a campaign
+            self.failure = reason_of(error)
             return None
 
     def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int) -> DynamicsEvidence:
@@ -167,11 +172,11 @@ class CampaignDynamics:
 
     def _learn(
         self, executed: Sequence[tuple[Trial, Trajectory]], others: Sequence[Trajectory]
-    ) -> LearnedDynamics | None:
+    ) -> tuple[LearnedDynamics | None, str | None]:
         try:
-            return self._study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed], others)
-        except Exception:  # the same
-            return None
+            return self._study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed], others), None
+        except Exception as error:  # the same
+            return None, reason_of(error)
 
     def _checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:
         """Return the predictions of completed trials; of those without a stored one, of the last few only.

@@ -14,6 +14,7 @@ from ctxval.campaign.history import predict_from
 from ctxval.certificates import DynamicsEvidence
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
+from ctxval.errors import CertificateError
 from ctxval.learning import DistancePredictor
 from ctxval.searches import Prediction
 from ctxval.storage.store import Store
@@ -52,8 +53,15 @@ class LearnedFromTrials:
         return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
 
     def dynamics(self, confidence: float) -> DynamicsEvidence | None:
-        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
-        return self.study.evidence(self.trials, confidence)
+        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned.
+
+        Raises:
+            CertificateError: if a part of the experiment raises an exception meanwhile.
+        """
+        found = self.study.evidence(self.trials, confidence)
+        if found is None and self.study.failure is not None:
+            raise CertificateError(f"no dynamics can be learned: {self.study.failure.rstrip('.')}.")
+        return found
 
     def tasks(self, count: int, seed: int) -> Array:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""

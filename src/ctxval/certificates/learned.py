@@ -29,6 +29,9 @@ class LearnedDistance(Protocol):
 
         Args:
             confidence: the probability with which a bound must hold; it sets the least number of draws.
+
+        Raises:
+            CertificateError: if a part of the experiment raises an exception meanwhile.
         """
 
     def tasks(self, count: int, seed: int) -> Array:
