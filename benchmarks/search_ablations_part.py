@@ -12,7 +12,7 @@ from plants import DEVELOPMENT, REPORTING
 from search_cells import ENDS, cells, reached, results
 from study_ablations import ABLATIONS, BUDGET, CHOSEN_BY, ON_PLANTS, OTHERS
 from study_ablations import CASES as ABLATED
-from study_auto import WITHIN, Result, first_within, repeated, shown
+from study_auto import CASES, WITHIN, Result, first_within, repeated, shown
 
 ABLATION_SEEDS = range(5)
 SHOWN = {"no climbs": "no trust region"}
@@ -85,6 +85,29 @@ def summary_table() -> str:
             pairs = [pair for case in systems for pair in _pairs(case, name)]
             rows += [[SHOWN.get(name, name), group, *_compared(pairs)]] if pairs else []
     return table(["without", "systems", "campaigns", "the same", *(f"{percent:g} %" for percent in ENDS_OF)], rows)
+
+
+def left_out_table() -> str:
+    """Return what the search found when its predictions were also corrected by a discrepancy, beside today's."""
+    groups = {
+        "all cases above": [(case, "auto") for case in CASES],
+        "misleading cases below": [(case, "misleading") for case in misleading.CASES],
+        "chosen by": [(case, "ablations") for case in (*CHOSEN_BY, *_plants(DEVELOPMENT))],
+        "others": [(case, "ablations") for case in (*OTHERS, *_plants(REPORTING))],
+    }
+    rows = []
+    for group, systems in groups.items():
+        pairs = [pair for case, study in systems for pair in _before_and_today(case, study)]
+        shares = (f"{100 * np.mean([average_share(run) for run in runs]):.1f} %" for runs in zip(*pairs, strict=True))
+        rows += [[group, *_compared(pairs), *shares]] if pairs else []
+    ends = (f"{percent:g} %" for percent in ENDS_OF)
+    return table(["systems", "campaigns", "the same", *ends, "mean share of d* with it", "without it"], rows)
+
+
+def _before_and_today(case: str, study: str) -> list[tuple[Result, Result]]:
+    """Return the campaigns with the discrepancy and those of today, on the seeds that both have."""
+    today = results(study, case, "auto")
+    return [(run, today[seed]) for seed, run in results("auto_left_out", case, "discrepancy").items() if seed in today]
 
 
 ENDS_OF = (WITHIN[0], WITHIN[-1])

@@ -46,11 +46,8 @@ def trust_region(**settings: Any) -> TrustRegion:
 # Bayesian optimisation that starts as the trust region does, with one random point, is all of it but the residual.
 ABLATIONS: dict[str, Callable[[], searches.Search]] = {
     "no residual": partial(BayesianOptimisation, initial=1),
-    "no discrepancy": partial(trust_region, correct_discrepancy=False),
     "no trust score": partial(trust_region, compare_with_surrogate=False),
     "no climbs": partial(trust_region, restrict=False),
-    "fixed noise": partial(trust_region, learn_noise=False),
-    "starts anywhere": partial(trust_region, distinct_start=0.0),
     "no boldness": partial(trust_region, boldness=1.0),
 }
 """What is left out -> the search without it."""

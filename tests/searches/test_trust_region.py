@@ -105,34 +105,6 @@ def test_a_wrong_prediction_shrinks_the_box_and_misses_end_the_climb() -> None:
     assert max(note["climb"] for note in notes) >= 1
 
 
-def starts_of_regions(search: TrustRegion) -> list[int]:
-    """Return the numbers of the points at which a region after the first one starts."""
-    regions = [-1 if note is None else note.get("climb", -1) for note in search.notes]
-    return [k for k, region in enumerate(regions) if region > max(regions[:k], default=0)]
-
-
-@pytest.mark.parametrize(("distinct_start", "next_to_known"), [(0.02, False), (0.0, True)])
-def test_a_region_starts_next_to_a_known_point_only_if_that_is_not_forbidden(
-    distinct_start: float, next_to_known: bool
-) -> None:
-    search = TrustRegion(settings=TrustRegionSettings(distinct_start=distinct_start))
-    run(search, hill, hill, 6, doubt=lambda X: np.zeros(len(X)))
-    starts = starts_of_regions(search)
-    assert starts
-    gaps = [np.abs(search.points[:k] - search.points[k]).max(axis=1).min() for k in starts]
-    assert (min(gaps) < 0.02) == next_to_known
-
-
-def test_a_region_starts_next_to_a_known_point_if_more_is_predicted_there() -> None:
-    settings = TrustRegionSettings(correct_discrepancy=False, compare_with_surrogate=False)
-    search = TrustRegion(misses=1, settings=settings)
-    run(search, lambda X: np.full(len(X), 0.1), lambda X: 9 * hill(X), 5)
-    starts = starts_of_regions(search)
-    assert starts
-    for k in starts:
-        assert np.abs(search.points[:k] - search.points[k]).max(axis=1).min() < 0.02
-
-
 def test_no_point_is_asked_twice_and_what_failed_is_kept_away_from() -> None:
     def holed(X: Array) -> Array:
         return np.where(np.linalg.norm(X - [0.3, 0.8], axis=1) < 0.1, np.nan, hill(X))
@@ -245,27 +217,6 @@ def test_settings_leave_parts_of_the_search_out() -> None:
     assert engines(TrustRegionSettings(compare_with_surrogate=False)) == {"climb"}
     assert len(regions(TrustRegionSettings())) > 1
     assert regions(TrustRegionSettings(restrict=False)) == {(0, 1.0)}
-
-
-def test_without_its_correction_a_prediction_is_taken_as_it_is() -> None:
-    found = []
-    for correct in (True, False):
-        search = TrustRegion(settings=TrustRegionSettings(correct_discrepancy=correct))
-        found.append(run(search, hill, lambda X: hill(X) * (0.2 + X[:, 0]), 5))
-    assert not np.array_equal(found[0], found[1])
-
-
-def test_the_noise_of_the_discrepancy_is_learned_and_changes_nothing_where_there_is_none() -> None:
-    def points(function: Function, learn_noise: bool) -> Array:
-        search = TrustRegion(settings=TrustRegionSettings(learn_noise=learn_noise, compare_with_surrogate=False))
-        run(search, function, hill, 8)
-        return search.points
-
-    def rough(X: Array) -> Array:
-        return hill(X) * np.exp(np.sin(1e4 * X.sum(axis=1)))
-
-    np.testing.assert_array_equal(points(hill, True), points(hill, False))
-    assert not np.array_equal(points(rough, True), points(rough, False))
 
 
 def test_a_store_has_the_settings_if_they_are_not_the_usual_ones() -> None:

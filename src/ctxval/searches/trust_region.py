@@ -1,12 +1,10 @@
 """Trust-region search on a prediction: it executes points where the prediction is large, or uncertain.
 
-It maximises the optimistic value ``d_hat(p) exp(g(p)) (1 + kappa w(p))``: the prediction d_hat, corrected by a Gaussian
-process g of its logarithmic discrepancy at known points, and raised in proportion to its doubt w. The prediction is
-trusted inside a box around the best point. The box grows if an execution improves on the best value. It shrinks if an
-execution does not and the prediction was wrong. If no improvement is predicted in a region, or if several executions
-have not improved, a new region starts at the point of the whole cube with the largest optimistic value for a larger
-kappa. A larger kappa favours points where neither values nor dynamics are known. A region does not start next to a
-known point, unless a value larger than all known ones is predicted there.
+It maximises the optimistic value ``d_hat(p) (1 + kappa w(p))``: the prediction d_hat, raised in proportion to its doubt
+w. The prediction is trusted inside a box around the best point. The box grows if an execution improves on the best
+value. It shrinks if an execution does not and the prediction was wrong. If no improvement is predicted in a region, or
+if several executions have not improved, a new region starts at the point of the whole cube with the largest optimistic
+value for a larger kappa. A larger kappa favours points where the dynamics are not known.
 """
 
 from __future__ import annotations
@@ -24,14 +22,11 @@ from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.gp.acquisition import Box
 from ctxval.gp.ascent import Ascent
-from ctxval.gp.regression import GaussianProcess
 from ctxval.searches.base import Note, Prediction, SequentialSearch, best_first
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 from ctxval.searches.optimistic_value import (
-    REPRESENTING,
     Candidate,
     OptimisticValue,
-    discrepancy,
     left_out_by_surrogate,
     log_error,
     represented,
@@ -48,9 +43,6 @@ class TrustRegionSettings:
     """Settings of :class:`TrustRegion` that its studies vary (``benchmarks/study_ablations.py``).
 
     Attributes:
-        correct_discrepancy: whether predictions are corrected by their errors at known points.
-        learn_noise: whether the noise of these errors is learned; they are noisy if distances are rough or the dynamics
-            depend on a hidden state.
         compare_with_surrogate: whether a prediction is used only if leave-one-out errors show that it is good.
         restrict: whether there are trust regions; if not, the whole cube is searched each time.
         accurate: largest relative error of a prediction that counts as right.
@@ -64,13 +56,9 @@ class TrustRegionSettings:
         compared_on: largest number of known values, the latest ones, on which the two are compared.
         good_enough: mean error of the logarithm up to which a prediction needs no comparison.
         distinct: least distance of a suggestion from each known point, in at least one coordinate.
-        distinct_start: the same for the first suggestion of a region, unless a value larger than all known ones is
-            predicted there.
         apart: least distance of a suggestion from pending and failed points, as a share of the cube's diagonal.
     """
 
-    correct_discrepancy: bool = True
-    learn_noise: bool = True
     compare_with_surrogate: bool = True
     restrict: bool = True
     accurate: float = 0.1
@@ -84,7 +72,6 @@ class TrustRegionSettings:
     compared_on: int = 24
     good_enough: float = 0.1
     distinct: float = 1e-6
-    distinct_start: float = 0.02
     apart: float = 0.05
 
 
@@ -177,8 +164,7 @@ class TrustRegion(SequentialSearch):
     def predicted_besides(self) -> int:
         """The number of known points that are predicted for a choice, besides those of the budget."""
         known, settings = int(np.isfinite(self.values).sum()), self._settings
-        compared = min(known, settings.compared_on) if known >= settings.compared_from else 0
-        return compared + min(known, REPRESENTING)
+        return min(known, settings.compared_on) if known >= settings.compared_from else 0
 
     # How good the prediction is
 
@@ -207,7 +193,7 @@ class TrustRegion(SequentialSearch):
 
     def _promising(self, prediction: Prediction, rng: np.random.Generator) -> Array | None:
         """Return the next point of the last region or of a new one; None if no point can be predicted."""
-        settings, value = self._settings, OptimisticValue(prediction, self._discrepancy(prediction), self.optimism)
+        settings, value = self._settings, OptimisticValue(prediction, self.optimism)
         if not settings.restrict:
             return self._noted(self._best(value, _Region(), rng), _Region())
         region = self._state()
@@ -218,49 +204,24 @@ class TrustRegion(SequentialSearch):
         # The optimism grows with every region that finds nothing larger, so the search explores more.
         bold = replace(value, optimism=self.optimism * settings.boldness ** (1 + region.stale))
         new = _Region(region.number + 1, settings.first_radius)
-        return self._noted(self._start(bold, rng), new)
+        return self._noted(self._best(bold, _Region(), rng), new)
 
     def _is_worth(self, found: Candidate, best: float) -> bool:
         """Return whether a value may exceed a region's best value and, with more optimism, all values."""
-        return self._exceeds(found, 1.0, best) and self._promises(found, self._settings.patience)
-
-    def _promises(self, found: Candidate, patience: float = 1.0) -> bool:
-        """Return whether the value with so many times the usual optimism is larger than all known values."""
-        return self._exceeds(found, patience, float(np.nanmax(self.values, initial=0.0)))
+        largest = float(np.nanmax(self.values, initial=0.0))
+        return self._exceeds(found, 1.0, best) and self._exceeds(found, self._settings.patience, largest)
 
     def _exceeds(self, found: Candidate, patience: float, other: float) -> bool:
         """Return whether the value with so many times the usual optimism exceeds another by the least improvement."""
         return found.optimistic(patience * self.optimism) > other * (1 + self._settings.improvement)
 
-    def _discrepancy(self, prediction: Prediction) -> GaussianProcess | None:
-        known = np.isfinite(self.values)
-        if not self._settings.correct_discrepancy or not known.any():
-            return None
-        return discrepancy(prediction, self.points[known], self.values[known], self._settings.learn_noise)
-
     def _best(self, value: OptimisticValue, region: _Region, rng: np.random.Generator) -> Candidate | None:
         """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
-        return next((value.at(point) for point in self._best_points(value, region, rng)), None)
-
-    def _start(self, value: OptimisticValue, rng: np.random.Generator) -> Candidate | None:
-        """Return the first point of a new region; None if no point can be predicted.
-
-        It is the best point, unless that one is next to a known point and, with the usual optimism, promises nothing.
-        """
-        points = self._best_points(value, _Region(), rng)
-        if not len(points):
-            return None
-        best, apart = value.at(points[0]), self._gaps(points) > self._settings.distinct_start
-        if apart[0] or not apart.any() or self._promises(best):
-            return best
-        return value.at(points[apart.argmax()])
-
-    def _best_points(self, value: OptimisticValue, region: _Region, rng: np.random.Generator) -> Array:
-        """Return new points ``(m, d)`` of a region whose value can be predicted, that of largest value first."""
         budget = min(value.prediction.budget, self._settings.points * self.dimension)
         ascent = Ascent(value, *region.box(self.dimension), budget, value.rough)
         points, promised = ascent.run(best_first(self.points, self.values)[:_STARTS], rng)
-        return np.asarray(points[self._is_new(points) & np.isfinite(promised)])
+        points = points[self._is_new(points) & np.isfinite(promised)]
+        return value.at(points[0]) if len(points) else None
 
     def _noted(self, found: Candidate | None, region: _Region) -> Array | None:
         """Return the next point of a region, and record the prediction for it in the note; None if there is none."""
@@ -277,14 +238,10 @@ class TrustRegion(SequentialSearch):
 
     def _is_new(self, points: Array) -> Mask:
         """Return which of some points ``(m, d)`` are far enough from all known, pending and failed ones."""
-        unknown, reach = self.points[~np.isfinite(self.values)], self._settings.apart * np.sqrt(self.dimension)
-        others = cdist(points, unknown).min(axis=1, initial=np.inf)
-        return np.asarray((self._gaps(points) > self._settings.distinct) & (others > reach))
-
-    def _gaps(self, points: Array) -> Array:
-        """Return the distance of each point to the nearest known one, in the coordinate in which it is largest."""
-        known = self.points[np.isfinite(self.values)]
-        return np.asarray(cdist(points, known, "chebyshev").min(axis=1, initial=np.inf))
+        known, reach = np.isfinite(self.values), self._settings.apart * np.sqrt(self.dimension)
+        gaps = cdist(points, self.points[known], "chebyshev").min(axis=1, initial=np.inf)
+        others = cdist(points, self.points[~known]).min(axis=1, initial=np.inf)
+        return np.asarray((gaps > self._settings.distinct) & (others > reach))
 
     def _state(self) -> _Region:
         """Return the state of the last region."""
