@@ -174,6 +174,45 @@ def test_bad_input_is_one_sentence_and_exit_status_2(invoke, arguments: list[str
 
 
 @pytest.mark.parametrize(
+    ("arguments", "status"),
+    [
+        (["run", "rig:crashing"], 2),
+        (["run", "rig:slow"], 130),
+        (["check", "none.toml"], 2),
+        (["status", "none.sqlite"], 2),
+        (["tell", "none.sqlite", "0", "--distance", "1"], 2),
+    ],
+)
+def test_an_error_is_a_json_object_if_the_result_is(invoke, arguments: list[str], status: int) -> None:  # type: ignore[no-untyped-def]
+    result = invoke(*arguments, "--json")
+    assert result.exit_code == status
+    (sentence,) = json.loads(result.stdout).values()
+    assert list(json.loads(result.stdout)) == ["error"]
+    assert sentence in result.stderr
+
+
+def test_an_unusable_option_is_not_blamed_on_the_file(invoke) -> None:  # type: ignore[no-untyped-def]
+    Path("e.toml").write_text('experiment = "rig:experiment"\nthreshold = 3.0\n')
+    result = invoke("run", "e.toml", "--threshold", "-1")
+    assert result.exit_code == 2
+    assert "the command line: threshold: input should be greater than 0, got -1.0." in result.stderr
+    Path("e.toml").write_text('experiment = "rig:experiment"\nthreshold = -3.0\n')
+    assert "e.toml: threshold: input should be greater than 0, got -3.0." in invoke("run", "e.toml").stderr
+
+
+def test_certify_says_that_the_campaign_was_decided_otherwise(invoke) -> None:  # type: ignore[no-untyped-def]
+    invoke("run", "rig:experiment", "--store", "a.sqlite", "--threshold", "9", "--no-report")
+    hint = "`ctxval certify a.sqlite --kind auto`"
+    assert hint in " ".join(invoke("certify", "a.sqlite").stdout.split())
+    assert "--kind auto" not in invoke("certify", "a.sqlite", "--kind", "posterior").stdout
+
+
+def test_an_example_is_written_to_a_new_folder(invoke) -> None:  # type: ignore[no-untyped-def]
+    assert invoke("init", "new/cart.toml").exit_code == 0
+    assert sorted(path.name for path in Path("new").iterdir()) == ["cart.toml", "cart_system.py"]
+
+
+@pytest.mark.parametrize(
     ("toml", "sentence"),
     [
         ('experiment = "pendulum"\nbudgit = 3', "budgit"),

@@ -137,7 +137,8 @@ def test_a_given_model_that_cannot_be_used_is_an_error(content: str | None, invo
         (("--step", "my_cart_step:step", "--parameter", "mass"), "--parameter must be NAME=VALUE"),
         (("--step", "my_cart_step:step", "--parameter", "mass=1"), "the bounds of mass must be two numbers"),
         (("--step", "os:getcwd", "--parameter", "mass=[0, 1]"), "os:getcwd is in Python's standard library"),
-        (("--kind", "linear", "--steps", "x"), "--steps must be integers"),
+        (("--kind", "linear", "--steps", "x"), "--steps must be positive integers"),
+        (("--kind", "linear", "--steps", "0,5"), "--steps must be positive integers with commas between them, such as"),
     ],
 )
 def test_what_cannot_be_used_is_said_in_one_sentence(arguments: tuple[str, ...], message: str, invoke: Invoke) -> None:

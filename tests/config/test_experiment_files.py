@@ -90,7 +90,7 @@ def test_init_overwrites_nothing(invoke: Any) -> None:
     assert "must" not in invoke("init", "other.toml").stderr
     assert "next: ctxval check 'my rig.toml'" in invoke("init", "my rig.toml").stdout
     assert "ends in .toml" in sentence(invoke("init", "other.ini"))
-    assert "cannot be written" in sentence(invoke("init", "none/other.toml"))
+    assert "cannot be written" in sentence(invoke("init", "/proc/none/other.toml"))
     assert Path("experiment.toml").read_bytes() == before
 
 
@@ -359,6 +359,12 @@ def test_a_controller_that_fails_on_the_model_itself_is_noted() -> None:
 def test_a_part_that_breaks_is_a_finding_and_no_traceback() -> None:
     validation = make_validation(distance=lambda a, b, task: 1 / 0)
     assert findings(validation)["distance"][0] == "failed"
+    elsewhere = findings(make_validation(distance=distances.FinalState(components=[7])))
+    assert elsewhere["tasks"][0] == "ok"
+    assert elsewhere["distance"] == (
+        "failed",
+        "the distance failed: ShapeError: components must be indices of 2 states, from 0 to 1, got 7.",
+    )
     broken = make_validation(model=lambda x, u: x * float("nan"))
     assert findings(broken)["tasks"][0] == "failed"
 
@@ -438,3 +444,16 @@ def test_every_distance_is_written_in_a_file_as_in_python(name: str) -> None:
         assert made.mixed_units(["rad", "rad/s"]) == ()
         del table["weights"], table["scales"]
         assert getattr(distances, type(made).__name__)(**table).mixed_units(["rad", "rad/s"]) == ("rad", "rad/s")
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("cart", "cart-auto-seed0.sqlite"),
+        ("Kran 起重机", "Kran 起重机-auto-seed0.sqlite"),
+        ("../../etc/cart", "..-..-etc-cart-auto-seed0.sqlite"),
+        ("a\\b\nc\0", "a-b-c--auto-seed0.sqlite"),
+    ],
+)
+def test_no_name_leaves_the_folder_of_the_stores(name: str, file: str) -> None:
+    assert read_settings("pendulum", {}).store_path(name) == Path("runs") / file

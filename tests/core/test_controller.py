@@ -181,3 +181,9 @@ def double(t: int, x: np.ndarray, task: Task) -> np.ndarray:
 def test_a_bound_policy_can_go_to_another_process() -> None:
     pi = Policy(double, limits=3.0).design(Task([1.0], horizon=3, dt=0.1), Linear([[1.0]], [[1.0]]))
     assert pickle.loads(pickle.dumps(pi))(0, np.array([1.0])).tolist() == [2.0]
+
+
+@pytest.mark.parametrize("step", [-1, 4])
+def test_a_step_that_the_task_does_not_have_is_refused(step: int) -> None:
+    with pytest.raises(InputError, match=f"the controller has inputs for the steps 0 to 3, got step {step}"):
+        feedback()(step, np.zeros(3))

@@ -68,6 +68,9 @@ def test_goals_are_those_of_states_that_are_weighed_and_compared() -> None:
     validation = make_validation(distance=distances.FinalState(components=[1]))
     assert aimed_states(make_validation(), 2).tolist() == [0, 1]
     assert aimed_states(validation, 2).tolist() == [1]
+    for components, aimed in (([-1], [1]), ([0, 7], [0]), ([7], [])):
+        compared = make_validation(distance=distances.FinalState(components=components))
+        assert aimed_states(compared, 2).tolist() == aimed
     # A policy does not tell what it brings to a goal.
     told = validation._with(synthesizer=controllers.Policy(lambda t, x, task: 0 * x[..., :1]))
     assert not len(aimed_states(told, 2))

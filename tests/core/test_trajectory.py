@@ -282,9 +282,9 @@ def test_a_batch_is_refused_as_csv(batch: Trajectory, tmp_path: Path) -> None:
     ("text", "sentence"),
     [
         ("t,x0,u0\n0,1,2\n1,one,\n", r"rig\.csv, line 3: x0 must be a number, got 'one'"),
-        ("t,x0,u0\n0,1,\n1,2,\n", r"rig\.csv, line 2: u0 must be a number, got ''"),
+        ("t,x0,u0\n0,1,\n1,2,\n", r"rig\.csv, line 2: u0 must be a number, and the cell is empty"),
         ("t,x0,u0\nnoon,1,2\n1,2,\n", r"rig\.csv, line 2: t must be a number, got 'noon'"),
-        ("t,x0,u0\n0,1,2\n1\n", r"rig\.csv, line 3: x0 must be a number, got None"),
+        ("t,x0,u0\n0,1,2\n1\n", r"rig\.csv, line 3: x0 must be a number, and the cell is empty"),
         ("x0,u0\n1,2\n3,\n", r"must have the columns t, x0, \.\.\., u0, \.\.\.; it has x0, u0"),
         ("t,u0\n0,2\n1,\n", r"must have the columns t, x0"),
         ("t,x0,u0\n0,1,2\n", "a header and at least two rows"),

@@ -322,6 +322,7 @@ def test_the_relative_deviation_divides_by_the_motion_of_the_model() -> None:
         (lambda: FinalState(angles=[0.5]), InputError, r"angles must be indices of states, got \[0.5\]"),
         (lambda: AtTimes(), ShapeError, "times must be a list"),
         (lambda: RelativeDeviation(), ShapeError, "least must be a list"),
+        (lambda: FinalState(components=[]), InputError, "components must name at least one state; leave it out"),
         (lambda: AtCrossing(crossings=0), InputError, "crossings must be an integer >= 1, got 0"),
         (lambda: AtCrossing(level=np.inf), InputError, "level must be finite"),
         (lambda: CrossingTime(direction="upp"), UnknownNameError, "did you mean 'up'"),

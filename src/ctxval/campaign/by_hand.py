@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ctxval._util.files import csv_rows
 from ctxval._util.texts import unguarded
 from ctxval.campaign.choices import OpenTrial
@@ -21,7 +23,7 @@ from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
 from ctxval.core.plan import Plan
 from ctxval.core.space import TaskSpace
-from ctxval.core.trajectory import Trajectory
+from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping, is_log, read_recordings
 from ctxval.errors import InputError
@@ -109,7 +111,22 @@ def read_recording(
         recording = Trajectory.from_csv(path, states=labels_of(states), inputs=labels_of(inputs))
         if inputs and not recording.inputs.shape[-1]:
             raise InputError(f"{path} must have the columns of the inputs, {', '.join(inputs)}.")
+    _require_finite(path, recording, *map(list, _names(experiment, plan)))
     return recording.resampled(plan.task.times) if resample else recording
+
+
+def _require_finite(path: Path, recording: Trajectory, states: list[str], inputs: list[str]) -> None:
+    """Refuse a complete recording with a number that is missing or infinite; the message says where."""
+    if recording.ended != COMPLETE:
+        return  # the reason why it ended is reported instead
+    for names, values in ((states, recording.states), (inputs, recording.inputs)):
+        wrong = np.argwhere(~np.isfinite(values[:, : len(names)]))
+        if len(wrong):
+            row, column = wrong[0]
+            raise InputError(
+                f"{path} is not finite: {names[column]} is {values[row, column]} at {recording.times[row]:g} s. "
+                "If the execution has no usable recording, report it with --failed."
+            )
 
 
 def _logged(path: Path, plan: Plan, mapping: LogMapping | None) -> Trajectory:

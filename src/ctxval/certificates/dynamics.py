@@ -113,7 +113,10 @@ def require_executions(sample: Sample) -> None:
             f"{advice_to_remeasure(sample)}"
         )
     if not sample.best > 0:
-        raise CertificateError("all distances are 0, so no prediction of a distance was tested.")
+        raise CertificateError(
+            "all distances are 0, so no prediction of a distance was tested. Check that the distance compares what "
+            "differs; an audit bounds how many tasks are worse."
+        )
 
 
 def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: float = 0.95) -> Certificate:

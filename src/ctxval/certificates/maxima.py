@@ -212,7 +212,10 @@ def _required_data(sample: Sample) -> tuple[Array, Array]:
     if len(sample) < FEWEST:
         raise CertificateError(f"a posterior bound needs at least {FEWEST} trials, got {len(sample)}.")
     if np.ptp(sample.distances) == 0:
-        raise CertificateError(f"all {len(sample)} distances are {sample.distances[0]:g}: they do not bound d*.")
+        raise CertificateError(
+            f"all {len(sample)} distances are {sample.distances[0]:g}: they do not bound d*. Check that the distance "
+            "compares what differs; an audit bounds how many tasks are worse."
+        )
     spread, largest = float(np.ptp(sample.distances)), float(np.abs(sample.distances).max())
     if spread < _ROUNDING * largest:
         raise CertificateError(f"the distances differ from {largest:g} by rounding alone: they do not bound d*.")

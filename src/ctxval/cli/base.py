@@ -48,32 +48,48 @@ err = Screen(stderr=True)
 def command(function: Callable[..., Any]) -> Callable[..., Any]:
     """Let a command print its result as JSON, and turn its errors into one sentence and an exit status.
 
-    The command returns the JSON object, or the object and the exit status.
+    The command returns the JSON object, or the object and the exit status. With ``--json``, an error is the object
+    ``{"error": sentence}``.
     """
 
     @functools.wraps(function)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
         warnings.showwarning = _show_warning
+        as_json = bool(kwargs.get("as_json"))
         try:
-            as_json = bool(kwargs.get("as_json"))
             with _stdout_to_stderr() if as_json else nullcontext() as stdout, progress_shown(not as_json, err):
                 return _finish(function(*args, **kwargs), stdout)
         except CtxvalError as error:
-            say_error(str(error))
+            _say_failure(str(error), as_json)
             raise typer.Exit(BAD_INPUT if isinstance(error, _BAD) else CANNOT_GO_ON) from None
         except (typer.Exit, typer.Abort):
             raise
         except KeyboardInterrupt:
-            err.say("stopped. All executions are stored; run the same command to resume.")
+            err.say(_STOPPED)
+            _print_failure(_STOPPED, as_json)
             raise typer.Exit(INTERRUPTED) from None
         except BaseException as error:  # users' code may raise anything
             if isinstance(error.__context__, BrokenPipeError):
                 raise typer.Exit(CUT_OFF) from None  # the reader of the output has ended, as in `| head`
             # Python's own exit status here would be 1, which means that a model is falsified.
-            say_error(reason_of(error))
+            _say_failure(reason_of(error), as_json)
             raise typer.Exit(CANNOT_GO_ON) from None
 
     return wrapped
+
+
+def _say_failure(sentence: str, as_json: bool) -> None:
+    """Print an error message, and its JSON object on the standard output if the result would be one."""
+    say_error(sentence)
+    _print_failure(sentence, as_json)
+
+
+def _print_failure(sentence: str, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps({"error": sentence}), flush=True)
+
+
+_STOPPED = "stopped. All executions are stored; run the same command to resume."
 
 
 def _finish(result: Any, stdout: Any) -> None:
@@ -195,7 +211,7 @@ def print_table(rows: dict[str, Any], units: str = "") -> None:
 def _text(value: Any, units: str) -> str:
     match value:
         case list():
-            return ", ".join(_text(item, units) for item in value)
+            return ", ".join(_text(item, units) for item in value) or "none"
         case {"task": dict() as task, "distance": distance, **rest}:
             at = ", ".join(f"{name} = {_text(item, '')}" for name, item in task.items())
             how = f" ({rest['method']})" if "method" in rest else ""

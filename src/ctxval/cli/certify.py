@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -104,7 +106,7 @@ def certify_store(
     Options that are not given have the values that the campaign was run with.
     """
     opened = Store.existing(store)
-    kind = _chosen_kind(opened, kind, audit)
+    asked, kind = kind, _chosen_kind(opened, kind, audit)
     loads = audit is not None or _needs_model(opened, kind)
     if not loads and (trust or experiment is not None):
         raise InputError(
@@ -132,6 +134,8 @@ def certify_store(
     others = [str(other) for other in other_stores(store)]
     if not as_json:
         _print_assessment(found)
+        if asked is None and kind == "posterior":
+            _print_auto(store)
         print_other_stores(others)
     report = {**found.to_json(), "store": str(store), "other_stores": others}
     return report, FALSIFIED if found.verdict is not None and found.verdict.answer == "falsified" else 0
@@ -147,6 +151,15 @@ def _chosen_kind(store: Store, kind: str | None, audit: int | None) -> str | Non
     if audit is not None:
         return "audit"
     return "posterior" if planned_settings(store).certificate.kind == "auto" else None
+
+
+def _print_auto(store: Path) -> None:
+    """Say how to get the verdict of the campaign, which may differ from that of the posterior bound."""
+    out.say(
+        "the campaign was run with the kind auto, which may decide earlier. It loads the experiment, so it must be "
+        f"asked for: `ctxval certify {shlex.quote(str(store))} --kind auto`.",
+        wrap=True,
+    )
 
 
 def _needs_model(store: Store, kind: str | None) -> bool:

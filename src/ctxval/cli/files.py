@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ctxval._util.files import make_folder_of
 from ctxval.aspect1 import TASKS
 from ctxval.cli.aspect1_findings import aspect1_findings
 from ctxval.cli.base import BAD_INPUT, FALSIFIED, app, command, out
@@ -119,6 +120,7 @@ def init(
     for path in contents:
         if path.exists():
             raise InputError(f"{path} already exists and was not changed.")
+    make_folder_of(file)
     try:
         for path, content in contents.items():
             with path.open("x", encoding="utf-8") as opened:

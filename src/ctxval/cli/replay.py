@@ -120,15 +120,15 @@ def _name(model: str | None, experiment: Experiment | None) -> str:
 
 
 def numbers(text: str) -> list[int]:
-    """Return the integers in a text with commas between them.
+    """Return the numbers of steps in a text with commas between them.
 
     Raises:
-        InputError: if a part is no integer.
+        InputError: if a part is no positive integer.
     """
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(f"--steps must be integers with commas between them, such as 1,10,50, got {text!r}.") from None
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() and int(part) > 0 for part in parts):
+        raise InputError(f"--steps must be positive integers with commas between them, such as 1,10,50, got {text!r}.")
+    return [int(part) for part in parts]
 
 
 # What is printed

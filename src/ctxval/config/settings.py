@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import tomllib
 from dataclasses import replace
@@ -277,7 +278,9 @@ class Settings(BaseModel):
         if self.store is not None:
             return self.store
         options = [f"{key}-{value}" for key, value in self.options.items()]
-        return Path("runs") / f"{'-'.join([name, *options, self.search.name])}-seed{self.seed}.sqlite"
+        # A name may have any characters, but the store must be in the folder.
+        names = re.sub(r"[/\\\x00-\x1f\x7f]", "-", "-".join([name, *options, self.search.name]))
+        return Path("runs") / f"{names}-seed{self.seed}.sqlite"
 
 
 def _with_refined(validation: Validation, path: Path) -> Validation:
@@ -322,7 +325,9 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
     try:
         return Settings.model_validate(whole)
     except ValidationError as error:
-        raise InputError(sentence_of(target, error)) from error
+        option = error.errors()[0]["loc"][:1]
+        source = "the command line" if option and overrides.get(str(option[0])) is not None else target
+        raise InputError(sentence_of(source, error)) from error
 
 
 def not_an_experiment(target: str, *others: str) -> str:
@@ -360,4 +365,6 @@ def sentence_of(target: str, error: ValidationError) -> str:
         return f"{target}: {first['msg']}"
     if first["type"] == "extra_forbidden":
         return f"{target}: {UnknownNameError.among('setting', str(first['loc'][-1]), Settings.model_fields)}"
-    return f"{target}: {where}: {first['msg'].lower()}, got {str(first['input'])[:100]!r}."
+    value = first["input"]
+    shown = repr(value[:100]) if isinstance(value, str) else str(value)[:100]
+    return f"{target}: {where}: {first['msg'].lower()}, got {shown}."

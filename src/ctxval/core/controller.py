@@ -219,7 +219,14 @@ class AffineFeedback:
     converged: Mask | None = None
 
     def __call__(self, t: int, x: Array) -> Array:
-        """Return the input at step t, shape ``(..., m)``."""
+        """Return the input at step t, shape ``(..., m)``.
+
+        Raises:
+            InputError: if the task has no such step.
+        """
+        steps = self.inputs.shape[-2]
+        if not 0 <= t < steps:
+            raise InputError(f"the controller has inputs for the steps 0 to {steps - 1}, got step {t}.")
         deviation = x - self.states[..., t, :]
         u = self.inputs[..., t, :] + fed_back(self.gains[..., t, :, :], deviation)
         return u if self.limits is None else self.limits.clip(u)

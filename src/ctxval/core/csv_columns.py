@@ -61,9 +61,17 @@ def read_columns(
     if header and (time is None or not x):
         raise InputError(
             f"{path} must have the columns t, {', '.join(states or ('x0', '...'))}, "
-            f"{', '.join(inputs or ('u0', '...'))}; it has {_listed(header)}."
+            f"{', '.join(inputs or ('u0', '...'))}; {_found(header)}."
         )
     return _Columns(path, header, [time or "", *x], u).read(rows, most_rows)
+
+
+def _found(header: Sequence[str]) -> str:
+    """Return what is wrong with a header, for a message."""
+    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
+        if len(header) == 1 and separator in header[0]:
+            return f"it has {name} between its columns: use commas, and points in the numbers"
+    return f"it has {_listed(header)}"
 
 
 def _column_names(letter: str, names: Sequence[str] | None, count: int) -> list[str]:
@@ -115,12 +123,12 @@ class _Columns:
     def _numbers(self, line: int, row: list[str], names: list[str]) -> Iterator[float]:
         for name in names:
             place = self.places[name]
-            cell = row[place] if place < len(row) else None
+            cell = row[place] if place < len(row) else ""
             try:
-                yield float(cell or "")
+                yield float(cell)
             except ValueError:
-                shown = repr(cell if cell is None else cell[:60])
-                raise InputError(f"{self.path}, line {line}: {name} must be a number, got {shown}.") from None
+                shown = f"got {cell[:60]!r}" if cell.strip() else "and the cell is empty"
+                raise InputError(f"{self.path}, line {line}: {name} must be a number, {shown}.") from None
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -196,7 +196,8 @@ def aimed_states(validation: Validation, count: int) -> Rows:
     compared = getattr(validation.distance, "components", None)
     aimed = np.diag(weights) > 0
     if compared is not None:
-        aimed = aimed & np.isin(np.arange(count), np.arange(count)[list(compared)])
+        # An index that no state has is left to the distance, which refuses it.
+        aimed = aimed & np.isin(np.arange(count), [index + count * (index < 0) for index in compared])
     return np.flatnonzero(aimed)
 
 

@@ -383,7 +383,7 @@ class Validation:
         except BaseException as error:
             if raised_by_signal(error):
                 raise
-            raise DistanceError(f"the distance failed: {reason_of(error)}.") from error
+            raise DistanceError(f"the distance failed: {reason_of(error).rstrip('.')}.") from error
 
     def _refuse_distance(self, value: Array, point: Array) -> NoReturn:
         where = self.space.describe_point(point)

@@ -180,9 +180,10 @@ class LogMapping:
         known = log.fields()
         states, inputs = _usual(known, _STATES, "x"), _usual(known, _INPUTS, "u")
         if not states:
+            fields = ", ".join(known[:24]) + (", ..." if len(known) > 24 else "")
             raise InputError(
                 f"{log.source} has no states under a usual name ({', '.join(_STATES)}, x0): name the states and inputs "
-                f"in a mapping; the fields are {', '.join(known[:24])}{', ...' if len(known) > 24 else ''}."
+                f"with --state and --input or in a mapping; the fields are {fields}."
             )
         return LogMapping(states, inputs, dt=log.period)
 

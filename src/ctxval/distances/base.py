@@ -35,7 +35,8 @@ class StateNorm:
             most pi.
 
     Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity, or a weight or a scale cannot be used.
+        InputError: if the order of the norm is not 1, 2 or infinity, no state is compared, or a weight or a scale
+            cannot be used.
         ShapeError: if the number of weights or scales is not that of the compared states.
     """
 
@@ -48,6 +49,8 @@ class StateNorm:
 
     def __post_init__(self) -> None:
         as_norm_order(self.norm)
+        if self.components is not None and not len(self.components):
+            raise InputError("components must name at least one state; leave it out to compare all states.")
         require_numbers("weights", self.weights, self.components, zero=True)
         require_numbers("scales", self.scales, self.components, zero=False)
         if not all(isinstance(index, int | np.integer) and not isinstance(index, bool) for index in self.angles):

@@ -140,7 +140,12 @@ class Database:
         except sqlite3.DatabaseError as error:
             hint = "; `ctxval export` saves what is readable" if "malformed" in str(error) else ""
             raise ForeignStoreError(f"{self.name} cannot be read as a store: {error}{hint}.") from error
-        except (OSError, ValueError, OverflowError) as error:
+        except OSError as error:
+            where = "" if error.filename is None else f"{error.filename}: "
+            raise StoreAccessError(
+                f"{self.name} cannot be used as a store: {where}{error.strerror or error}."
+            ) from error
+        except (ValueError, OverflowError) as error:
             if isinstance(error, InputError):
                 raise
             raise StoreAccessError(f"{self.name} cannot be used as a store: {error}.") from error
