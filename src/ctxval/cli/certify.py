@@ -103,7 +103,7 @@ def certify_store(
 
     A kind that uses what the experiment's model predicts loads the experiment; other kinds run no code.
 
-    Options that are not given have the values that the campaign was run with.
+    Options that are not given have the values that the campaign was run with, except --kind.
     """
     opened = Store.existing(store)
     asked, kind = kind, _chosen_kind(opened, kind, audit)
