@@ -123,6 +123,9 @@ def test_a_store_knows_what_it_is_of(invoke: Any) -> None:
     assert [r["trial"] for r in (second, chosen, drawn)] == [1, 2, 3]
     assert (chosen["task"], chosen["origin"], drawn["origin"]) == ({"goal": 1.25}, "manual", "iid")
     assert Path("elsewhere/task.json").exists()
+    assert [r["open"] for r in (second, chosen, drawn)] == [[0], [0, 1], [0, 1, 2]]
+    said = " ".join(invoke("ask", "a.sqlite", "--trial", "1").stdout.split())
+    assert "3 other trials are open: 0, 2, 3. next: ctxval tell a.sqlite 1" in said
     status = json.loads(invoke("status", "a.sqlite", "--json").stdout)
     assert (status["open"], status["executions"]) == ([0, 1, 2, 3], 0)
 

@@ -157,6 +157,7 @@ def _asked(opened: Opened, found: OpenTrial, out_folder: Path | None) -> dict[st
         "store": str(opened.path),
         "folder": str(folder),
         "files": write_files(folder, opened.experiment, found),
+        "open": [t.number for t in opened.campaign.trials if t.state == "open" and t.number != found.number],
     }
 
 
@@ -318,4 +319,8 @@ def _print_asked(report: dict[str, Any], opened: OpenTrial) -> None:
     out.say(f"{', '.join(report['files'])} in {report['folder']}")
     if "controller.json" not in report["files"]:
         out.say("the controller cannot be written to a file: this is possible only for affine feedback (LQR and iLQR).")
+    if report["open"]:
+        count = len(report["open"])
+        numbers = ", ".join(map(str, report["open"][:10])) + (", ..." if count > 10 else "")
+        out.say(f"{count} other {'trial is' if count == 1 else 'trials are'} open: {numbers}.")
     out.say(f"next: ctxval tell {shlex.quote(report['store'])} {opened.number} --trajectory run.csv")
