@@ -428,15 +428,15 @@ part, and those in which `auto` needs fewer / more executions to 5 % and to 1 % 
 {ablations_summary}
 
 The trust score and the boldness save executions on the systems by which they were chosen, and hardly any on the others.
-They stay: without boldness or trust regions the search repeats itself (last column above), and without the trust score
-the mean share of d* is smaller.
+They stay: without boldness or trust regions the search repeats itself (column `next to an earlier one` above), and
+without the trust score the mean share of d* is smaller.
 
 The code of commit 64a3b0d had two further mechanisms. A second Gaussian process, over the tasks, learned the ratio of
 the executed to the predicted distances with its noise, and the prediction was multiplied by this discrepancy. And a
 local search did not start next to an executed task unless a larger distance was predicted there. Both are gone: they
 saved executions only on systems by which they were chosen, although fewer executions were next to an earlier one. The
-table compares all campaigns. Columns 5 % and 1 % count those that needed fewer / more executions with these mechanisms
-than without them.
+table compares all campaigns; its last two rows are the plants and the further systems. Columns 5 % and 1 % count those
+that needed fewer / more executions with these mechanisms than without them.
 
 {left_out}
 

@@ -387,6 +387,16 @@ def test_a_recording_of_something_else_is_refused_and_the_trial_stays_open(
     assert Store("a.sqlite").trials()[0].state == "open"
 
 
+def test_a_batch_of_recordings_is_refused(invoke: Any) -> None:
+    one = record(new(invoke)["folder"])
+    states = np.stack([one.states, np.full_like(one.states, np.nan)])
+    Path("two.npz").write_bytes(Trajectory(one.times, states, np.stack([one.inputs] * 2)).to_npz())
+    assert "two.npz must be one recording, got a batch of shape (2, 21, 2)" in refused(
+        invoke("tell", "a.sqlite", "0", "--npz", "two.npz")
+    )
+    assert Store("a.sqlite").trials()[0].state == "open"
+
+
 def test_a_start_that_is_elsewhere_can_be_allowed(invoke: Any) -> None:
     record(new(invoke)["folder"])
     edit(with_cell(2, 1, "0.3"))

@@ -659,3 +659,22 @@ def test_every_help_text_is_a_sentence() -> None:
             assert not re.search(r"\[[a-z#/@]", text.replace("position[", "")), (
                 f"rich would take this for markup: {text}"
             )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("reader", "status"), [("ended", 141), ("full disk", 2)])
+def test_an_error_that_cannot_be_written_as_json_keeps_its_exit_status(
+    tmp_path: Path, reader: str, status: int
+) -> None:
+    if reader == "full disk" and not Path("/dev/full").exists():
+        pytest.skip("there is no /dev/full here")
+    if reader == "ended":
+        ours, theirs = os.pipe()
+        os.close(ours)
+    else:
+        theirs = os.open("/dev/full", os.O_WRONLY)
+    command = [sys.executable, "-m", "ctxval.cli", "status", "none.sqlite", "--json"]
+    done = subprocess.run(command, stdout=theirs, stderr=subprocess.PIPE, text=True, cwd=tmp_path, check=False)
+    os.close(theirs)
+    assert done.returncode == status
+    assert done.stderr == "error: there is no store at none.sqlite.\n"

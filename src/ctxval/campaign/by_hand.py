@@ -111,6 +111,8 @@ def read_recording(
         recording = Trajectory.from_csv(path, states=labels_of(states), inputs=labels_of(inputs))
         if inputs and not recording.inputs.shape[-1]:
             raise InputError(f"{path} must have the columns of the inputs, {', '.join(inputs)}.")
+    if recording.states.ndim != 2:
+        raise InputError(f"{path} must be one recording, got a batch of shape {recording.states.shape}.")
     _require_finite(path, recording, *map(list, _names(experiment, plan)))
     return recording.resampled(plan.task.times) if resample else recording
 

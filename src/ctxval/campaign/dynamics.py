@@ -65,7 +65,7 @@ class CampaignDynamics:
         experiment: a digest of the description; a stored prediction belongs to one experiment.
         elsewhere: returns recordings of the same system that belong to no trial of this campaign. They teach the
             dynamics, and they are no executions of this model's controllers.
-        failure: the exception that ended the last :meth:`evidence`, in words; None if there was none.
+        failure: the exception because of which the last :meth:`evidence` was None, in words; None if there was none.
     """
 
     def __init__(self, validation: Validation, store: Store, seed: int, description: Mapping[str, Any]) -> None:

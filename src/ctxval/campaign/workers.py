@@ -234,6 +234,13 @@ def _run_worker(system: System, pipe: Connection, others: list[Connection], pare
     # With a copy of the campaign's random state, every worker would have the same noise.
     np.random.seed()  # noqa: NPY002
     random.seed()
+    try:
+        _execute_all(system, pipe)
+    finally:
+        _leave_once()
+
+
+def _execute_all(system: System, pipe: Connection) -> None:
     while True:
         try:
             controller, task = pickle.loads(pipe.recv_bytes())
@@ -257,13 +264,19 @@ _leaving = False
 
 
 def _exit_on_signal(_signal: int, _frame: FrameType | None) -> None:
-    """Leave once. An exception while a forked process ends would let it go on where it was forked, as the campaign."""
+    if _leave_once():
+        raise SystemExit(_TERMINATED)
+
+
+def _leave_once() -> bool:
+    """Ignore signals from now on, because the worker ends; return whether it had not yet begun to end.
+
+    An exception while a forked process ends would let it go on where it was forked, as a copy of the campaign.
+    """
     global _leaving
-    if _leaving:
-        return
-    _leaving = True
+    first, _leaving = not _leaving, True
     allow_exits()
-    raise SystemExit(_TERMINATED)
+    return first
 
 
 def _exit_with_parent(parent: int) -> None:
@@ -272,6 +285,7 @@ def _exit_with_parent(parent: int) -> None:
         time.sleep(_POLL_INTERVAL)
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_GRACE_PERIOD)
+    allow_exits()  # the execution may be going on, in code that no signal handler interrupts
     os._exit(1)
 
 

@@ -10,7 +10,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -85,8 +85,16 @@ def _say_failure(sentence: str, as_json: bool) -> None:
 
 
 def _print_failure(sentence: str, as_json: bool) -> None:
-    if as_json:
+    if not as_json:
+        return
+    try:
         print(json.dumps({"error": sentence}), flush=True)
+    except OSError as error:
+        # What is still buffered must not fail again at the exit of the interpreter, which would change the status.
+        with suppress(io.UnsupportedOperation, OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            raise typer.Exit(CUT_OFF) from None
 
 
 _STOPPED = "stopped. All executions are stored; run the same command to resume."

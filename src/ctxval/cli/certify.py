@@ -31,8 +31,8 @@ Kind = Annotated[
     str | None,
     typer.Option(
         help=f"Kind of the certificate: {', '.join(KINDS.built_in)}, or a kind from an installed package (default: "
-        "audit if --audit is given, otherwise posterior). The kinds auto, dynamics, mean and region load the "
-        "experiment."
+        "audit if --audit is given, otherwise that of the campaign, and posterior if that is auto). The kinds auto, "
+        "dynamics, mean and region load the experiment."
     ),
 ]
 Draws = Annotated[
@@ -103,7 +103,8 @@ def certify_store(
 
     A kind that uses what the experiment's model predicts loads the experiment; other kinds run no code.
 
-    Options that are not given have the values that the campaign was run with, except --kind.
+    Options that are not given have the values that the campaign was run with. If its kind was auto, --kind is
+    posterior, because auto loads the experiment.
     """
     opened = Store.existing(store)
     asked, kind = kind, _chosen_kind(opened, kind, audit)

@@ -11,7 +11,7 @@ from ctxval.gp.subset import kept_rows
 from ctxval.gp.surrogate import fit_surrogate
 from ctxval.searches.base import Prediction
 
-REPRESENTING = 150
+_REPRESENTING = 150
 """Largest number of known values from which the errors of the surrogate are computed."""
 _ERROR_OFFSET = 0.1
 """The c of ``log(d + c)`` in errors of predictions, in medians of the known values: small values count little."""
@@ -74,7 +74,7 @@ def log_error(expected: Array, values: Array) -> float:
 
 def represented(points: Array, values: Array) -> Rows:
     """Return the rows of a long history that represent all of it, in their order; they end with the latest ones."""
-    return kept_rows(points, values, REPRESENTING, long=REPRESENTING)
+    return kept_rows(points, values, _REPRESENTING, long=_REPRESENTING)
 
 
 def left_out_by_surrogate(points: Array, values: Array) -> Array:
