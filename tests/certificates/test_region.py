@@ -212,8 +212,14 @@ def test_a_margin_below_zero_is_said_in_words() -> None:
 
 
 @pytest.mark.slow
-def test_on_a_campaign_the_bound_holds_at_tasks_that_were_not_drawn() -> None:
-    campaign = Campaign(make_validation(), search=searches.Auto(), seed=5).run(6).audit(60)
+def test_on_campaigns_the_bound_holds_at_tasks_that_were_not_drawn() -> None:
+    exceeding = [seed for seed in (4, 5, 6, 7) if share_above_bound(seed) > 0]
+    assert len(exceeding) <= 1  # each holds with a probability of 0.95; of seeds 0 to 15, that of seed 5 does not
+
+
+def share_above_bound(seed: int) -> float:
+    """Return by how much the volume above the bound of a campaign exceeds the volume that the bound leaves out."""
+    campaign = Campaign(make_validation(), search=searches.Auto(), seed=seed).run(6).audit(60)
     threshold = 1.01 * max(trial.distance or 0.0 for trial in campaign.trials)
     by = CertificateOptions(Region(), volume=0.1)
     verdict = campaign.verdict(threshold, certificate=by)
@@ -227,5 +233,5 @@ def test_on_a_campaign_the_bound_holds_at_tasks_that_were_not_drawn() -> None:
     points = np.linspace(0, 1, 201)[:, None]
     truth = campaign.validation.distances(campaign.validation.space.from_unit(points))
     bound = learned.expected(points, 6) + certificate.details["margin"]
-    assert (truth > bound).mean() <= certificate.details["volume_of_draws"]
     assert certificate.details["margin"] < 0.1 * truth.max()
+    return float((truth > bound).mean() - certificate.details["volume_of_draws"])

@@ -187,8 +187,11 @@ def test_splits_are_printed(invoke: Invoke) -> None:
         (("logs", "--model", "absent.npz"), "absent.npz cannot be read as a model (an NPZ file of ctxval, or one with"),
         (("logs", "--model", "absent.toml"), "there is no experiment file absent.toml"),
         (("logs", "--model", "absent:model"), "no module named 'absent'"),
-        (("logs", *LINEAR, "--steps", "1,two"), "--steps must be integers with commas between them"),
-        (("logs", *LINEAR, "--steps", "0"), "steps must be positive integers, got [0]"),
+        (("logs", *LINEAR, "--steps", "1,two"), "--steps must be positive integers with commas between them"),
+        (
+            ("logs", *LINEAR, "--steps", "0"),
+            "between them, such as 1,10,50, got '0'",
+        ),
         (("logs", *LINEAR, "--dt", "-1"), "dt of a mapping must be a positive number"),
         (("logs", *LINEAR, "--delay", "nan"), "delay of a mapping must be a finite number"),
         (("logs", *LINEAR, "--state", "x=x9"), "has no field 'x9'; it has t, x0, x1, u0"),
