@@ -9,10 +9,10 @@ import numpy as np
 import misleading
 from calibration_page import table
 from plants import DEVELOPMENT, REPORTING
-from search_cells import ENDS, cells, reached, results
+from search_cells import ENDS, ENDS_OF, cells, reached, results
 from study_ablations import ABLATIONS, BUDGET, CHOSEN_BY, ON_PLANTS, OTHERS
 from study_ablations import CASES as ABLATED
-from study_auto import CASES, WITHIN, Result, first_within, repeated, shown
+from study_auto import CASES, Result, first_within, repeated, shown
 
 ABLATION_SEEDS = range(5)
 SHOWN = {"no climbs": "no trust region"}
@@ -64,7 +64,7 @@ TOGETHER = ["campaigns", "within 5 %", "within 1 %", "median to 5 %", "mean shar
 
 def together(campaigns: list[Result]) -> list[str]:
     """Return counts and means over campaigns on several systems."""
-    near = [[first_within(result, percent) for result in campaigns] for percent in (WITHIN[0], WITHIN[-1])]
+    near = [[first_within(result, percent) for result in campaigns] for percent in ENDS_OF]
     executions = sum(len(result["distances"]) for result in campaigns)
     wasted = sum(repeated(result) or 0 for result in campaigns)
     return [
@@ -108,9 +108,6 @@ def _before_and_today(case: str, study: str) -> list[tuple[Result, Result]]:
     """Return the campaigns with the discrepancy and those of today, on the seeds that both have."""
     today = results(study, case, "auto")
     return [(run, today[seed]) for seed, run in results("auto_left_out", case, "discrepancy").items() if seed in today]
-
-
-ENDS_OF = (WITHIN[0], WITHIN[-1])
 
 
 def _plants(kind: str) -> list[str]:

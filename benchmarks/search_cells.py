@@ -11,6 +11,8 @@ from ctxval._util.json_lines import JsonLines
 from study_auto import WITHIN, Result, first_within, results_of, shown
 
 SEEDS = range(10)
+ENDS_OF = (WITHIN[0], WITHIN[-1])
+"""The percentages of d* that tables show."""
 
 Counts = list[float]
 """Executions to somewhere, seed by seed; infinity where the budget did not suffice."""
@@ -49,7 +51,7 @@ def cells(found: Iterable[Result]) -> list[str]:
     campaigns = list(found)
     budget = campaigns[0]["budget"]
     row = []
-    for percent in (WITHIN[0], WITHIN[-1]):
+    for percent in ENDS_OF:
         counts = [first_within(result, percent) for result in campaigns]
         row.append(f"{shown(float(np.median(counts)), budget)} ({spread(counts, budget)}), {reached(counts)}")
     shares = [100 * largest(result) / result["truth"] for result in campaigns]

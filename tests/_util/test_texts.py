@@ -17,6 +17,7 @@ from ctxval import Campaign, Trajectory, searches
 from ctxval._util.texts import (
     LONGEST,
     aligned,
+    enumerated,
     guarded,
     markdown_text,
     plain,
@@ -175,3 +176,8 @@ def test_columns_are_as_wide_as_their_longest_cell() -> None:
 
 def test_texts_cannot_become_markup_in_markdown() -> None:
     assert markdown_text("a|b <i>\n*c*") == r"a\|b \<i\> \*c\*"
+
+
+@pytest.mark.parametrize(("count", "text"), [(0, ""), (1, "0"), (3, "0, 1, 2"), (4, "0, 1, 2, ...")])
+def test_many_items_are_enumerated_up_to_a_number(count: int, text: str) -> None:
+    assert enumerated(range(count), 3) == text

@@ -34,6 +34,19 @@ def run_of(system: Any, budget: int = 8, **options: Any) -> Campaign:
     return Campaign(make_validation(system=system), search=searches.Random(), seed=5).run(budget, **options)
 
 
+def run_python(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run Python in a folder, with the modules of the tests."""
+    return subprocess.run(
+        [sys.executable, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path])},
+        cwd=folder,
+        check=False,
+    )
+
+
 class Heard:
     """Fails if the progress of the campaign is heard in its process."""
 
@@ -256,15 +269,7 @@ finally:
 
 @pytest.mark.slow
 def test_a_worker_that_is_signalled_while_it_ends_does_not_go_on_as_the_campaign(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", SIGNALLED_AT_ITS_END],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path])},
-        cwd=tmp_path,
-        check=False,
-    )
+    done = run_python("-c", SIGNALLED_AT_ITS_END, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "campaign left\n"
     assert len(list(tmp_path.glob("ended-*"))) == 2
@@ -376,15 +381,7 @@ def test_a_campaign_on_dask_survives_the_death_of_a_worker(tmp_path: Path) -> No
     script = tmp_path / "cluster.py"
     script.write_text(DASK)
     (tmp_path / "marks").mkdir()
-    done = subprocess.run(
-        [sys.executable, str(script), str(tmp_path / "a.sqlite"), str(tmp_path / "marks")],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path])},
-        cwd=tmp_path,
-        check=False,
-    )
+    done = run_python(str(script), str(tmp_path / "a.sqlite"), str(tmp_path / "marks"), folder=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "killed a worker after" in done.stdout
     trials = Store(tmp_path / "a.sqlite").trials()

@@ -1,9 +1,9 @@
-"""Texts from elsewhere, made harmless for terminals, Markdown and spreadsheets; and columns of plain text."""
+"""Texts from elsewhere, made harmless for terminals, Markdown and spreadsheets; and lists and columns of plain text."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 LONGEST = 2_000
 """Largest number of characters of a failure's text that are kept: half from its beginning, half from its end."""
@@ -39,6 +39,12 @@ def shortened(text: str, longest: int = LONGEST) -> str:
     tail = room // 2
     head = room - tail
     return text[:head] + _gap(len(text) - head - tail) + text[len(text) - tail :]
+
+
+def enumerated(items: Iterable[object], most: int) -> str:
+    """Return items with commas between them; if there are more than ``most``, the first ones and an ellipsis."""
+    texts = [str(item) for item in items]
+    return ", ".join(texts[:most]) + (", ..." if len(texts) > most else "")
 
 
 def _gap(characters: int) -> str:

@@ -104,16 +104,16 @@ def read_recording(
         logged = _logged(path, plan, mapping)
         return logged.resampled(plan.task.times) if resample else logged
     _require_file(path)
+    states, inputs = _names(experiment, plan)
     if path.suffix == ".npz" if npz is None else npz:
         recording = Trajectory.from_npz(path)
     else:
-        states, inputs = _names(experiment, plan)
         recording = Trajectory.from_csv(path, states=labels_of(states), inputs=labels_of(inputs))
         if inputs and not recording.inputs.shape[-1]:
             raise InputError(f"{path} must have the columns of the inputs, {', '.join(inputs)}.")
     if recording.states.ndim != 2:
         raise InputError(f"{path} must be one recording, got a batch of shape {recording.states.shape}.")
-    _require_finite(path, recording, *map(list, _names(experiment, plan)))
+    _require_finite(path, recording, list(states), list(inputs))
     return recording.resampled(plan.task.times) if resample else recording
 
 

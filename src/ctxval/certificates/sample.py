@@ -10,6 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, record
+from ctxval._util.texts import enumerated
 from ctxval.certificates.learned import LearnedDistance
 from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
@@ -189,7 +190,7 @@ _LISTED = 5
 
 def listed(numbers: Sequence[int]) -> str:
     """Return numbers of trials as text; if there are many, only the first few."""
-    first = ", ".join(map(str, numbers[:_LISTED])) + (", ..." if len(numbers) > _LISTED else "")
+    first = enumerated(numbers, _LISTED)
     return f"trial {first}" if len(numbers) == 1 else f"{len(numbers)} trials ({first})"
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ctxval._util.texts import enumerated
 from ctxval.campaign.by_hand import KnownRun, parameters_from, read_runs, write_files
 from ctxval.campaign.campaign import OpenTrial
 from ctxval.campaign.known import KnownExecution
@@ -321,6 +322,5 @@ def _print_asked(report: dict[str, Any], opened: OpenTrial) -> None:
         out.say("the controller cannot be written to a file: this is possible only for affine feedback (LQR and iLQR).")
     if report["open"]:
         count = len(report["open"])
-        numbers = ", ".join(map(str, report["open"][:10])) + (", ..." if count > 10 else "")
-        out.say(f"{count} other {'trial is' if count == 1 else 'trials are'} open: {numbers}.")
+        out.say(f"{count} other {'trial is' if count == 1 else 'trials are'} open: {enumerated(report['open'], 10)}.")
     out.say(f"next: ctxval tell {shlex.quote(report['store'])} {opened.number} --trajectory run.csv")

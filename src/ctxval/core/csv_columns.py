@@ -12,7 +12,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MOST_BYTES, csv_rows
-from ctxval._util.texts import guarded, parted, unguarded, visible
+from ctxval._util.texts import enumerated, guarded, parted, unguarded, visible
 from ctxval.errors import InputError, ShapeError
 
 
@@ -133,7 +133,7 @@ class _Columns:
 
 def _listed(names: Sequence[str]) -> str:
     """Return names for a message; long names and long lists are cut."""
-    return ", ".join(name[:60] for name in names[:20]) + (", ..." if len(names) > 20 else "")
+    return enumerated((name[:60] for name in names), 20)
 
 
 def _chosen(path: str | Path, columns: dict[str, str], letter: str, names: Sequence[str] | None) -> list[str]:

@@ -15,13 +15,14 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call
+from ctxval._util.texts import enumerated
 from ctxval.data.units import conversion
 from ctxval.errors import InputError
 
 TIMES = ("t", "time", "times", "timestamp")
 """Names under which the times of a table are looked for."""
 
-_LISTED = 24
+LISTED = 24
 """Largest number of fields that a message names."""
 
 _INDEX = re.compile(r"(.+?)\[(\d{1,6})\]")
@@ -97,9 +98,7 @@ class Log(ABC):
 
     def missing(self, field: str) -> InputError:
         """Return the error that there is no such field; its message lists those that there are."""
-        known = self.fields()
-        more = ", ..." if len(known) > _LISTED else ""
-        return InputError(f"{self.source} has no field {field!r}; it has {', '.join(known[:_LISTED])}{more}.")
+        return InputError(f"{self.source} has no field {field!r}; it has {enumerated(self.fields(), LISTED)}.")
 
     def __repr__(self) -> str:
         return call(self, self.source)

@@ -11,7 +11,8 @@ from typing import Any, Literal, get_args
 
 from ctxval._util.files import read_bytes
 from ctxval._util.representation import record
-from ctxval.data.log import Clock, Log
+from ctxval._util.texts import enumerated
+from ctxval.data.log import LISTED, Clock, Log
 from ctxval.data.units import conversion
 from ctxval.errors import InputError, UnknownNameError
 
@@ -180,10 +181,9 @@ class LogMapping:
         known = log.fields()
         states, inputs = _usual(known, _STATES, "x"), _usual(known, _INPUTS, "u")
         if not states:
-            fields = ", ".join(known[:24]) + (", ..." if len(known) > 24 else "")
             raise InputError(
                 f"{log.source} has no states under a usual name ({', '.join(_STATES)}, x0): name the states and inputs "
-                f"with --state and --input or in a mapping; the fields are {fields}."
+                f"with --state and --input or in a mapping; the fields are {enumerated(known, LISTED)}."
             )
         return LogMapping(states, inputs, dt=log.period)
 
