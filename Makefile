@@ -2,12 +2,13 @@
 PYTHON ?= python3
 BIN := .venv/bin
 KILLS ?= 50
+SWITCHES ?= 2
 CAMPAIGNS ?= 120
 
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick check docs reliability crash-states attack bench bench-peers study study-refine reproduce search global-search calibrate parts pictures posterior-ranks clean
+.PHONY: demo test quick check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate parts pictures posterior-ranks clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -26,14 +27,22 @@ check: .venv/.test
 reliability: .venv/.test  ## kill -9 and resume, KILLS times
 	$(BIN)/python -m pytest tests/campaign/test_kill.py --kills $(KILLS)
 
+interleavings: .venv/.test  ## two processes on one store, switched SWITCHES times at every statement
+	$(BIN)/python -m pytest tests/campaign/test_interleavings.py --switches $(SWITCHES)
+
 crash-states: .venv/.test  ## power cuts, thousands of them; needs strace; writes docs/reliability.md
 	$(BIN)/python benchmarks/crash_states.py
 	$(BIN)/python benchmarks/crash_states.py --synchronous FULL
 	$(BIN)/python benchmarks/reliability.py
 
-attack: .venv/.test  ## hostile input, thousands of command lines; writes docs/reliability.md, and resumes
+attack: .venv/.test  ## hostile input, thousands of command lines; better with strace; writes docs/reliability.md, and resumes
 	$(BIN)/python benchmarks/attack.py
 	$(BIN)/python benchmarks/reliability.py
+
+lowest: .venv/lowest/.installed  ## the page's security, with the lowest versions that pyproject.toml permits
+	.venv/lowest/bin/python -m pytest -q -p no:cacheprovider tests/web/test_access.py tests/web/test_security.py \
+	  tests/web/test_connections.py tests/web/test_app.py \
+	  -k "test_access or test_security or three_hundred or send_much or nonsense or (refused and not wrong_file)"
 
 bench: .venv/.test  ## speed, as ratios measured in one run
 	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
@@ -43,7 +52,7 @@ bench-peers: .venv/peers/.installed .venv/peers-verifai/.installed  ## beside ot
 	  ../.venv/$$group/bin/python -W ignore -m peers.$$part || exit 1; done; done
 	cd benchmarks && ../.venv/peers/bin/python -m peers.page
 
-study: .venv/.test  ## the running example over many seeds; writes docs/main-job.md
+study: .venv/.test  ## the running example over many seeds, from the runs of `make reproduce`; writes docs/main-job.md
 	$(BIN)/python benchmarks/study_main_job.py
 
 study-refine: .venv/.test  ## how much better refined models are; writes docs/refinement.md, and resumes
@@ -73,7 +82,7 @@ compare-study: .venv/.test  ## how many executions comparisons need; writes docs
 posterior-ranks: .venv/.test  ## are draws of the learned dynamics as uncertain as they should be? Resumes
 	$(BIN)/python benchmarks/study_posterior_ranks.py
 
-search: .venv/.test  ## how many executions the searches need; writes docs/search.md, and resumes
+search: .venv/.test  ## how many executions the searches need; writes docs/searches.md, and resumes
 	$(BIN)/python benchmarks/study_auto.py
 	$(BIN)/python benchmarks/study_scalar.py linear-10 --search scalar --seeds 60
 	$(BIN)/python benchmarks/study_scalar.py dubins-basin
@@ -84,7 +93,7 @@ search: .venv/.test  ## how many executions the searches need; writes docs/searc
 	$(BIN)/python benchmarks/study_global_search.py
 	$(BIN)/python benchmarks/search_page.py
 
-global-search: .venv/.test  ## what a global search of the true systems finds; writes docs/search.md, and resumes
+global-search: .venv/.test  ## what a global search of the true systems finds; writes docs/searches.md, and resumes
 	$(BIN)/python benchmarks/study_global_search.py
 	$(BIN)/python benchmarks/search_page.py
 
@@ -106,6 +115,13 @@ clean:
 .venv/.test: pyproject.toml | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	touch $@ .venv/.installed
+
+.venv/lowest/.installed: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m venv $(@D)
+	$(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+	  print(*(r.replace(">=", "==") for r in p["dependencies"] + p["optional-dependencies"]["web"]), sep="\n")' > $(@D)/lowest.txt
+	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check -c $(@D)/lowest.txt --editable '.[web]' pytest hypothesis
+	touch $@
 
 .venv/peers/.installed .venv/peers-verifai/.installed: .venv/%/.installed: pyproject.toml | .venv/bin/python
 	$(BIN)/python -m venv $(@D)

@@ -1,8 +1,9 @@
-"""Hostile stores, recordings, tables, experiment files, systems and arguments, through the command line's entry point.
+"""Hostile stores, logs, tables, experiment files, systems, requests and arguments, through the command line.
 
-``python benchmarks/attack.py --inputs 20400`` makes each input from its family, its number and the seed alone, and runs
+``python benchmarks/attack.py --inputs 20200`` makes each input from its family, its number and the seed alone, and runs
 its command line in a process of its own, bounded in time, memory and files. None may end with a traceback, hang, take
-much memory, run code, write elsewhere, or send the terminal what steers it. The counts go to
+much memory, run code, read or write elsewhere, tell a secret, change files that are no outputs, give another answer for
+the same data in another format, or send the terminal what steers it. The counts go to
 benchmarks/results/attack.jsonl, from which it goes on; `benchmarks/reliability.py` makes the page. What went wrong is
 printed; ``python benchmarks/attack.py --repeat FAMILY NUMBER --keep FOLDER`` repeats it.
 """
@@ -33,8 +34,8 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 from ctxval._util.json_lines import JsonLines  # noqa: E402
-from hostile import archives, arguments, experiments, stores  # noqa: E402
-from hostile.cage import Case, Outcome, carry_out  # noqa: E402
+from hostile import archives, arguments, clothes, doors, experiments, logs, oracles, served, stores  # noqa: E402
+from hostile.cage import SENTINEL, STATUSES, Case, Outcome, Watched, carry_out, declared  # noqa: E402
 from hostile.values import Rng, pick  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "results" / "attack.jsonl"
@@ -66,37 +67,58 @@ type = "LQR"
 Q = [10.0, 1.0]
 R = [0.1]
 [distance]
-type = "FinalState"
-weights = [1, 1]
+type = "MaximumDeviation"
+scales = [1.0, 1.0]
 [search]
 name = "random"
 """
 
 
+_TOUCHES = f"""
+
+import os
+
+PASSWORD = "{oracles.GLOBAL}"
+ACCOUNT = {{"password": os.environ["ROBOT_PASSWORD"]}}
+_frictional = step
+
+
+def step(x, u):
+    # Drivers log in, with secrets of the environment and of their module.
+    assert os.environ["AWS_SECRET_ACCESS_KEY"] and PASSWORD and ACCOUNT
+    return _frictional(x, u)
+"""
+
+
 def prepare(base: Path) -> Path:
-    """Make what is attacked: an experiment file, a store of it, and one of a rig that people operate."""
+    """Make what is attacked: an experiment file, a store of it, and stores of a rig that people operate."""
     base.mkdir()
-    run = "run", "experiment.toml", "--budget", "4", "--search", "random", "--store", "a.sqlite"
-    ask_run = "ask", "a.sqlite"
     (base / "rig.toml").write_text(_MANUAL)
-    ask = "ask", "rig.toml", "--store", "rig.sqlite"
-    lines: tuple[tuple[str, ...], ...] = (
-        *(("init", "experiment.toml"), run, ask_run, ask_run),
-        *(
-            ask,
-            ask,
-            ask,
-            ("tell", "rig.sqlite", "0", "--distance", "0.1"),
-            ("tell", "rig.sqlite", "1", "--failed", "x"),
-        ),
-        *(ask, ask, ask),
-    )
-    for line in lines:
-        outcome = carry_out(Case(line, code=True, environment=_environment(base)), base)
-        if outcome.status:
-            raise RuntimeError(f"{line}: {outcome.status}: {outcome.said}")
+    (base / "table.toml").write_text(_MANUAL + clothes.MAPPING)
+    done(base, "init", "experiment.toml")
+    # Learned dynamics take as long as a hang.
+    (base / "experiment.toml").write_text((base / "experiment.toml").read_text().replace('"auto"  ', '"posterior"  '))
+    with (base / "experiment_system.py").open("a") as file:
+        file.write(_TOUCHES)
+    done(base, "run", "experiment.toml", "--budget", "4", "--search", "random", "--store", "a.sqlite", "--no-report")
+    for _ in range(2):
+        done(base, "ask", "a.sqlite")
+    for store in ("rig", "table"):
+        for _ in range(3):
+            done(base, "ask", f"{store}.toml", "--store", f"{store}.sqlite")
+        done(base, "tell", f"{store}.sqlite", "0", "--distance", "0.1")
+        done(base, "tell", f"{store}.sqlite", "1", "--failed", "x")
+    for _ in range(3):
+        done(base, "ask", "rig.sqlite")
     (base / "network.onnx").write_bytes(_network())
     return base
+
+
+def done(base: Path, *line: str) -> None:
+    """Run a command that must succeed."""
+    outcome = carry_out(Case(line, code=True, environment=_environment(base)), base)
+    if outcome.status:
+        raise RuntimeError(f"{line}: {outcome.status}: {outcome.said}")
 
 
 def _network() -> bytes:
@@ -130,12 +152,14 @@ class Family:
         share: of all inputs.
         make: writes the files of one input and returns its command line.
         own: whether the stores in it are this user's.
+        each: how many inputs one command line takes: a server takes many requests.
     """
 
     title: str
     share: float
     make: Callable[[Rng, Path, Path], Case]
     own: bool = False
+    each: int = 1
 
 
 def _store(change: Callable[[Rng, Path, Path], None], name: str = "") -> Callable[[Rng, Path, Path], Case]:
@@ -222,16 +246,21 @@ def _arguments(rng: Rng, folder: Path, base: Path) -> Case:
 
 
 FAMILIES: dict[str, Family] = {
-    "damaged": Family("stores with changed bytes", 0.2, _store(stores.damaged), own=True),
-    "crafted": Family("stores changed by SQL", 0.22, _store(stores.crafted)),
-    "crafted-own": Family("the same, for stores that this user made", 0.08, _store(stores.crafted), own=True),
-    "coded": Family("stores whose settings name code", 0.06, _store(stores.coded, "a.sqlite")),
-    "no-store": Family("pipes, devices, folders and others in place of a store", 0.06, _store(stores.no_store)),
-    "told": Family("recordings for `ctxval tell`, NPZ and CSV", 0.14, _told, own=True),
-    "imported": Family("tables of runs for `ctxval import`", 0.08, _imported, own=True),
+    "damaged": Family("stores with changed bytes", 0.12, _store(stores.damaged), own=True),
+    "crafted": Family("stores changed by SQL", 0.14, _store(stores.crafted)),
+    "crafted-own": Family("the same, for stores that this user made", 0.05, _store(stores.crafted), own=True),
+    "coded": Family("stores whose settings name code", 0.05, _store(stores.coded, "a.sqlite")),
+    "no-store": Family("pipes, devices, folders and others in place of a store", 0.05, _store(stores.no_store)),
+    "told": Family("recordings for `ctxval tell`, NPZ and CSV", 0.1, _told, own=True),
+    "imported": Family("tables of runs for `ctxval import`", 0.06, _imported, own=True),
     "data": Family("recordings and networks for models", 0.03, _data),
     "toml": Family("experiment files", 0.05, _toml),
-    "systems": Family("systems", 0.03, _system),
+    "systems": Family("systems", 0.01, _system),
+    "clothes": Family("the same recordings in other formats, columns and units", 0.12, clothes.case, own=True),
+    "logs": Family("logs of all kinds, and models, for `replay`, `fit`, `tell` and `import`", 0.1, logs.case, own=True),
+    "outputs": Family("outputs onto inputs, and other files", 0.03, doors.outputs, own=True),
+    "secrets": Family("systems that use secrets", 0.02, doors.secret_system, own=True),
+    "served": Family("requests to `ctxval serve`", 0.02, served.case, own=True, each=served.REQUESTS),
     "arguments": Family("arguments", 0.05, _arguments, own=True),
 }
 
@@ -243,7 +272,9 @@ def case_of(name: str, number: int, seed: int, folder: Path, base: Path) -> Case
     if family.own:
         shutil.copytree(base / "home", folder / "home")
     environment = _environment(folder)
-    return replace(family.make(rng, folder, base), environment=environment)
+    case = family.make(rng, folder, base)
+    places = (str(base),) if family.own else ()  # a store's own modules are looked up where it was made
+    return replace(case, environment={**environment, **case.environment}, places=places)
 
 
 # Carrying it out
@@ -257,39 +288,54 @@ def inflict(name: str, number: int, seed: int, base: Path, keep: Path | None = N
         case = case_of(name, number, seed, folder, base)
         if keep is not None:
             shutil.copytree(folder, keep, symlinks=True)
-        outcome = _apart(case, folder) if apart else carry_out(case, folder)
+        outcome = _apart(case, folder) if apart and case.client is None else carry_out(case, folder)
         return replace(outcome, said=f"{arguments.shown(case.arguments)}\n{outcome.said}")
 
 
 def _apart(case: Case, folder: Path) -> Outcome:
-    """Run a command line as a shell does."""
+    """Run a command line as a shell does, and look at all files that it opens, also in native code, with strace."""
     command = [sys.executable, "-m", "ctxval.cli", *case.arguments]
-    try:
-        done = subprocess.run(
-            command,
-            cwd=folder,
-            env={**os.environ, **case.environment},
-            capture_output=True,
-            timeout=90,
-            stdin=subprocess.DEVNULL,
-        )
-    except subprocess.TimeoutExpired:
-        return Outcome(-9, ("hang",), 90.0, 0.0)
+    trace = folder.parent / "trace"
+    if shutil.which("strace"):
+        command = ["strace", "-f", "-qq", "--seccomp-bpf", "-e", "trace=open,openat,creat", "-o", str(trace), *command]
+    with Watched(folder, case.arguments) as watched:
+        try:
+            done = subprocess.run(
+                command,
+                cwd=folder,
+                env={**os.environ, **oracles.SECRETS, **case.environment},
+                capture_output=True,
+                timeout=90,
+                stdin=subprocess.DEVNULL,
+            )
+        except subprocess.TimeoutExpired:
+            return Outcome(-9, ("hang",), 90.0, 0.0)
+        opened = trace.read_text(errors="replace") if trace.exists() else ""
+        trace.unlink(missing_ok=True)
+    why = watched.wrong(done.stdout, done.stderr)
+    why += [
+        f"read elsewhere: {one}"
+        for one in oracles.traced(opened, folder, [*declared(case.arguments, folder), *case.places])
+    ]
+    why += [] if case.check is None else case.check(done.returncode, done.stdout)
     wrong = ["traceback"] if b"Traceback (most recent call last)" in done.stderr and not case.prints else []
-    wrong += [] if done.returncode in (0, 1, 2, 3, 130, 141) else ["status"]
-    wrong += ["code"] if not case.code and (folder / "PWNED").exists() else []
-    return Outcome(done.returncode, tuple(wrong), 0.0, 0.0, done.stderr[-1500:].decode("utf-8", "backslashreplace"))
+    wrong += [] if done.returncode in STATUSES else ["status"]
+    wrong += ["code"] if not case.code and (folder / SENTINEL).exists() else []
+    wrong += [one.partition(":")[0] for one in why]
+    said = "\n".join([*why[:20], done.stderr[-1500:].decode("utf-8", "backslashreplace")])
+    return Outcome(done.returncode, tuple(dict.fromkeys(wrong)), 0.0, 0.0, said)
 
 
 def _some(given: tuple[str, int, int, int, str, int]) -> tuple[str, int, Counter[str], list[dict[str, Any]]]:
     """Inflict inputs of a family, from one number to another."""
     name, first, last, seed, base, apart = given
+    each = FAMILIES[name].each
     counts: Counter[str] = Counter()
     found = []
     for number in range(first, last):
-        alone = number % apart == 0
+        alone = each == 1 and number % apart == 0
         outcome = inflict(name, number, seed, Path(base), apart=alone)
-        counts.update({"inputs": 1, f"status {outcome.status}": 1, "apart": int(alone)})
+        counts.update({"inputs": each, f"status {outcome.status}": each, "apart": int(alone)})
         counts.update(outcome.wrong)
         counts["megabytes"] = max(counts["megabytes"], round(outcome.megabytes))
         counts["seconds"] = max(counts["seconds"], round(outcome.seconds))
@@ -302,9 +348,10 @@ def _chunks(inputs: int, done: dict[str, Any], seed: int, base: Path, apart: int
     """Return what is to be done, all families side by side."""
     found = []
     for name in only:
-        target = round(FAMILIES[name].share * inputs)
-        for begin in range(done.get(name, {}).get("inputs", 0), target, CHUNK):
-            found.append((begin / target, (name, begin, min(begin + CHUNK, target), seed, str(base), apart)))
+        each = FAMILIES[name].each
+        target, size = round(FAMILIES[name].share * inputs / each), max(CHUNK // each, 1)
+        for begin in range(done.get(name, {}).get("inputs", 0) // each, target, size):
+            found.append((begin / target, (name, begin, min(begin + size, target), seed, str(base), apart)))
     return [job for _, job in sorted(found, key=lambda item: item[0])]
 
 
@@ -315,7 +362,7 @@ def attack(
     *,
     workers: int,
     done: dict[str, Any],
-    apart: int = 200,
+    apart: int = 400,
     only: list[str] | None = None,
     on_chunk: Callable[[str, dict[str, int], list[dict[str, Any]]], None] = lambda family, counts, found: None,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -338,8 +385,13 @@ def _warm() -> None:
     """Import what the commands do, once for all the forks."""
     import gc
 
+    import h5py
     import matplotlib.backends.backend_agg
     import matplotlib.pyplot
+    import mcap_protobuf.writer
+    import pyarrow.parquet
+    import rosbags.rosbag2
+    import rosbags.typesys
 
     import ctxval.cli
     import ctxval.plot
@@ -349,14 +401,13 @@ def _warm() -> None:
         importlib.import_module(
             "mujoco"
         )  # it starts a process to find its window library, which is no code of an input
-    assert matplotlib.pyplot, matplotlib.backends.backend_agg
-    assert ctxval.cli, (ctxval.plot, ctxval.reproduce)
+    assert all((h5py, matplotlib, mcap_protobuf, pyarrow, rosbags, ctxval))
     gc.freeze()  # or the collector copies all pages into each fork
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--inputs", type=int, default=20_400, help="in all families together")
+    parser.add_argument("--inputs", type=int, default=20_200, help="in all families together")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", nargs="*", choices=list(FAMILIES), default=list(FAMILIES))

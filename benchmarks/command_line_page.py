@@ -18,8 +18,8 @@ INTRODUCTION = """\
 # Command line
 
 This page is made from the command line by `make parts`, and a test fails if it is not current. `ctxval COMMAND --help`
-prints the same text. The [glossary](../glossary.md) explains what the commands print, and [exit
-statuses](exit-statuses.md) how they end.
+prints the same text, and `ctxval --version` the version. The [glossary](../glossary.md) explains what the commands
+print, and [exit statuses](exit-statuses.md) how they end.
 """
 
 

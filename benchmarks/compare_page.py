@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ctxval.reproduce.revision import AUTO, measured_with
 from study_compare import BUDGETS, CONFIDENCE, PAPER, PLAIN, STORED
 
 PAGE = Path(__file__).parents[1] / "docs" / "comparison.md"
@@ -18,6 +19,7 @@ INTRODUCTION = f"""\
 
 `make compare-study` computes these tables, and `ctxval compare` is the command. All decisions of one comparison hold
 together with confidence {CONFIDENCE}. The truths come from dense grids, which a real system would not have.
+{measured_with(STORED.values(), AUTO)}
 
 ## The paper's arm: network, Gaussian process, linear model
 

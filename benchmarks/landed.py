@@ -2,7 +2,7 @@
 
 A benchmark calls :func:`beside_landed` with its own file and arguments. In each repeat the script runs twice, once with
 the package of the earlier revision and once with that of this checkout, and prints its figures by :func:`report`. CPU
-times of both are compared by :class:`Ratio`, which is stored for ``docs/search.md`` if that is asked for.
+times of both are compared by :class:`Ratio`, which is stored for ``docs/searches.md`` if that is asked for.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Ratio:
 
 def add_store_option(parser: argparse.ArgumentParser) -> None:
     """Add the option that stores ratios."""
-    parser.add_argument("--store", action="store_true", help="keep the ratios for docs/search.md")
+    parser.add_argument("--store", action="store_true", help="keep the ratios for docs/searches.md")
 
 
 def beside_landed(script: str | Path, *arguments: str, repeats: int = 1) -> tuple[list[Any], list[Any]]:

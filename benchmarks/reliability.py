@@ -58,14 +58,18 @@ CRASH_COLUMNS = ("resumed", "lost", "changed", "twice", "refused")
 ATTACK_COLUMNS = {
     "inputs": ("inputs",),
     "apart": ("apart",),
-    "ended well": ("status 0", "status 1"),
+    "ended well": ("status 0", "status 1", "status 130"),
     "refused": ("status 2", "status 3"),
-    "traceback": ("traceback",),
+    "traceback": ("traceback", "foreign"),
     "hang": ("hang",),
     "memory": ("memory",),
     "status": ("status",),
     "code": ("code",),
     "elsewhere": ("wrote elsewhere",),
+    "read": ("read elsewhere",),
+    "secret": ("secret",),
+    "files": ("files",),
+    "answer": ("other answer",),
     "output": ("escape", "flood", "no JSON", "silent"),
 }
 COLUMNS = ("inflicted", "midway", "lost", "twice", "same end", "noticed", "harmless", "silent")
@@ -256,17 +260,25 @@ POWER_TAIL = """
 HOSTILE = """
 ## Hostile input
 
-`make attack` creates each input from a seed and runs the corresponding command line in a process of its own. It checks
-the output and the exit status of `ctxval` and limits its memory and time. An audit hook detects whether `ctxval` runs
-or writes something that it should not. Some of the inputs run in a newly started interpreter, as from a shell; the
-column *apart* counts these.
+`make attack` creates each input from a seed and runs the corresponding command line in a process of its own; a server
+gets 40 requests. It checks the output and the exit status of `ctxval` and limits its memory and time. An audit hook
+detects whether `ctxval` runs, reads or writes something that it should not. Decoys lie in the home folder and beside
+the working folder, and the kernel reports whoever opens them. Secrets are in the environment, in files of the home
+folder and in the system's module; they are searched for in everything that is printed, answered or written, also in
+hexadecimal, Base64 and UTF-16. All files are compared before and after. Recordings are also given in other formats,
+columns and units. Some of the inputs run in a newly started interpreter under `strace`, as from a shell; the column
+*apart* counts these.
 
 """
 
 HOSTILE_TAIL = """
-- *traceback*: an exception reached the top level. *hang*: more than 12 s of processor time. *memory*: more than 700 MB
-  in addition to the interpreter with the package. *status*: an exit status that the README does not list, or a signal.
+- *traceback*: an exception reached the top level, or its name was printed in place of a sentence. *hang*: more than
+  12 s of processor time. *memory*: more than 700 MB in addition to the interpreter with the package. *status*: an exit
+  status that is not in the [list](reference/exit-statuses.md), or a signal.
 - *code*: a part of the input was run although the input is data. *elsewhere*: a file outside the folder was written.
+- *read*: a file was opened that is neither an input, nor an output, nor part of the interpreter. *secret*: a secret was
+  printed, answered or written. *files*: a file was changed, removed or created that is neither the store nor a declared
+  output. *answer*: the same data in other clothes had another answer, and not a refusal.
 - *output*: control characters, more than 200 kB, no JSON although `--json` was given, or a failure without a message.
 - *largest*: the peak memory of one process, including the interpreter with the package.
 """

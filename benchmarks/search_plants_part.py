@@ -1,4 +1,4 @@
-"""The part of ``docs/search.md`` on plants of the falsification literature and of robotics. Nothing is run here."""
+"""The part of ``docs/searches.md`` on plants of the falsification literature and of robotics. Nothing is run here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The part of ``docs/search.md`` on the CPU time of suggestions. Nothing is run here."""
+"""The part of ``docs/searches.md`` on the CPU time of suggestions. Nothing is run here."""
 
 from __future__ import annotations
 

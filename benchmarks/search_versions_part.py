@@ -1,4 +1,4 @@
-"""The table of ``docs/search.md`` that compares `auto` with the code of an earlier commit. Nothing is run here."""
+"""The table of ``docs/searches.md`` that compares `auto` with the code of an earlier commit. Nothing is run here."""
 
 from __future__ import annotations
 

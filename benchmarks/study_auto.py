@@ -20,6 +20,7 @@ import numpy as np
 
 from ctxval import Campaign, Experiment, Truth, Validation, cached_truth, cases, grid_truth, search_truth, searches
 from ctxval._util.json_lines import JsonLines
+from ctxval.reproduce.revision import AUTO, provenance
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -105,7 +106,7 @@ def stored(results: JsonLines, case: str, seed: int, search: str, compute: Calla
     """Return a stored result, or compute and store it."""
     key = (case, seed, search)
     if key not in results:
-        results.append({**dict(zip(KEY, key, strict=True)), **compute()})
+        results.append({**dict(zip(KEY, key, strict=True)), **compute(), **provenance(AUTO)})
     return results[key]
 
 

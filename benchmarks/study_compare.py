@@ -27,6 +27,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
 from ctxval.cases import arm
 from ctxval.certificates.difference import PairedDifferences, mean_difference
+from ctxval.reproduce.revision import AUTO, provenance
 
 STORED = JsonLines(Path(__file__).parent / "results" / "compare.jsonl", ("case", "question", "seed"))
 
@@ -172,7 +173,7 @@ def main() -> None:
         case, question, seeds = text.split(":")
         for seed in range(int(seeds)):
             if (case, question, seed) not in STORED:
-                STORED.append(result(case, question, seed))
+                STORED.append({**result(case, question, seed), **provenance(AUTO)})
                 print(STORED[case, question, seed], flush=True)
 
 

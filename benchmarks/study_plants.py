@@ -12,6 +12,7 @@ from pathlib import Path
 
 from ctxval import searches
 from ctxval._util.json_lines import JsonLines
+from ctxval.reproduce.revision import AUTO, provenance
 from plants import PLANTS
 from plants.truths import TRUTHS, require_known, truth
 from study_auto import RESULTS, Result, campaign, print_table
@@ -37,7 +38,7 @@ def run(version: str, case: str, seed: int, search: str, results: JsonLines, tru
         found = plant(seed)
         best_known = truth(plant, seed, found, truths)["distance"]
         result = campaign(found.validation, searches.by_name(search), seed, plant.budget, best_known)
-        results.append({**dict(zip(results.key, key, strict=True)), **result})
+        results.append({**dict(zip(results.key, key, strict=True)), **result, **provenance(AUTO)})
     return results[key]
 
 

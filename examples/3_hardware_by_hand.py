@@ -44,7 +44,7 @@ def execute(opened, fuse):
         print(f"{100 * trial.distance:.1f} cm from where the model said.")
 
 
-campaign = Campaign(validation, search=searches.Scalar(), seed=0)  # store="rig.sqlite" keeps it between the days
+campaign = Campaign(validation, search=searches.BayesianOptimisation(), seed=0)  # store="rig.sqlite" keeps it
 heavy = {"goal": 1.0, "load": 2.0}
 execute(campaign.ask(heavy), "weak")  # a task of your own choice
 execute(campaign.ask(heavy, because="the fuse was replaced"), "strong")  # a failure counts until its cause is removed

@@ -44,6 +44,7 @@ settings.load_profile("ctxval")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--kills", type=int, default=10, help="how many campaigns are killed and resumed")
+    parser.addoption("--switches", type=int, default=1, help="how often two processes on one store are switched")
 
 
 STATE = "LOCALAPPDATA" if os.name == "nt" else "XDG_STATE_HOME"

@@ -65,7 +65,7 @@ uint32 nanosec
 """
 
 
-def write_mcap_ros2(path: Path, one: Trajectory, *, late: float = 0.0) -> None:
+def write_mcap_ros2(path: Path, one: Trajectory, *, late: float | np.ndarray = 0.0) -> None:
     """Write the run to MCAP as ROS 2 messages. Log times are late, header stamps are not."""
     from mcap_ros2.writer import Writer
 
@@ -81,7 +81,7 @@ def write_mcap_ros2(path: Path, one: Trajectory, *, late: float = 0.0) -> None:
                 "velocity": [one.states[k, 1]],
                 "effort": effort,
             }
-            logged = stamp + round(1e9 * late)
+            logged = stamp + round(1e9 * float(np.broadcast_to(late, len(one.times))[k]))
             writer.write_message("/joints", schema, message, log_time=logged, publish_time=stamp)
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import tarfile
 from pathlib import Path, PurePosixPath
 
 import pytest
+
+from ctxval import __version__
 
 ROOT = Path(__file__).parents[1]
 
@@ -25,7 +28,7 @@ def test_the_source_distribution_has_code_tests_examples_and_texts(files: list[s
     assert modules | examples <= set(files)
     for needed in ("README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "pyproject.toml"):
         assert needed in files
-    assert {"tests/conftest.py", "tests/data/pendulum-0.1.0.sqlite", "docs/theory.md"} <= set(files)
+    assert {"tests/conftest.py", "tests/data/test_mapping.py", "docs/theory.md"} <= set(files)
 
 
 def test_the_source_distribution_has_no_results_and_no_pictures(files: list[str]) -> None:
@@ -35,3 +38,13 @@ def test_the_source_distribution_has_no_results_and_no_pictures(files: list[str]
     }
     assert {PurePosixPath(file).suffix for file in files if file.startswith("docs/")} == {".md"}
     assert not [file for file in files if PurePosixPath(file).suffix in (".jsonl", ".csv", ".png")]
+
+
+def test_every_text_names_the_version_of_the_source() -> None:
+    metadata = pytest.importorskip("hatchling.metadata.core").ProjectMetadata
+    manager = pytest.importorskip("hatchling.plugin.manager").PluginManager()
+    assert metadata(str(ROOT), manager).version == __version__
+    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    released = re.findall(r"^## ([\d.]+) \((\d{4}-\d\d-\d\d)\)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert released[0][0] == __version__
+    assert f"\ndate-released: {released[0][1]}\n" in (ROOT / "CITATION.cff").read_text()

@@ -24,7 +24,6 @@ from ctxval.certificates import (
     StateInputGap,
     certify_anytime,
     certify_audit,
-    certify_convergence,
     certify_dynamics,
     certify_mean,
     certify_posterior,
@@ -112,7 +111,6 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
     certificates = [
         certify_audit(sample),
         certify_anytime(sample, 3.0),
-        certify_convergence(sample, 1.0),
         certify_dynamics(sample, evidence()),
         certify_mean(sample, options=Mean(quantile=0.5, largest_possible=4.0)),
         certify_region(sample, 3.0),
@@ -161,3 +159,24 @@ def test_the_glossary_is_in_alphabetical_order() -> None:
     terms = [line.split("|")[1].strip().replace("`", "").lower() for line in lines if line.startswith("| ")][1:]
     assert len(terms) > 100
     assert terms == sorted(terms)
+
+
+def test_no_page_has_the_name_of_one_that_the_manual_makes_itself() -> None:
+    assert not {path.stem for path in (ROOT / "docs").glob("*.md")} & {"search", "genindex", "py-modindex"}
+
+
+NEEDS = (
+    "A verdict in few executions needs executions without noise, a fully recorded state, and dynamics that do not "
+    "depend on the task"
+)
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        *("README.md", "docs/index.md", "docs/theory.md", "docs/explanation/auto.md", "docs/how-to/decide.md"),
+        "docs/tutorials/gymnasium-and-network.md",
+    ],
+)
+def test_pages_that_promise_few_executions_say_what_they_need(page: str) -> None:
+    assert NEEDS in " ".join((ROOT / page).read_text().split())

@@ -124,6 +124,7 @@ def fmu() -> systems.FMU:
     """Return an FMU of which only the settings are there."""
     made = object.__new__(systems.FMU)
     made.path, made.states, made.inputs = Path("/somewhere/cart.fmu"), ["position", "speed"], ["force"]
+    made._digest = "0" * 16
     made.start, made.parameters, made.step = {"position": "x0"}, {"mass": 2.0}, 0.01
     return made
 
@@ -134,11 +135,13 @@ def gymnasium() -> systems.Gymnasium:
     return systems.Gymnasium("InvertedPendulum-v5", max_episode_steps=-1)
 
 
+BODY = '<body><joint name="hinge" axis="0 1 0"/><geom size="0.1"/></body>'
+MJCF = f'<mujoco><worldbody>{BODY}</worldbody><actuator><motor joint="hinge"/></actuator></mujoco>'
+
+
 def mujoco() -> systems.MuJoCo:
     pytest.importorskip("mujoco")
-    body = '<body><joint name="hinge" axis="0 1 0"/><geom size="0.1"/></body>'
-    motor = '<actuator><motor joint="hinge"/></actuator>'
-    return systems.MuJoCo(f"<mujoco><worldbody>{body}</worldbody>{motor}</mujoco>", substeps=5)
+    return systems.MuJoCo(MJCF, substeps=5)
 
 
 def mpc() -> controllers.MPC:
@@ -298,7 +301,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "Truth": lambda: Truth(0.321, SPACE.parameters([1, 2, 3, 4]), "dense grid of 2,001 points, refined 6 times"),
     "Validation": make_validation,
     "Verdict": lambda: Verdict("falsified", 0.5, "trial 3 was executed.", FAILED, CERTIFICATE),
-    "searches.Annealing": searches.Annealing,
     "searches.Auto": searches.Auto,
     "searches.BayesianOptimisation": searches.BayesianOptimisation,
     "searches.CMAES": searches.CMAES,
@@ -322,7 +324,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "models.GaussianProcessModel": gaussian_process,
     "models.IncrementScaling": lambda: models.IncrementScaling.of(DATA),
     "models.Linear": lambda: LINEAR,
-    "models.MuJoCo": lambda: models.MuJoCo(mujoco()._mjcf),
+    "models.MuJoCo": lambda: models.MuJoCo(MJCF),
     "models.Onnx": lambda: models.Onnx(network()),
     "models.Parametric": lambda: models.Parametric(lambda x, u, theta: x, {"mass": 1.2, "friction": 0.3}),
     "models.ScikitLearn": scikit_learn,
@@ -364,7 +366,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "learning.Identity": learning.Identity,
     "learning.LearnedDynamics": learned,
     "learning.PredictionScore": lambda: learning.PredictionScore(1.5, 0.35, 0.98),
-    "learning.Replay": lambda: learning.Replay(TASK, None, 0.5, True),
+    "learning.Replay": lambda: learning.Replay(TASK, None, 0.5),
     "learning.Residual": residual,
     "report.Axis": lambda: report.Axis("goal [rad]", 0.0, 3.0),
     "report.Chart": lambda: report.Chart("Distance", report.Axis("goal", 0.0, 3.0), report.Axis("distance", 0.0, 1.0)),
@@ -377,7 +379,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.Certificate": lambda: CERTIFICATE,
     "certificates.CertificateOptions": certificates.CertificateOptions.posterior,
     "certificates.CheckedPrediction": lambda: CHECKED,
-    "certificates.Convergence": certificates.Convergence,
     "certificates.Dynamics": certificates.Dynamics,
     "certificates.DynamicsEvidence": evidence,
     "certificates.Posterior": certificates.Posterior,
@@ -400,7 +401,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.Verdict": lambda: certificates.judge(
         campaign().trials, 0.01, certificates.CertificateOptions.posterior()
     ),
-    "certificates.TheoremConstants": lambda: certificates.TheoremConstants(1.0, 0.01, 1.0, 1.0, 1.0),
     "data.Break": lambda: data.Break("run.csv", 0.5, 0.2, "angle", "has no value in row 7"),
     "data.Channel": lambda: data.Channel("angle", "rad", False, np.arange(9.0), np.arange(9.0)),
     "data.Clock": data.Clock,
@@ -501,7 +501,6 @@ EXACT = {
     "Transitions": "Transitions(40, x=(40, 2) in [-1, 1], u=(40, 1) in [0.01644, 25], x_next=(40, 2) all 0)",
     "Trial": "Trial(3, origin='initial', state='failed', attempts=2, parameters={'goal': 0.25})\n"
     "  failure: the motor cut out",
-    "searches.Annealing": "Annealing(temperature=0.1, cooling=0.98, move=0.2, restart=0.05)",
     "searches.Repeated": "Repeated(search=Random(), times=3)",
     "systems.FMU": "FMU('cart.fmu', states=['position', 'speed'], inputs=['force'], start={'position': 'x0'}, "
     "parameters={'mass': 2}, step=0.01)",
@@ -645,9 +644,8 @@ ATTACKS: dict[str, Callable[[], object]] = {
     "made good": lambda: certificates.MadeGood(1, 2, HOSTILE),
     "options": lambda: certificates.Options(remarks=(HOSTILE,) * 1000),
     "diagnosis": lambda: certificates.Diagnosis(0.0, 1, 1.0, 1.0, HOSTILE),
-    "manual": lambda: systems.Manual(states={HOSTILE: HOSTILE}, inputs={}, dt=1.0),
+    "manual": lambda: systems.Manual(states={"x": HOSTILE}, inputs={}, dt=1.0),
     "command": lambda: systems.Subprocess([sys.executable, HOSTILE], timeout=1.0),
-    "policy": lambda: controllers.Policy(Endless()),  # type: ignore[arg-type]
     "model": lambda: models.Function(type(HOSTILE, (), {"__call__": policy})()),
     "class": lambda: type(HOSTILE, (searches.Random,), {})(),
 }

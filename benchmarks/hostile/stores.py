@@ -182,7 +182,7 @@ def _many(connection: sqlite3.Connection, rng: Rng) -> None:
 
 def _view(connection: sqlite3.Connection, rng: Rng) -> None:
     """Put a view that never ends, or that gives anything, in the place of a table."""
-    table = str(pick(rng, ("trials", "trajectories", "settings", "experiment", "migrations")))
+    table = str(pick(rng, ("trials", "trajectories", "settings", "experiment", "history")))
     columns = [row[1] for row in connection.execute(f"PRAGMA table_info({table})")]
     connection.execute("PRAGMA legacy_alter_table = ON")
     connection.execute(f"ALTER TABLE {table} RENAME TO old_{table}")
@@ -211,7 +211,7 @@ def _trigger(connection: sqlite3.Connection, rng: Rng) -> None:
 
 
 def _schema(connection: sqlite3.Connection, rng: Rng) -> None:
-    table = str(pick(rng, ("trials", "trajectories", "settings", "experiment", "migrations")))
+    table = str(pick(rng, ("trials", "trajectories", "settings", "experiment", "history")))
     column = pick(rng, [row[1] for row in connection.execute(f"PRAGMA table_info({table})")])
     statements = (
         f"DROP TABLE {table}",
@@ -356,6 +356,7 @@ def commands(rng: Rng) -> tuple[str, ...]:
         ("ask", NAME, "--draw"),
         ("import", NAME, "table.csv"),
         ("remeasure", NAME),
+        ("report", NAME, "--out", "r.html", *pick(rng, ((), ("--markdown", "r.md", "--junit", "r.xml")))),
         ("remeasure", NAME, "--accept-change", str(pick(rng, [t for t in TEXTS if "\0" not in t]))),
         ("certify", NAME, "--audit", "6", "--kind", "scenario"),
     ]

@@ -12,6 +12,7 @@ import functools
 from typing import Any
 
 from ctxval._util.json_lines import JsonLines
+from ctxval.reproduce.revision import AUTO, provenance
 from peers.functions import CASES, SEEDS, Function, function
 from peers.methods import METHODS
 from peers.recorder import Finished, Maximise, Recorder
@@ -143,7 +144,7 @@ def main() -> None:
             for method in methods:
                 if applies(method, case) and (case, method, seed) not in STORED:
                     result = of_the_study(case, method, seed) or run(case, method, seed)
-                    STORED.append(result)
+                    STORED.append({**result, **provenance(AUTO)})
                     share = max((value for _, value in result["improvements"]), default=0.0) / result["maximum"]
                     print(
                         case,

@@ -10,7 +10,7 @@ from typing import Any
 
 from ctxval import Experiment
 from ctxval._util.json_lines import JsonLines
-from dynamics_truths import digest, search
+from dynamics_truths import digest, known
 from plants import PLANTS, Plant
 from study_auto import RESULTS
 
@@ -26,10 +26,7 @@ def truth(plant: Plant, seed: int, found: Experiment, file: JsonLines = TRUTHS) 
         found: the experiment of this seed, which takes a while to make.
         file: where records are kept.
     """
-    key = (plant.name, seed, digest(found.validation))
-    if key not in file:
-        file.append({**dict(zip(file.key, key, strict=True)), **search(found, plant.samples)})
-    return file[key]
+    return known(file, (plant.name, seed, digest(plant.make)), found, plant.samples)
 
 
 def require_known(parser: argparse.ArgumentParser, names: list[str]) -> None:

@@ -21,9 +21,10 @@ print(f"closed loop, worst goal: {found.ccdt.max():.3g} and {found.custom.max():
 figure, axes = pyplot.subplots(figsize=(6.4, 3.6), layout="constrained")
 axes.plot(found.goals, found.ccdt, label="whole trajectories", color="#D55E00", linestyle="--")
 axes.plot(found.goals, found.custom, label="final states", color="#0072B2")
-axes.axvline(found.worst_ccdt_goal, color="#D55E00", linestyle=":", linewidth=1)
-axes.axvline(found.worst_custom_goal, color="#0072B2", linestyle=":", linewidth=1)
+worst = [found.goals[profile.argmax()] for profile in (found.ccdt, found.custom)]
+axes.axvline(worst[0], color="#D55E00", linestyle=":", linewidth=1)
+axes.axvline(worst[1], color="#0072B2", linestyle=":", linewidth=1)
 axes.set(xlabel="goal [rad]", ylabel="distance", ylim=(0, None))
 axes.legend()
 pyplot.show()
-print(f"worst goals: {found.worst_ccdt_goal:.2f} rad and {found.worst_custom_goal:.2f} rad")
+print(f"worst goals: {worst[0]:.2f} rad and {worst[1]:.2f} rad")

@@ -10,20 +10,20 @@ import contextlib
 import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.checked import Must, NonNegativeInt, PositiveFloat, checked
 from ctxval._util.progress import advance, stage
-from ctxval._util.representation import call, record
 from ctxval._util.texts import text_of
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.certificates import CertificateOptions, Posterior
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.certificates.scenario import volume_bound
-from ctxval.certificates.verdict import Verdict, require_threshold
+from ctxval.certificates.verdict import Verdict
 from ctxval.core.controller import converged_of
 from ctxval.core.distance import Distance
 from ctxval.core.plan import Plan
@@ -60,9 +60,6 @@ class SimulatedTask:
     parameters: dict[str, Any]
     error: float | None
     reason: str = ""
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,19 +141,16 @@ class Aspect1Report:
             "designs": self.designs,
         }
 
-    def __repr__(self) -> str:
-        worst = self.worst.error if self.worst.error is not None else self.worst.reason
-        return call(self, tasks=len(self.simulated), worst=worst, threshold=self.threshold, completes=self.completes)
 
-
+@checked
 def check(
     validation: Validation,
     *,
-    threshold: float | None = None,
+    threshold: PositiveFloat | None = None,
     distance: Distance | None = None,
-    tasks: int = TASKS,
+    tasks: Annotated[int, Must("an integer >= 2", lambda value: value >= 2)] = TASKS,
     search: Search | None = None,
-    seed: int = 0,
+    seed: NonNegativeInt = 0,
 ) -> Aspect1Report:
     """Search for the task that M itself completes worst, and look at the controllers. S is never executed.
 
@@ -171,14 +165,9 @@ def check(
         seed: seed of the search.
 
     Raises:
-        InputError: if the tasks have neither a goal nor a reference and no distance is given, or if a number cannot be
-            used.
+        InputError: if the tasks have neither a goal nor a reference and no distance is given.
         DistanceError: if the distance fails.
     """
-    if not isinstance(tasks, int | np.integer) or isinstance(tasks, bool) or tasks < 2:
-        raise InputError(f"tasks must be an integer >= 2, got {tasks!r}.")
-    if threshold is not None:
-        require_threshold(threshold)
     measured = completion(validation) if distance is None else distance
     on_model = validation.on_model(measured, units=None if distance is None else "")
     campaign = Campaign(on_model, search=by_name(SEARCH) if search is None else search, seed=seed)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.files import MADE_BY, written_whole
 from ctxval._util.representation import record
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
@@ -88,9 +89,6 @@ def overview(
         threshold: tau, drawn as a line; None if there is none.
         bound: a bound on d* from a certificate, drawn as a line; None if there is none.
         ax: the axes to draw into; new ones by default.
-
-    Raises:
-        InputError: if no distance is known.
     """
     if campaign.validation.space.dimension == 1 and len(campaign.completed) >= 2:
         return surrogate_slice(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
@@ -113,9 +111,6 @@ def convergence(
         threshold: tau, drawn as a line; None if there is none.
         bound: a bound on d* from a certificate, drawn as a line; None if there is none.
         ax: the axes to draw into; new ones by default.
-
-    Raises:
-        InputError: if no distance is known.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -158,9 +153,6 @@ def surrogate_slice(
         threshold: tau, drawn as a line; None if there is none.
         bound: a bound on d* from a certificate, drawn as a line; None if there is none.
         ax: the axes to draw into; new ones by default.
-
-    Raises:
-        InputError: if fewer than two distances are known, or there is no such parameter.
     """
     space = campaign.validation.space
     if not 0 <= axis < space.dimension:
@@ -193,9 +185,6 @@ def surrogate(
         units: the units of the distance; by default, those of the validation.
         threshold: tau, drawn as a line; None if there is none.
         bound: a bound on d* from a certificate, drawn as a line; None if there is none.
-
-    Raises:
-        InputError: if fewer than two distances are known.
     """
     fitted = campaign.surrogate()
     worst = _worst(campaign)
@@ -262,9 +251,6 @@ def worst_trajectories(campaign: Results, *, states: Sequence[str] = (), inputs:
     Args:
         campaign: a campaign with at least one distance.
         states, inputs: axis labels, with units; by default, those of the validation.
-
-    Raises:
-        InputError: if no distance is known.
     """
     worst = _worst(campaign)
     model, system = campaign.trajectories(worst)
@@ -330,9 +316,6 @@ def signal(
         label: label of the vertical axis, with the unit.
         reference: the reference of the states, ``(H + 1, n)``; it is drawn for a state if it is not zero everywhere.
         ax: the axes to draw into; new ones by default.
-
-    Raises:
-        InputError: if there is no such state or input.
     """
     n, m = model.states.shape[-1], model.inputs.shape[-1]
     if not 0 <= component < n + m:
@@ -353,14 +336,12 @@ def signal(
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Write a figure as PNG or SVG; the suffix of the path decides.
-
-    Raises:
-        InputError: if the file cannot be written, or the suffix is unknown.
-    """
+    """Write a figure as PNG or SVG; the suffix of the path decides."""
+    metadata = {"Software" if Path(path).suffix.lower() == ".png" else "Creator": MADE_BY}
     try:
-        figure.savefig(path, dpi=150)
-    except (OSError, ValueError) as error:
+        with written_whole(path) as file:
+            figure.savefig(file, dpi=150, format=Path(path).suffix[1:] or "png", metadata=metadata)
+    except ValueError as error:
         raise InputError(f"the figure {path} cannot be written: {error}.") from error
     return Path(path)
 

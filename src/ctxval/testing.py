@@ -40,9 +40,6 @@ def check_model(
         seed: seed of the random states and inputs.
         scale: standard deviation of the random states and inputs.
         tolerance: largest relative difference between a batch and single steps; use 1e-6 for single precision.
-
-    Raises:
-        ConformanceError: if the model breaks its contract.
     """
     rng = np.random.default_rng(seed)
     x, u = scale * rng.normal(size=(7, states)), scale * rng.normal(size=(7, inputs))
@@ -70,9 +67,6 @@ def check_system(system: System, controller: Controller, task: Task, *, toleranc
         task: one task, not a batch.
         tolerance: largest difference between two executions, relative to the larger of 1 and the state; set it to the
             noise that you expect.
-
-    Raises:
-        ConformanceError: if the system breaks its contract.
     """
     first, second = system.execute(controller, task), system.execute(controller, task)
     for trajectory in (first, second):
@@ -107,9 +101,6 @@ def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> Non
         synthesizer: the synthesizer; it has ``design``.
         task: a batch of tasks ``(N,)``.
         model: the model that the controllers are designed on.
-
-    Raises:
-        ConformanceError: if the synthesizer breaks its contract.
     """
     singles, converged = [], []
     for index in range(task.batch_shape[0]):
@@ -141,9 +132,6 @@ def check_distance(distance: Distance, model_trajectory: Trajectory, system_traj
     Args:
         distance: ``(model_trajectory, system_trajectory, task) -> d``.
         model_trajectory, system_trajectory, task: a batch of trajectories and tasks ``(N,)`` to compare.
-
-    Raises:
-        ConformanceError: if the distance breaks its contract.
     """
     d = np.asarray(distance(model_trajectory, system_trajectory, task), dtype=np.float64)
     _require(d.shape == task.batch_shape, f"the distance of a batch {task.batch_shape} has shape {d.shape}")
@@ -161,9 +149,6 @@ def check_search(search: Search, *, dimension: int = 2, seed: int = 3, budget: i
         dimension: dimension of the unit cube in the test run.
         seed: seed of the test run.
         budget: number of points in the test run; every fourth evaluation fails.
-
-    Raises:
-        ConformanceError: if the search breaks its contract.
     """
     history = _trial_run(search, dimension, seed, budget)
     again = _trial_run(search, dimension, seed, budget)
@@ -215,11 +200,7 @@ class FaultyRig:
         self._executions = 0
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run one task, with the fault of this execution if it has one.
-
-        Raises:
-            RuntimeError: if the fault of this execution is ``"raise"``.
-        """
+        """Run one task, with the fault of this execution if it has one."""
         fault = self.faults.get(self._executions)
         self._executions += 1
         time.sleep(self.delay)

@@ -10,7 +10,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from ctxval._util.arrays import (
     as_finite,
     as_floats,
-    as_norm_order,
     as_weight,
     require_shape,
     rows_of,
@@ -91,17 +90,6 @@ def test_rounding_does_not_make_a_gram_matrix_an_invalid_weight(scale: float) ->
 @given(vectors=VECTORS)
 def test_the_norm_is_that_of_numpy_over_the_last_axis(order: float, vectors: np.ndarray) -> None:
     np.testing.assert_allclose(vector_norm(vectors, order), np.linalg.norm(vectors, order, axis=-1), rtol=1e-12)
-
-
-@pytest.mark.parametrize("value", [0, 3, -1, np.nan, "two", None])
-def test_another_norm_is_refused_by_value(value: object) -> None:
-    with pytest.raises(InputError, match=r"norm must be 1, 2 or inf, got "):
-        as_norm_order(value)
-
-
-@pytest.mark.parametrize("value", [1, 2, np.inf])
-def test_the_three_norms_are_taken(value: float) -> None:
-    assert as_norm_order(value) == value
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3), (0,)])

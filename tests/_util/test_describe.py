@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctxval import TaskSpace, controllers, distances, models
+from ctxval import TaskSpace, controllers, distances, models, systems
 from ctxval._util.describe import describe, first_difference
 
 PLAIN = st.recursive(
@@ -22,16 +22,16 @@ PLAIN = st.recursive(
 @dataclass
 class Part:
     gain: float
-    _cache: int = 0
 
 
-class Slotted:
-    __slots__ = ("gain",)
+class Secretive(dict):  # type: ignore[type-arg]
+    """A user's object with a description for another purpose."""
 
+    def __init__(self) -> None:
+        super().__init__(password="hunter2")
 
-class Own:
     def describe(self) -> dict[str, object]:
-        return {"identity": 7}
+        return dict(self)
 
 
 def policy(t: int, x: float) -> float:
@@ -40,11 +40,6 @@ def policy(t: int, x: float) -> float:
 
 def stored(value: object) -> object:
     return json.loads(json.dumps(describe(value)))
-
-
-def without_code(description: object) -> object:
-    assert isinstance(description, dict)
-    return {key: value for key, value in description.items() if key != "code"}
 
 
 @settings(max_examples=40, deadline=None)
@@ -64,57 +59,43 @@ def test_a_description_is_json_and_does_not_differ_from_itself(value: object) ->
         (np.nan, "nan"),
         ((1, "two"), [1, "two"]),
         (np.array([[1, 2]]), [[1, 2]]),
+        (np.zeros((200, 3)), {"shape": [200, 3]}),
         ({1: None}, {"1": None}),
-        (int, "builtins.int"),
-        (np.linalg.norm, "numpy.linalg.norm"),
+        (distances.FinalState(norm=2.0), {"type": "FinalState", "norm": 2.0, "components": None}),
     ],
 )
-def test_values_are_described_by_what_identifies_them(value: object, expected: object) -> None:
+def test_values_and_parts_of_this_package_are_described_by_their_settings(value: object, expected: object) -> None:
     assert stored(value) == expected
 
 
-@pytest.mark.parametrize(
-    ("value", "expected"),
-    [
-        (Part(2.0, _cache=9), {"type": "Part", "gain": 2.0}),
-        (Slotted(), {"type": "Slotted"}),
-        (Own(), {"type": "Own", "identity": 7}),
-    ],
-)
-def test_objects_are_described_by_their_type_their_values_and_their_code(value: object, expected: object) -> None:
-    described = stored(value)
-    assert without_code(described) == expected
+def test_users_objects_are_described_by_their_source_alone() -> None:
+    def scaled(gain: float, key: str = "hunter2") -> object:
+        return lambda x: gain * x + len(key)
+
+    for value, kind in (
+        (Part(2.5), {"type": "Part"}),
+        (Secretive(), {"type": "Secretive"}),
+        (policy, {"function": "policy"}),
+        (scaled(2.5), {"function": f"{scaled.__qualname__}.<locals>.<lambda>"}),
+        (functools.partial(policy, 2.5), {"function": "partial"}),
+    ):
+        described = stored(value)
+        assert isinstance(described, dict)
+        assert described == {**kind, "source": described["source"]}
+        assert "2.5" not in str(described)
+        assert "hunter2" not in str(described)
+
+
+def test_a_users_function_in_a_part_of_this_package_is_its_source() -> None:
+    described = stored(systems.Simulated(policy))
     assert isinstance(described, dict)
-    assert [set(code) - {"uses"} for code in described["code"]] == [{"digest"}]
+    assert described["type"] == "Simulated"
+    assert '"source"' in json.dumps(described)
 
 
-def test_private_attributes_are_described_on_request() -> None:
-    assert describe(Part(2.0, _cache=9), private=True)["_cache"] == 9
-
-
-def test_a_partial_is_described_by_its_function_and_what_it_binds() -> None:
-    expected = {"partial": stored(policy), "args": [1], "keywords": {"x": 2.0}}
-    assert stored(functools.partial(policy, 1, x=2.0)) == expected
-
-
-def test_functions_that_close_over_other_values_are_told_apart() -> None:
-    def scaled(gain: float) -> object:
-        return lambda x: gain * x
-
-    assert first_difference(stored(scaled(2.0)), stored(scaled(2.0))) is None
-    assert first_difference(stored(scaled(2.0)), stored(scaled(3.0))) == "gain was 2.0 and is now 3.0"
-
-
-def test_methods_of_objects_with_other_values_are_told_apart() -> None:
+def test_methods_of_parts_with_other_settings_are_told_apart() -> None:
     one, other = models.Linear([[1]], [[1]]), models.Linear([[2]], [[1]])
     assert first_difference(stored(one.step), stored(other.step)) == "of.A[0][0] was 1.0 and is now 2.0"
-
-
-def test_large_arrays_are_told_apart_without_being_listed() -> None:
-    data = np.random.default_rng(0).normal(size=(200, 3))
-    assert len(json.dumps(stored(data))) < 200
-    assert first_difference(stored(data), stored(data + 1e-3)) is not None
-    assert first_difference(stored(data), stored(data[:-1])) is not None
 
 
 def test_what_contains_itself_has_a_description() -> None:
@@ -158,9 +139,15 @@ def test_descriptions_with_what_is_not_finite_agree_with_themselves(one: np.ndar
         ({"a": "x"}, {"a": 1}, "a was 'x' and is now 1"),
         ({"a": 1.0}, {"a": 1.0 + 1e-5}, "a was 1.0 and is now 1.00001"),
         ({"a": 1.0}, {"a": float("nan")}, "a was 1.0 and is now nan"),
+        ({"a": {"function": "f", "source": "1"}}, {"a": {"function": "g", "source": "1"}}, None),
+        (
+            {"a": {"function": "f", "source": "1"}},
+            {"a": {"function": "f", "source": "2"}},
+            "the source of a has changed",
+        ),
     ],
 )
-def test_the_first_difference_is_named_with_its_place(one: object, other: object, difference: str) -> None:
+def test_the_first_difference_is_named_with_its_place(one: object, other: object, difference: str | None) -> None:
     assert first_difference(one, other) == difference
 
 
@@ -176,24 +163,6 @@ def test_long_values_are_shortened_in_a_difference() -> None:
     assert len(found) < 160
 
 
-def test_functions_that_differ_in_a_constant_a_default_or_a_name_are_told_apart() -> None:
-    pairs = (
-        (lambda x: 0.5 * x, lambda x: 0.3 * x),
-        (lambda x, k=1.0: k * x, lambda x, k=2.0: k * x),
-        (lambda x, *, k=1.0: k * x, lambda x, *, k=2.0: k * x),
-        (lambda x: np.sin(x), lambda x: np.tanh(x)),
-    )
-    for one, other in pairs:
-        assert first_difference(stored(one), stored(other)) is not None
-        assert first_difference(stored(one), stored(one)) is None
-
-
-def test_large_arrays_in_another_order_are_told_apart() -> None:
-    matrix = np.random.default_rng(0).normal(size=(11, 11))
-    assert first_difference(stored(matrix), stored(matrix.T)) is not None
-    assert first_difference(stored(matrix), stored(matrix * (1 + 1e-9))) is None
-
-
 def test_small_weights_are_told_apart() -> None:
     assert first_difference(1e-10, 9e-10, "R") is not None
 
@@ -204,12 +173,9 @@ def test_small_weights_are_told_apart() -> None:
         range(10**9),
         b"x" * 10**7,
         1 + 2j,
-        np.array([np.nan, *range(500)]),
-        np.array([Slotted()], dtype=object),
+        np.array([Part(1.0)], dtype=object),
         type("Answering", (), {"__getattr__": lambda self, name: lambda *a, **k: 1})(),
-        type("Raising", (), {"describe": property(lambda self: 1 / 0)})(),
-        type("Text", (), {"describe": lambda self: "text"})(),
-        type("Wanting", (), {"describe": lambda self, more: {}})(),
+        type("Slotted", (), {"__slots__": ("gain",)})(),
     ],
 )
 def test_odd_objects_have_a_short_description_that_agrees_with_itself(value: object) -> None:

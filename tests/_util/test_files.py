@@ -11,7 +11,8 @@ import pytest
 
 from ctxval import Trajectory
 from ctxval._util import files
-from ctxval._util.files import csv_rows, open_regular, read_bytes, read_json, require_regular_file, written_whole
+from ctxval._util.csv_table import CsvTable
+from ctxval._util.files import open_regular, read_bytes, read_json, require_regular_file, written_whole
 from ctxval.config.parts import recorded
 from ctxval.core.exchange import read_task
 from ctxval.errors import InputError
@@ -44,7 +45,7 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, monkeypatch:
             "no\0name": "null",
         }
         for name, reason in reasons.items():
-            for read in (read_bytes, read_json, require_regular_file, open_regular, lambda path: list(csv_rows(path))):
+            for read in (read_bytes, read_json, require_regular_file, open_regular, CsvTable):
                 with pytest.raises(InputError, match=reason):
                     read(name)
 
@@ -68,7 +69,7 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     with (tmp_path / "a").open("wb") as file:
         file.truncate(2**33)  # sparse: it takes no space
     tracemalloc.start()
-    for read in (read_bytes, read_json, lambda path: list(csv_rows(path))):
+    for read in (read_bytes, read_json, CsvTable):
         with pytest.raises(InputError, match="it has 8589934592 bytes, and at most"):
             read(tmp_path / "a")
     peak = tracemalloc.get_traced_memory()[1]
@@ -90,7 +91,9 @@ def test_hostile_json_gives_one_error(content: bytes, reason: str, tmp_path: Pat
 
 def test_rows_have_the_numbers_of_their_lines(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(b'\xef\xbb\xbfa,b\r\n\r\n1,"x\ny"\n2,z')
-    assert list(csv_rows(tmp_path / "a.csv")) == [(1, ["a", "b"]), (4, ["1", "x\ny"]), (5, ["2", "z"])]
+    table = CsvTable(tmp_path / "a.csv")
+    assert table.names == ("a", "b")
+    assert list(table.rows()) == [(4, ["1", "x\ny"]), (5, ["2", "z"])]
 
 
 @pytest.mark.parametrize(
@@ -128,7 +131,7 @@ def test_more_rows_than_a_plan_has_are_not_read(tmp_path: Path) -> None:
 
 def test_numbers_of_csv_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.csv").write_text("t,x0\n" + "0,1\n" * 100)
-    monkeypatch.setattr("ctxval.core.csv_columns.MOST_BYTES", 1000)
+    monkeypatch.setattr("ctxval._util.csv_table.MOST_BYTES", 1000)
     with pytest.raises(InputError, match="too many numbers: 1000 bytes may be read"):
         Trajectory.from_csv(tmp_path / "a.csv")
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import brentq, fsolve
+from threadpoolctl import threadpool_info
 
 from ctxval import Task, rollout
 from ctxval.testing import check_system
@@ -20,7 +21,7 @@ import plants  # noqa: E402
 import search_plants_part  # noqa: E402
 from ctxval._util.json_lines import JsonLines  # noqa: E402
 from dynamics_systems import repeated  # noqa: E402
-from dynamics_truths import digest  # noqa: E402
+from dynamics_truths import belongs, digest  # noqa: E402
 from plants import (  # noqa: E402
     DEVELOPMENT,
     PLANTS,
@@ -233,11 +234,18 @@ def test_the_arm_has_the_published_mass_and_reach() -> None:
 # Maxima
 
 
+KERNELS = {one.get("architecture") for one in threadpool_info()}
+ROUNDED = set() if {"Haswell", "Zen"} >= KERNELS else {"automatic-transmission", "magnetic-levitation"}
+"""Plants whose models are others than with the kernels of the records, because learning amplifies rounding."""
+
+
 @pytest.mark.parametrize("name", [name for name in PLANTS if TRUTHS.select(plant=name)])
 def test_the_stored_maximum_belongs_to_the_plant_as_it_is(name: str) -> None:
     found = experiment(name, 0)
-    record = TRUTHS[name, 0, digest(found.validation)]
-    assert found.validation.distances(np.array([record["point"]]))[0] == pytest.approx(record["distance"], rel=1e-6)
+    record = TRUTHS[name, 0, digest(PLANTS[name].make)]
+    if not belongs(record, found):
+        assert name in ROUNDED
+        pytest.skip("the model that is learned on this processor is another one than that of the record")
     sample = found.validation.space.iid(100, np.random.default_rng(5))
     assert found.validation.distances(sample).max() <= record["distance"]
     assert truth(PLANTS[name], 0, found) == record
@@ -257,10 +265,10 @@ def test_stored_campaigns_end_within_one_per_cent_or_with_their_budget() -> None
 
 def test_a_campaign_is_run_once_and_only_auto_has_versions(tmp_path: Path) -> None:
     results, truths = JsonLines(tmp_path / "plants.jsonl", STORED.key), JsonLines(tmp_path / "truths.jsonl", TRUTHS.key)
-    found = experiment("cart-pole", 0)
-    truths.append({"plant": "cart-pole", "seed": 0, "digest": digest(found.validation), "distance": 0.01})
+    record = TRUTHS["cart-pole", 0, digest(PLANTS["cart-pole"].make)]
+    truths.append({**record, "repeats": [0.01]})
     first = run("before", "cart-pole", 0, "random", results, truths)
-    assert first["distances"][0] > 0.01
+    assert first["truth"] == record["distance"]
     assert run("after", "cart-pole", 0, "random", results, truths) == first
     assert list(results) == [("cart-pole", 0, "random", "unchanged")]
     assert version_of("auto", "after") == "after"

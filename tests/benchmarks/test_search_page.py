@@ -15,6 +15,7 @@ sys.path.insert(0, str(BENCHMARKS))
 import search_page  # noqa: E402
 import search_versions_part  # noqa: E402
 from ctxval._util.json_lines import JsonLines  # noqa: E402
+from ctxval.reproduce.revision import AUTO, provenance  # noqa: E402
 from study_auto import CASES, KEY, first_within, results_of, stored  # noqa: E402
 
 TARGETS = search_page.targets()
@@ -48,7 +49,7 @@ def test_what_is_stored_is_not_run_again_and_what_is_run_is_stored(tmp_path: Pat
     results, computed = JsonLines(tmp_path / "study.jsonl", KEY), []
     for seed in (0, 1, 0):
         found = stored(results, "pendulum", seed, "no climbs", lambda: computed.append(1) or run)
-        assert found == {"case": "pendulum", "seed": seed, "search": "no climbs", **run}
+        assert found == {"case": "pendulum", "seed": seed, "search": "no climbs", **run, **provenance(AUTO)}
     assert len(computed) == 2
     again = JsonLines(tmp_path / "study.jsonl", KEY)
     assert stored(again, "pendulum", 1, "no climbs", dict)["distances"] == [0.5, 1.0]

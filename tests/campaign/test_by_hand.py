@@ -24,6 +24,7 @@ from ctxval.controllers import read_controller
 from ctxval.core.exchange import read_task
 from ctxval.core.rollout import rollout
 from ctxval.errors import ExecutionError, InputError, StoreAccessError
+from ctxval.storage.database import Database
 
 MODULE = """
 from ctxval import Experiment, Task, TaskSpace, Validation, controllers, distances, models, systems
@@ -186,7 +187,7 @@ def test_asking_by_command_chooses_what_a_campaign_chooses(invoke: Any) -> None:
         ),
         (["a.sqlite", "--until-decided", "--draw"], "--trial and --until-decided cannot be combined"),
         (["a.sqlite", "--threshold", "1"], "--threshold and --budget need --until-decided"),
-        (["a.sqlite", "--until-decided", "--threshold", "nan"], "the threshold must be"),
+        (["a.sqlite", "--until-decided", "--threshold", "nan"], "threshold must be a positive number"),
         (["a.sqlite", "--until-decided", "--budget", "0"], "budget must be a positive integer"),
         (["a.sqlite", "--trial", "9"], "there is no trial 9"),
         (["a.sqlite", "--seed", "3"], "is a store and keeps its own settings"),
@@ -359,15 +360,23 @@ def with_cell(line: int, column: int, text: str) -> Any:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (without(2), "run.csv has no column speed; there are t, position, force"),
+        (without(2), "run.csv has no column speed; there are t, position [m], force"),
         (without(3), "must have the columns of the inputs, force"),
-        (with_cell(1, 1, "position [km]"), "has position in km, and m is needed; convert it"),
+        (with_cell(1, 1, "position [kg]"), "has position in kg, and m is needed"),
+        (with_cell(1, 1, "speed [m/s]"), "has two columns 'speed'"),
+        (with_cell(1, 0, "t [ms]"), "must have steps of 0.1 s: time 1 must be 0.1 s after the first, got 0.0001 s"),
+        (
+            lambda rows: [rows[0], *([str(100 * k), *row[1:]] for k, row in enumerate(rows[1:]))],
+            "if the times are in ms, name their column t [ms]",
+        ),
+        (with_cell(5, 1, "-999"), "position is -999 at 0.3 s, far from all other values, which stands for a missing"),
+        (with_cell(7, 1, "1,5"), "line 7: position [m] must be a number, got '1,5'"),
         (without(0), "must have the columns t, position [m], speed [m/s], force [N]"),
-        (lambda rows: rows[:15], "must have 21 times, 20 steps of 0.1 s, got 14"),
+        (lambda rows: rows[:15], "must have 21 times, 20 steps of 0.1 s, got 14 with steps of 0.1 s; --resample"),
         (lambda rows: rows[:1], "must have a header and at least two rows"),
         (with_cell(5, 1, "n/a"), "run.csv, line 5: position [m] must be a number, got 'n/a'"),
         (with_cell(5, 1, ""), "run.csv, line 5: position [m] must be a number, and the cell is empty"),
-        (lambda rows: [";".join(row).split(",") for row in rows], "it has semicolons between its columns: use commas"),
+        (lambda rows: [";".join(row).split(",") for row in with_cell(7, 1, "0,5")(rows)], "decimal commas (line 7)"),
         (with_cell(5, 1, "nan"), "run.csv is not finite: position is nan at 0.3 s. If the execution has no usable"),
         (with_cell(4, 3, "-inf"), "run.csv is not finite: force is -inf at 0.2 s."),
         (with_cell(2, 1, "0.7"), "starts elsewhere: state 0 must start at 0 within"),
@@ -435,7 +444,7 @@ def test_a_recording_at_other_times_is_resampled_on_request(invoke: Any) -> None
     whole, kept = record(report["folder"], "plain.csv"), Store("a.sqlite").trajectory(0, "system")
     assert kept is not None
     np.testing.assert_allclose(kept.states, whole.states, atol=1e-12)
-    np.testing.assert_array_equal(kept.inputs, whole.inputs)
+    np.testing.assert_allclose(kept.inputs, whole.inputs, rtol=1e-12)
     assert json.loads(answer.stdout)["state"] == "completed"
     asked(invoke, "a.sqlite")
     edit(lambda rows: rows[:60])
@@ -522,7 +531,7 @@ def test_known_runs_come_in_once_with_their_origin(invoke: Any) -> None:
         ("goal,distance\n", "runs.csv has no run below its header"),
         (
             "goal,distance,goal\n1,2,3\n",
-            "runs.csv must not have two columns of the same name, got goal, distance, goal",
+            "runs.csv has two columns 'goal': each name must be there once",
         ),
         ("", "it has none"),
         ("\x00\x01", "runs.csv"),
@@ -539,11 +548,53 @@ def test_a_table_of_runs_is_read_with_a_bound(invoke: Any) -> None:
     new(invoke)
     Path("runs.csv").touch()
     os.truncate("runs.csv", 2**33)
-    assert "runs.csv cannot be read as a table of runs: it has 8589934592 bytes" in refused(
+    assert "runs.csv cannot be read as CSV: it has 8589934592 bytes" in refused(
         invoke("import", "a.sqlite", "runs.csv")
     )
     Path("runs.csv").write_text("distance,goal\n0.5\n")
-    assert "line 2: goal must be a number, got None" in refused(invoke("import", "a.sqlite", "runs.csv"))
+    assert "line 2: goal must be a number, and the cell is empty" in refused(invoke("import", "a.sqlite", "runs.csv"))
+
+
+def test_many_runs_are_imported_in_one_transaction_and_told_once(invoke: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    new(invoke)
+    rows = [f"{0.5 + k / 100},{k / 1000}" for k in range(100)]
+    Path("runs.csv").write_text("\n".join(["goal,distance", *rows, rows[7]]))
+    calls: Counter[str] = Counter()
+    for kind, name in ((Store, "record_known"), (Database, "transaction")):
+        monkeypatch.setattr(kind, name, counted(getattr(kind, name), name, calls))
+    result = invoke("import", "a.sqlite", "runs.csv")
+    assert result.exit_code == 0, result.stderr
+    assert (calls["record_known"], len(Store("a.sqlite").trials())) == (1, 101)
+    assert calls["transaction"] < 10
+    assert result.stdout.splitlines()[-2:] == [
+        "... and 90 other trials; --json lists them.",
+        "100 runs imported, 1 already in the store.",
+    ]
+
+
+def counted(function: Any, name: str, calls: Counter[str]) -> Any:
+    def call(*args: Any, **kwargs: Any) -> Any:
+        calls[name] += 1
+        return function(*args, **kwargs)
+
+    return call
+
+
+def test_a_table_of_runs_is_converted_to_the_units_of_the_tasks(invoke: Any) -> None:
+    new(invoke)
+    Path("runs.csv").write_text("goal [mm];distance\n750;0,25\n")
+    found = json.loads(invoke("import", "a.sqlite", "runs.csv", "--json").stdout)["imported"]
+    assert [(one["task"]["goal"], one["distance"]) for one in found] == [(0.75, 0.25)]
+    Path("runs.csv").write_text("goal [s],distance\n1,0.25\n")
+    assert "no known factor from s to m" in refused(invoke("import", "a.sqlite", "runs.csv"))
+
+
+def test_a_little_jitter_is_refused_with_its_size_and_the_option_that_helps(invoke: Any) -> None:
+    record(new(invoke)["folder"])
+    edit(lambda rows: [rows[0], *([str(0.1 * k + 0.0025 * (k % 2)), *row[1:]] for k, row in enumerate(rows[1:]))])
+    sentence = refused(invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv"))
+    assert "The largest difference is 0.0025 s; --resample interpolates a recording to these times" in sentence
+    assert invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv", "--resample").exit_code == 0
 
 
 def test_what_is_imported_must_be_there(invoke: Any) -> None:

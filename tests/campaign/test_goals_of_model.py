@@ -36,7 +36,7 @@ def test_a_campaign_warns_once_that_the_model_misses_its_goals() -> None:
         campaign.run(8)
     said = [str(one.message) for one in caught if issubclass(one.category, GoalWarning)]
     assert len(said) == 1
-    assert said[0].startswith("the model itself does not complete its tasks: in 2 of 3 it ends more than 10 % of")
+    assert said[0].startswith("the model itself does not complete its tasks: in 3 of 3 it ends more than 10 % of")
     assert "in angle [rad] for the task {'goal': " in said[0]
     assert said[0].endswith("see `ctxval check --aspect1`.")
 

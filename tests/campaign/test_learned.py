@@ -64,7 +64,6 @@ def test_a_sample_keeps_the_predictions_and_a_kind_asks_for_them() -> None:
     [
         (Labels(("angle [rad]", "rate [rad/s]"), ("torque [N m]",)), ["angle [rad]", "rate [rad/s]", "torque [N m]"]),
         (Labels(), ["x[0]", "x[1]", "u[0]"]),
-        (Labels(("a", "b"), ("a",)), ["x[0]", "x[1]", "u[0]"]),
     ],
 )
 def test_evidence_names_states_and_inputs_as_the_experiment_does(labels: Labels, coordinates: list[str]) -> None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from conftest import make_validation
-from ctxval import Campaign, Experiment, Store, Validation, searches
-from ctxval.campaign.telling import ToldResult, parameters_of_trial, require_tolerance, result_sentence, tell_result
+from ctxval import Campaign, Experiment, Store, Trajectory, Validation, searches
+from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 
@@ -60,13 +62,6 @@ def test_parameters_of_a_trial(campaign: Campaign) -> None:
         parameters_of_trial(campaign, 7)
 
 
-@pytest.mark.parametrize("given", [-1.0, float("nan"), float("inf")])
-def test_a_tolerance_must_be_possible(given: float) -> None:
-    with pytest.raises(InputError, match="the tolerance must be a finite number >= 0"):
-        require_tolerance(given, "the tolerance")
-    require_tolerance(None, "the tolerance")
-
-
 def test_a_campaign_sees_what_another_process_has_stored(tmp_path: Path) -> None:
     one, other = (Campaign(make_validation(), search=searches.Random(), store=tmp_path / "a.sqlite") for _ in range(2))
     one.tell(one.ask(), distance=0.5)
@@ -75,3 +70,57 @@ def test_a_campaign_sees_what_another_process_has_stored(tmp_path: Path) -> None
     assert [trial.distance for trial in other.trials] == [0.5]
     for campaign in (one, other):
         campaign.store.close()
+
+
+@pytest.mark.parametrize("told", [{"distance": 0.1}, {"failed": "the motor cut out"}, {}])
+def test_a_wrong_result_is_replaced_and_the_history_keeps_it(tmp_path: Path, told: dict[str, Any]) -> None:
+    campaign = Campaign(make_validation(), search=searches.Random(), store=tmp_path / "a.sqlite")
+    opened = campaign.ask()
+    first = campaign.validation.execute(opened.plan)
+    wrong = campaign.tell(
+        opened, Trajectory(first.times, first.states + np.linspace(0, 1, len(first.states))[:, None], first.inputs)
+    )
+    right = told or {"trajectory": first}
+    with pytest.raises(InputError, match="nothing more can be told of it"):
+        campaign.tell(0, **right)
+    with pytest.raises(InputError, match="replace needs a reason"):
+        campaign.tell(0, **right, replace=" ")
+    replaced = campaign.tell(0, **right, replace="the file of another run")
+    assert (replaced.number, replaced.executed) == (0, True)
+    assert replaced.distance == (campaign.validation.measure(opened.plan, first) if not told else told.get("distance"))
+    executed = campaign.store.trajectory(0, "system")
+    assert (executed is None) == bool(told)
+    assert executed is None or np.array_equal(executed.states, first.states)
+    [change] = campaign.store.history()
+    assert (change.what, change.why) == ("replaced", "the file of another run")
+    assert change.content["before"]["0"]["distance"] == wrong.distance
+    kept = Trajectory.from_npz(base64.b64decode(change.content["before"]["0"]["npz"]))
+    assert not np.array_equal(kept.states, first.states)
+    assert "the file of another run" in " ".join(campaign.provenance.remarks)
+    again = Campaign(make_validation(), search=searches.Random(), store=tmp_path / "a.sqlite")
+    assert again.trials[0].distance == replaced.distance
+    assert campaign.ask().number == 1
+
+
+def test_only_results_that_people_told_can_be_replaced() -> None:
+    campaign = Campaign(make_validation(), search=searches.Random()).run(1)
+    campaign.ask()
+    for number in (0, 1, 2):
+        with pytest.raises(InputError, match=r"was told by a person|there is no trial 2"):
+            campaign.tell(number, distance=0.1, replace="wrong file")
+
+
+def test_the_offset_of_a_start_is_stated_and_compared_with_the_threshold() -> None:
+    campaign = Campaign(make_validation(), search=searches.Random())
+    opened = campaign.ask()
+    executed = campaign.validation.execute(opened.plan)
+    offset = np.zeros_like(executed.states)
+    offset[0, 0] = 0.02
+    ended = campaign.tell(opened, Trajectory(executed.times, executed.states + offset, executed.inputs))
+    start = campaign.start_offset(ended)
+    assert start is not None
+    assert start.size == pytest.approx(0.02)
+    assert result_sentence(ended, "rad", start).endswith("; its start was off by 0.02 in x0")
+    sentence = "The start of an execution was off by 0.02 in x0 (trial 0); the threshold is"
+    assert f"{sentence} 0.01" in campaign.verdict(0.01).reason
+    assert sentence not in campaign.verdict(0.03).reason

@@ -170,7 +170,11 @@ def test_how_far_elsewhere_a_start_may_be_is_the_validations() -> None:
     assert [t.state for t in Campaign(validation).run(2).trials] == ["completed"] * 2
 
 
-# A distance that gives nothing usable
+# A distance that gives nothing usable for the system, which no trial with the model alone shows
+
+
+def differ(model: Trajectory, system: Trajectory) -> bool:
+    return not np.array_equal(model.states, system.states)
 
 
 def test_an_execution_that_cannot_be_measured_is_kept_and_measured_later_for_free(tmp_path: Path) -> None:
@@ -182,7 +186,7 @@ def test_an_execution_that_cannot_be_measured_is_kept_and_measured_later_for_fre
     mended = tmp_path / "mended"
 
     def distance(model: Any, system: Any, task: Any) -> float:
-        if not mended.exists():
+        if not mended.exists() and differ(model, system):
             return float("nan")
         return float(np.abs(model.final_state - system.final_state).sum())
 
@@ -202,7 +206,7 @@ def test_an_execution_that_cannot_be_measured_is_kept_and_measured_later_for_fre
 
 
 def test_what_is_told_or_added_without_a_usable_distance_is_kept_too() -> None:
-    campaign = campaign_of(distance=lambda model, system, task: -1.0)
+    campaign = campaign_of(distance=lambda model, system, task: -1.0 if differ(model, system) else 0.0)
     opened = campaign.ask()
     whole = campaign.validation.execute(opened.plan)
     with pytest.raises(DistanceError):
@@ -239,8 +243,7 @@ def test_a_trial_that_was_interrupted_can_be_told(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         campaign.run(2)
     assert campaign.tell(0, distance=0.5).distance == 0.5
-    again = campaign_of(store=tmp_path / "a.sqlite")
-    assert again.trials[0].distance == 0.5
+    assert Store(tmp_path / "a.sqlite").trials()[0].distance == 0.5
 
 
 def test_what_a_store_does_not_take_is_kept_beside_it_every_time(tmp_path: Path) -> None:
@@ -333,7 +336,8 @@ def test_an_alarm_of_the_system_itself_is_its_failure() -> None:
 @pytest.mark.parametrize("act", [leave, interrupt_by_code, leave_hard])
 def test_a_distance_that_exits_leaves_its_execution(act: Any) -> None:
     def distance(model: Any, system: Any, task: Any) -> float:
-        act(system)
+        if differ(model, system):
+            act(system)
         return 0.0
 
     campaign = campaign_of(distance=distance)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctxval import Trial
-from ctxval.certificates import Audit, CertificateOptions, Convergence, Provenance, Scenario, assess
+from ctxval.certificates import Audit, CertificateOptions, Provenance, SamplingDiscarding, Scenario, assess
 from ctxval.errors import CertificateError, InputError
 from ctxval.version import VERSION
 
@@ -38,11 +38,11 @@ def test_against_a_threshold_the_verdict_comes_first() -> None:
 
 
 def test_a_counterexample_stands_where_the_certificate_is_refused() -> None:
-    refused = assess(DRAWN, CertificateOptions(Convergence()), 0.4)
-    assert (refused.certificate, refused.kind) == (None, "convergence")
+    refused = assess(DRAWN, CertificateOptions(SamplingDiscarding()), 0.4)
+    assert (refused.certificate, refused.kind) == (None, "sampling-discarding")
     assert refused.verdict is not None
     assert refused.verdict.answer == "falsified"
-    assert "needs its constant C" in refused.to_json()["refused"]
+    assert "how many to discard" in refused.to_json()["refused"]
     certified = assess(DRAWN, CertificateOptions(Scenario()), 0.4)
     assert certified.certificate is not None
     assert certified.verdict is not None
@@ -51,8 +51,8 @@ def test_a_counterexample_stands_where_the_certificate_is_refused() -> None:
 
 def test_what_is_neither_certified_nor_falsified_is_an_error() -> None:
     for threshold in (None, 0.6):
-        with pytest.raises(CertificateError, match="needs its constant C"):
-            assess(DRAWN, CertificateOptions(Convergence()), threshold)
+        with pytest.raises(CertificateError, match="how many to discard"):
+            assess(DRAWN, CertificateOptions(SamplingDiscarding()), threshold)
     with pytest.raises(InputError, match="positive number"):
         assess(DRAWN, AUDIT, -1.0)
 
@@ -65,5 +65,5 @@ def test_options_that_no_verdict_can_have_are_refused(confidence: float, volume:
 
 @pytest.mark.parametrize("confidence", [0.0, 1.0, 1e-300, np.nan])
 def test_a_confidence_that_is_no_probability_is_refused(confidence: float) -> None:
-    with pytest.raises(CertificateError, match="strictly between 0 and 1"):
+    with pytest.raises(InputError, match=r"strictly between 0 and 1|wrong more often|must be"):
         CertificateOptions(Audit(), confidence)

@@ -20,7 +20,6 @@ from ctxval.certificates import (
     Options,
     Posterior,
     Sample,
-    TheoremConstants,
     certify,
     require_use,
 )
@@ -40,9 +39,8 @@ def sample(n: int = 9, origin: str = "acquisition") -> Sample:
 
 
 def everything(kind: str) -> tuple[Sample, Options]:
-    trials = sample(30, origin="acquisition" if kind == "convergence" else "iid")
-    theorem = TheoremConstants(1.0, 0.01, 1.0, 3.0, 1.0)
-    return trials, Options(discard=2, theorem=theorem)
+    trials = sample(30, origin="iid")
+    return trials, Options(discard=2)
 
 
 def certified(kind: str, confidence: float) -> Certificate:
@@ -75,8 +73,6 @@ def test_what_a_kind_needs_and_is_not_given_is_asked_for() -> None:
     trials, _ = everything("scenario")
     with pytest.raises(CertificateError, match="how many to discard"):
         certify(trials, "sampling-discarding", 0.9)
-    with pytest.raises(CertificateError, match="needs its constant C"):
-        certify(trials, "convergence", 0.9)
     with pytest.raises(UnknownNameError, match="did you mean 'posterior'"):
         certify(trials, "posteriour", 0.9)
 
@@ -88,15 +84,10 @@ def test_a_confidence_below_1_is_not_printed_as_1() -> None:
     assert "confidence 0.9999999," in certificate.statement
 
 
-def test_proposition_1_is_refused_where_another_search_chose_the_tasks() -> None:
-    with pytest.raises(CertificateError, match="CMAES chose these"):
-        certify(sample(), "convergence", 0.9, Options(constant=1.0, search="CMAES"))
-
-
 def test_the_kinds_of_this_package_are_listed_by_name() -> None:
-    own = ["anytime", "audit", "auto", "convergence", "dynamics", "mean", "posterior", "region"]
+    own = ["anytime", "audit", "auto", "dynamics", "mean", "posterior", "region"]
     assert list(KINDS) == [*own, "sampling-discarding", "scenario"]
-    assert len(KINDS) == 10
+    assert len(KINDS) == 9
     assert "posteriour" not in KINDS
     assert KINDS["posterior"] is Posterior
 
@@ -110,8 +101,6 @@ def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> Non
         "predictions": ("mean", "region"),
         "quantile": ("mean",),
         "largest_possible": ("mean",),
-        "constant": ("convergence",),
-        "theorem": ("convergence",),
     }
     with pytest.raises(AttributeError, match="no attribute 'USED'"):
         _ = certificates.USED
@@ -219,5 +208,5 @@ def test_options_of_another_type_are_refused(make: Any) -> None:
 
 
 def test_a_number_to_discard_is_an_integer() -> None:
-    with pytest.raises(CertificateError, match=r"discard must be an integer, got 1\.5"):
+    with pytest.raises(InputError, match=r"discard must be a positive integer, got 1\.5"):
         certificates.SamplingDiscarding(discard=1.5).certify(sample(30))  # type: ignore[arg-type]

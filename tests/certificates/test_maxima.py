@@ -7,13 +7,14 @@ from hypothesis import strategies as st
 
 from ctxval.certificates import (
     Maxima,
+    Posterior,
     Sample,
     certify_posterior,
     draw_maxima,
     settle_maxima,
 )
-from ctxval.certificates.maxima import _MOST
-from ctxval.errors import CertificateError
+from ctxval.certificates.maxima import _MOST, MOST, representative
+from ctxval.errors import CertificateError, InputError
 from ctxval.gp.hyperposterior import Prior
 
 confidences = st.floats(0.01, 0.999)
@@ -69,9 +70,9 @@ def test_the_rank_is_that_of_exchangeable_draws() -> None:
 
 @pytest.mark.parametrize("confidence", [0.0, 1.0, -0.1, 1.5, np.nan])
 def test_a_confidence_that_is_no_probability_is_refused(confidence: float) -> None:
-    with pytest.raises(CertificateError, match="strictly between 0 and 1"):
+    with pytest.raises(InputError, match="strictly between 0 and 1"):
         drawn([1.0, 2.0]).upper(confidence)
-    with pytest.raises(CertificateError, match="strictly between 0 and 1"):
+    with pytest.raises(InputError, match="strictly between 0 and 1"):
         certify_posterior(sample(), confidence)
 
 
@@ -255,3 +256,28 @@ def test_near_the_threshold_more_is_drawn_but_not_for_ever(monkeypatch: pytest.M
     assert (np.diff(found.draws) >= 0).all()
     assert np.bincount(found.owners).tolist() == [4] * len(found.conditioned)
     assert np.isin(usual.draws, found.draws).all()
+
+
+# Many trials
+
+
+def test_many_trials_are_represented_by_the_largest_and_well_spread_ones() -> None:
+    few, many = sample(MOST), sample(1000, 2)
+    assert len(representative(few)) == MOST
+    kept = representative(many)
+    assert len(kept) == MOST
+    assert kept.best == many.best
+    assert set(np.sort(many.distances)[-MOST // 4 :]) <= set(kept.distances)
+
+
+def test_a_bound_of_many_trials_says_that_it_uses_some_of_them() -> None:
+    many = sample(400)
+    certificate = certify_posterior(many, 0.9, found=quick(many))
+    assert certificate.trials == 400
+    assert "conditioned on 160 of the 400 trials" in " ".join(certificate.assumptions)
+    assert certificate.upper_bound >= many.best
+
+
+def test_many_trials_that_do_not_cover_the_tasks_are_refused_before_the_draws() -> None:
+    with pytest.raises(CertificateError, match=r"away from each of 400 trials.*is not computed"):
+        Posterior().certify_against(sample(400, 5), 10.0)

@@ -10,7 +10,6 @@ from ctxval.core.trial import Change
 
 def test_what_was_changed_in_a_store_is_remarked() -> None:
     changes = [
-        Change("described anew", "made by an older version", {}),
         Change("accepted", "gripper replaced", {"differences": ["x was 1 and is now 2", "y is new"], "trials": 7}),
         Change("remeasured", "another norm", {"before": {}}),
     ]

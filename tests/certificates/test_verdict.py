@@ -17,9 +17,9 @@ from ctxval.certificates import (
 )
 from ctxval.certificates.covering import resolved_volume
 from ctxval.certificates.stopping import StoppingRule
-from ctxval.certificates.verdict import counterexample, judge, judge_by, require_threshold
-from ctxval.core.trial import Origin, State
-from ctxval.errors import CertificateError, InputError
+from ctxval.certificates.verdict import counterexample, judge, judge_by
+from ctxval.core.trial import Origin, State, designs_sentence
+from ctxval.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("few_draws")
 
@@ -68,10 +68,43 @@ def test_a_distance_at_the_threshold_is_no_counterexample_and_neither_is_a_failu
 @pytest.mark.parametrize("threshold", [0.0, -1.0, np.nan, np.inf, "1", None])
 def test_a_threshold_is_a_positive_number(threshold: object) -> None:
     with pytest.raises(InputError, match="positive number"):
-        require_threshold(threshold)  # type: ignore[arg-type]
+        counterexample([], threshold)  # type: ignore[arg-type]
     for function in (counterexample, judge, lambda known, tau: StoppingRule(tau).decide(known, 0)):
         with pytest.raises(InputError, match="positive number"):
             function(trials(), threshold)  # type: ignore[operator]
+
+
+# Designs of the controllers
+
+
+def with_notes(notes: list[dict[str, object] | None]) -> list[Trial]:
+    return [replace(one, note=note) for one, note in zip(trials(len(notes)), notes, strict=True)]
+
+
+def test_a_verdict_says_at_how_many_executed_tasks_the_design_did_not_converge() -> None:
+    known = with_notes([{"converged": True}, {"converged": False}, {"converged": False, "unsteady": 2}, None])
+    sentence = (
+        "the design of the controller did not converge at 2 of 3 executed tasks, among them the worst one; 2 tasks "
+        "were not executed, because the controller jumps if the task changes by 1e-9 of its range"
+    )
+    worst = replace(known[2], distance=5.0)
+    for threshold, answer in ((0.5, "falsified"), (50.0, "undecided")):
+        found = judge([known[0], known[1], worst, known[3]], threshold)
+        assert found.answer == answer
+        assert found.reason.endswith(f"; {sentence}.")
+    other = replace(known[0], distance=9.0)
+    assert designs_sentence([other, *known[1:]]) == sentence.replace(", among them the worst one", "")
+
+
+@pytest.mark.parametrize("notes", [[None] * 3, [{"converged": True}] * 3, [{"unsteady": "many"}, {}, None]])
+def test_a_verdict_says_nothing_of_designs_that_converged(notes: list[dict[str, object] | None]) -> None:
+    assert designs_sentence(with_notes(notes)) is None
+    assert "design" not in judge(with_notes(notes), 0.1).reason
+
+
+def test_the_designs_of_open_trials_do_not_count() -> None:
+    waiting = replace(trial(0, 0.1, None, state="open"), note={"converged": False})
+    assert designs_sentence([waiting]) is None
 
 
 # By a certificate
@@ -184,9 +217,9 @@ def test_a_confidence_beyond_the_draws_is_undecided_and_one_that_is_none_is_refu
     assert verdict.answer == "undecided"
     assert "needs more than" in verdict.reason
     for tau, confidence in ((50.0, 1.5), (0.5, 0.0)):
-        with pytest.raises(CertificateError, match="strictly between 0 and 1"):
+        with pytest.raises(InputError, match="strictly between 0 and 1"):
             judge(trials(), tau, posterior(confidence))
-        with pytest.raises(CertificateError, match="strictly between 0 and 1"):
+        with pytest.raises(InputError, match="strictly between 0 and 1"):
             StoppingRule(tau, posterior(confidence)).decide(trials(), 0)
 
 
@@ -235,9 +268,9 @@ def test_a_reason_does_not_round_its_comparison_away() -> None:
 @pytest.mark.parametrize("resolution", [np.nan, 0.0, -0.1, np.inf])
 def test_a_resolution_that_is_no_positive_number_is_refused_before_anything_is_said(resolution: float) -> None:
     for trials_of in (trials(), [trial(0, 0.5, 9.0)]):  # a counterexample among them or not
-        with pytest.raises(CertificateError, match="resolution must be a positive number"):
+        with pytest.raises(InputError, match="resolution must be a positive number"):
             judge(trials_of, 1.0, posterior(resolution=resolution))
-        with pytest.raises(CertificateError, match="resolution must be a positive number"):
+        with pytest.raises(InputError, match="resolution must be a positive number"):
             StoppingRule(1.0, posterior(resolution=resolution)).decide(trials_of, 5)
 
 

@@ -98,7 +98,7 @@ def test_candidates_have_names_and_cases_have_options(invoke: Invoke) -> None:
     [
         (["gentle.toml"], "at least two candidates, got 1"),
         (["gentle.toml", "wide.toml"], "gentle and wide must have the same task spaces"),
-        (["gentle.toml", "stiff.toml", "--question", "best"], "question must be worst, mean or both, got 'best'"),
+        (["gentle.toml", "stiff.toml", "--question", "best"], "no question is called 'best'; did you mean 'both'?"),
         (["gentle.toml", "stiff.toml", "--budget", "0"], "budget must be a positive integer"),
         (["gentle.toml", "stiff.toml", "--confidence", "0.2"], "more often than right"),
         (["gentle.toml", "nothing.toml"], "there is no experiment file nothing.toml"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import pytest
 
 from ctxval import models
 from ctxval.config.parts import part
+from ctxval.config.settings import read_settings
+from ctxval.errors import InputError
 from rig_cli import Invoke, calling, report
 from rig_logs import DT, run, write_mcap_json
 
@@ -85,7 +88,9 @@ def test_fields_are_named_as_for_replay(invoke: Invoke) -> None:
     found = report(invoke(*files, *fields, "--kind", "linear", "--dt", "0.05", "--delay", "0", "--json"))
     assert {one["state"] for one in found["fitted"][0]["errors"]} == {"p", "v"}
     Path("map.toml").write_text('states = ["/state.cart.position"]\ninputs = ["/command.force"]\n')
-    mapped = report(invoke(*files, "--mapping", "map.toml", "--kind", "linear", "--json"))
+    result = invoke(*files, "--mapping", "map.toml", "--kind", "linear", "--json")
+    assert result.exit_code == 1  # without the speed, the position cannot be predicted
+    mapped = json.loads(result.stdout)
     assert mapped["fitted"][0]["errors"][0]["relative"] > 0.1
     Path("clock.csv").write_text(Path("logs/0.csv").read_text().replace("t,", "clock,", 1))
     assert report(invoke("clock.csv", "--time", "clock", "--kind", "linear", "--json"))["held_out"]["steps"] == 20
@@ -102,7 +107,9 @@ def test_recordings_that_determine_nothing_are_said_to(invoke: Invoke) -> None:
 def test_batches_are_taken_if_they_are_promised(invoke: Invoke) -> None:
     Path("my_batch_step.py").write_text("def step(x, u, theta):\n    return x + theta[0] * u\n")
     options = ("--step", "my_batch_step:step", "--parameter", "gain=[0, 1]", "--vectorized", "--out", "a.toml")
-    assert report(invoke("logs", *options, "--json"))["fitted"][0]["kind"] == "parameters"
+    found = json.loads(invoke("logs", *options, "--json").stdout)["fitted"][0]
+    assert found["kind"] == "parameters"
+    assert "no better than to predict no change" in found["useless"]  # a cart is no integrator of the force
     assert "vectorized = true" in Path("a.toml").read_text()
 
 
@@ -146,3 +153,79 @@ def test_what_cannot_be_used_is_said_in_one_sentence(arguments: tuple[str, ...],
     result = invoke("logs", *arguments)
     assert result.exit_code == 2, result.stdout + result.stderr
     assert message in " ".join(result.stderr.split())
+
+
+def test_a_model_that_is_no_better_than_none_is_said_to_be_useless(invoke: Invoke) -> None:
+    rng = np.random.default_rng(0)
+    for number in range(4):  # each recording has dynamics of its own
+        one = run(80, number, friction=(-30.0, 30.0, 25.0, -25.0)[number] * (1 + rng.uniform()), dt=0.01)
+        one.to_csv(f"logs/{number}.csv")
+    found = invoke("logs", "--kind", "linear", "--out", "model.npz")
+    assert found.exit_code == 1
+    said = " ".join(found.stderr.split())
+    assert "not good: the linear model is no better than to predict no change: its held-out error of x" in said
+    assert "% of the recorded change." in said
+    again = invoke("logs", "--kind", "linear", "--json")
+    assert again.exit_code == 1
+    assert "no better than" in json.loads(again.stdout)["fitted"][0]["useless"]
+
+
+@pytest.mark.parametrize("name", ["model.npz", "model.onnx", "model.toml"])
+def test_a_model_file_holds_its_time_step(invoke: Invoke, name: str) -> None:
+    options = ("--step", "my_cart_step:step", "--parameter", "mass=[0.5, 2]", "--parameter", "friction=[0, 1]")
+    kind = options if name.endswith("toml") else ("--kind", "linear")
+    assert invoke("logs", *kind, "--out", name).exit_code == 0
+    source = {
+        "model.npz": 'type = "Saved"\nsource = "model.npz"',
+        "model.onnx": 'type = "Onnx"\nsource = "model.onnx"\ndata = "model.data.npz"',
+        "model.toml": Path(name).read_text().partition("[model]\n")[2] if name.endswith("toml") else "",
+    }[name]
+    for dt, agrees in ((DT, True), (2 * DT, False)):
+        Path("cart.toml").write_text(EXPERIMENT.format(dt=dt, model=source))
+        validation = read_settings("cart.toml", {}).load().validation
+        if agrees:
+            assert validation.plan([1.0]).task.dt == DT
+            continue
+        with pytest.raises(InputError, match=r"the model has steps of 0.05 s and the task has steps of 0.1 s"):
+            validation.plan([1.0])
+
+
+EXPERIMENT = """
+[space]
+goal = [0.5, 2.0]
+
+[task]
+initial_state = [0.0, 0.0]
+goal = ["goal", 0.0]
+horizon = 10
+dt = {dt}
+
+[system]
+type = "Manual"
+states = {{x0 = "", x1 = ""}}
+inputs = {{u0 = ""}}
+dt = {dt}
+
+[model]
+{model}
+
+[synthesizer]
+type = "LQR"
+Q = [1.0, 1.0]
+R = [0.1]
+"""
+
+
+def test_recorded_data_of_several_files_have_one_unit_and_one_time_step(invoke: Invoke) -> None:
+    run(80, 5, dt=2 * DT).to_csv("slow.csv")
+    np.savez("slow.npz", **{name: getattr(run(80, 5, dt=2 * DT), name) for name in ("times", "states", "inputs")})
+    run(80, 6).to_csv("degrees.csv", states=["x0 [deg]", "x1"])
+    table = {"type": "Linear", "data": ["logs/0.csv", "logs/1.csv"]}
+    assert len(part("model", table).data) == 160
+    assert len(part("model", {**table, "data": ["logs/0.csv", "slow.csv"]}).data) == 80 + 160
+    for other, message in (
+        ("slow.npz", "recorded steps must have one length, got 0.05 s and 0.1 s"),
+        ("degrees.csv", "x0 in deg, and other logs have it in an unknown unit"),
+    ):
+        with pytest.raises(InputError, match=message):
+            part("model", {**table, "data": ["logs/0.csv", other]})

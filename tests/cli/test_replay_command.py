@@ -233,4 +233,4 @@ def test_a_replay_is_also_a_page(invoke: Invoke, tmp_path: Path) -> None:
     assert "report: out/page.html" in printed.output
     refused = invoke("runs", *LINEAR, "--html", "runs")
     assert refused.exit_code == 2
-    assert "runs cannot be written" in refused.output
+    assert "--html must be a file that ends in .html, got 'runs'" in refused.output

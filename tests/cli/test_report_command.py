@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -13,6 +14,8 @@ import pytest
 
 from conftest import STATE
 from ctxval import Store
+from ctxval.report.context import context_of_store
+from ctxval.report.sections.repeat import command_of
 from rig_cli import calling
 
 RIG = """
@@ -49,6 +52,29 @@ def store(invoke: Any) -> Path:
     assert done.exit_code == 0, done.output
     assert not Path("a.report.html").exists()
     return Path("a.sqlite")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--until-decided", "--threshold", "5", "--confidence", "0.9"],
+        ["--until-decided", "--audited", "--budget", "3"],
+        ["--resolution", "1", "--budget", "3", "--stochastic"],
+    ],
+    ids=" ".join,
+)
+def test_the_command_of_a_report_repeats_the_campaign(invoke: Any, options: list[str]) -> None:
+    first = ["run", "short_rig:experiment", "--search", "gp-ucb", "--seed", "2", "--no-report", *options]
+    assert invoke(*first, "--store", "a.sqlite").exit_code in (0, 1)
+    command = shlex.split(command_of(context_of_store(Store.existing("a.sqlite"))))
+    assert command[0] == "ctxval"
+    assert invoke(*command[1:], "--no-report", "--store", "b.sqlite").exit_code in (0, 1)
+    ran, again = (
+        [(trial.unit_point.tolist(), trial.origin) for trial in Store.existing(path).trials()]
+        for path in ("a.sqlite", "b.sqlite")
+    )
+    assert again == ran
+    assert command_of(context_of_store(Store.existing("b.sqlite"))) == shlex.join(command)
 
 
 def test_run_writes_a_report_next_to_the_store(invoke: Any) -> None:
@@ -129,7 +155,7 @@ def test_a_kind_and_a_confidence_of_ones_own(invoke: Any, store: Path) -> None:
     [
         (("nothing.sqlite",), "there is no store"),
         (("short_rig.py",), "not a database"),
-        (("a.sqlite", "-o", "."), "cannot be written"),
+        (("a.sqlite", "-o", "."), "--out must be a file that ends in .html"),
         (("a.sqlite", "--threshold", "-1"), "must be a positive number"),
         (("a.sqlite", "--trust", "--experiment", "pendulum"), "cannot be given together"),
         (("a.sqlite", "--junit", "a.sqlite/junit.xml"), "cannot be written"),
@@ -149,11 +175,38 @@ def test_a_report_leaves_the_store_as_it_is(invoke: Any, store: Path) -> None:
     assert [repr(trial) for trial in Store.existing(kept).trials()] == before
 
 
-@pytest.mark.parametrize("option", ["--out", "--junit", "--markdown"])
-def test_a_report_does_not_replace_a_store(invoke: Any, store: Path, option: str) -> None:
-    kept = Path(shutil.copy(store, "copy.sqlite"))
+@pytest.mark.parametrize(("option", "suffix"), [("--out", "html"), ("--junit", "xml"), ("--markdown", "md")])
+def test_a_report_does_not_replace_a_store(invoke: Any, store: Path, option: str, suffix: str) -> None:
+    kept = Path(shutil.copy(store, f"copy.{suffix}"))
     before = kept.read_bytes()
-    done = invoke("report", "a.sqlite", option, "copy.sqlite")
-    assert done.exit_code == 2
-    assert "must not replace it" in " ".join(done.stderr.split())
-    assert kept.read_bytes() == before
+    for forced in ((), ("--force",)):
+        done = invoke("report", "a.sqlite", option, str(kept), *forced)
+        assert done.exit_code == 2
+        assert ("ctxval did not write it", "is a store")[bool(forced)] in " ".join(done.stderr.split())
+        assert kept.read_bytes() == before
+
+
+def test_a_report_replaces_its_own_files_and_no_others(invoke: Any, store: Path) -> None:
+    written = ("--out", "a.html", "--junit", "a.xml", "--markdown", "a.md")
+    for _ in range(2):
+        assert invoke("report", str(store), *written).exit_code == 0
+    for option, name in zip(written[::2], written[1::2], strict=True):
+        Path(name).write_text("the work of a month")
+        done = invoke("report", str(store), option, name)
+        assert (done.exit_code, "ctxval did not write it" in " ".join(done.stderr.split())) == (2, True)
+        assert Path(name).read_text() == "the work of a month"
+        assert invoke("report", str(store), option, name, "--force").exit_code == 0
+    Path("experiment.toml").write_text("name = 'a'")
+    for options in (("--out", "experiment.toml"), ("--out", "a.html", "--junit", "a.html")):
+        assert invoke("report", str(store), *options, "--force").exit_code == 2
+    assert Path("experiment.toml").read_text() == "name = 'a'"
+
+
+def test_an_export_does_not_replace_the_files_of_others(invoke: Any, store: Path) -> None:
+    assert [invoke("export", str(store), "--out", "saved").exit_code for _ in range(2)] == [0, 0]
+    Path("mine").mkdir()
+    for name in ("trials.csv", "trials.json"):
+        Path("mine", name).write_text("my own table")
+        assert invoke("export", str(store), "--out", "mine").exit_code == 2
+        assert Path("mine", name).read_text() == "my own table"
+    assert invoke("export", str(store), "--out", "mine", "--force").exit_code == 0

@@ -43,7 +43,7 @@ def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         (["a.sqlite", "--host", "no host"], "the page cannot be served at no host, port 8765"),
         (["a.sqlite", "--host", "203.0.113.7", "--port", "0"], "the page cannot be served at 203.0.113.7"),
         (["a.sqlite", "--token", "short", "--port", "0"], "the token must have at least 16 characters"),
-        (["a.sqlite", "--threshold", "-1", "--port", "0"], "the threshold must be a positive number, got -1.0."),
+        (["a.sqlite", "--threshold", "-1", "--port", "0"], "threshold must be a positive number, got -1.0."),
         (["a.sqlite", "--experiment", "pendulum", "--port", "0"], "another experiment"),
     ],
 )

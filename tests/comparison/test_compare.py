@@ -27,7 +27,7 @@ from ctxval import (
     systems,
 )
 from ctxval.comparison import CandidateResult, PairResult
-from ctxval.comparison.candidates import Candidate, TrialNote
+from ctxval.comparison.candidates import TrialNote
 from ctxval.comparison.executions import agrees
 from ctxval.comparison.tables import markdown
 from ctxval.errors import InputError
@@ -186,8 +186,8 @@ def test_a_comparison_that_is_stopped_continues_with_the_same_choices(tmp_path: 
         (lambda: {"a": cart(), "b": cart(limit=3.0)}, "the same task spaces, but space"),
         (lambda: {"a": cart(), "b": make_validation()}, "the same task spaces"),
         (lambda: {"a": by_hand(), "b": by_hand()}, "on a system that people execute"),
-        (lambda: {"a": cart(), "b": 3}, "candidate b must be a Validation"),
-        (lambda: [cart(), cart()], "must be a mapping of names"),
+        (lambda: {"a": cart(), "b": 3}, "each value is a Validation or an Experiment or a Campaign, also 'b'"),
+        (lambda: [cart(), cart()], "must be a table of names"),
         (
             lambda: {"a": cart(), "b": cart().with_labels(Labels(units="mm"))},
             "must have the same unit, got 'm' and 'mm'",
@@ -208,7 +208,7 @@ def test_another_system_is_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"question": "median"}, "question must be worst, mean or both"),
+        ({"question": "median"}, "no question is called 'median'; did you mean 'mean'"),
         ({"budget": 0}, "budget must be a positive integer"),
         ({"budget": 2.5}, "budget must be a positive integer"),
         ({"seed": -1}, "seed must be an integer"),
@@ -314,4 +314,3 @@ def test_notes_of_others_are_no_notes_of_a_comparison() -> None:
         found = TrialNote.of(replace(trial, note=stored))
         assert found is not None
         assert vars(found) == vars(kept)
-    assert "Candidate('a', executions=0" in repr(Candidate("a", Campaign(make_validation())))

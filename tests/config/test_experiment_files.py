@@ -7,6 +7,7 @@ import json
 import sys
 import tomllib
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
 from conftest import make_validation, make_validation_without_inputs
-from ctxval import Experiment, Store, Task, TaskSpace, Trajectory, distances, systems
+from ctxval import Experiment, Store, Task, TaskSpace, Trajectory, Validation, controllers, distances, systems
 from ctxval.cli import app
 from ctxval.config.check import check_experiment
 from ctxval.config.parts import TaskTable, part, recorded
@@ -278,6 +279,20 @@ def findings(validation: Any, execute: bool = False, **names: Any) -> dict[str, 
     return {finding.check: (finding.state, finding.text) for finding in ordered}
 
 
+@pytest.mark.parametrize(("iterations", "state"), [(1, "noted"), (100, "ok")])
+def test_a_check_counts_the_designs_that_did_not_converge(iterations: int, state: str) -> None:
+    validation = make_validation()
+    hasty = controllers.ILQR([1.0, 0.1], [1e-2], [10.0, 1.0], iterations=iterations, limits=0.5)
+    validation = Validation(**{**vars(validation), "synthesizer": hasty})
+    found = {one.check: one for one in check_experiment(Experiment("x", validation))}["convergence of the designs"]
+    assert found.state == state
+    designs = "of 11 designs did not converge, such as goal = " if state == "noted" else "all 11 designs converged"
+    assert designs in found.text
+    assert "convergence of the designs" not in {
+        one.check for one in check_experiment(Experiment("x", make_validation()))
+    }
+
+
 def test_a_check_executes_nothing_unless_told() -> None:
     rig = FaultyRig(make_validation().system, dict.fromkeys(range(9), "raise"))
     validation = make_validation(system=rig)
@@ -457,3 +472,71 @@ def test_every_distance_is_written_in_a_file_as_in_python(name: str) -> None:
 )
 def test_no_name_leaves_the_folder_of_the_stores(name: str, file: str) -> None:
     assert read_settings("pendulum", {}).store_path(name) == Path("runs") / file
+
+
+@pytest.mark.parametrize(
+    ("table", "entry"),
+    [
+        ("distance", {"type": "FinalState", "components": [5]}),
+        ("distance", {"type": "FinalState", "angles": [7]}),
+        ("distance", {"type": "AtTimes", "times": [99.0]}),
+        ("distance", {"type": "FinalState", "components": ["speed"]}),
+        ("distance", {"type": "AtCrossing", "crossings": 0}),
+        ("certificate", {"kind": "mean", "quantile": 2.0}),
+        ("certificate", {"kind": "mean", "predictions": 0}),
+        ("certificate", {"kind": "region", "discard": -1}),
+        ("certificate", {"kind": "sampling-discarding"}),
+        ("certificate", {"kind": "region", "discard": 9}),
+        ("search", {"name": "gp-ucb", "beta": -1.0}),
+        ("search", {"name": "cma-es", "population": 0}),
+        ("synthesizer", {"type": "ILQR", "Q": [1.0], "R": [1.0], "iterations": 0}),
+        ("space", {"goal": [1.0, 0.0]}),
+        ("task", {"initial_state": [0.0], "goal": ["goal"], "horizon": 0, "dt": 0.1}),
+        ("system", {"type": "Manual", "states": {"time": "s"}, "inputs": {"u": "N"}, "dt": 0.1}),
+    ],
+    ids=repr,
+)
+def test_a_wrong_option_is_refused_before_an_execution_is_spent(table: str, entry: dict[str, Any]) -> None:
+    counted: list[int] = []
+
+    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        counted.append(1)
+        return x + u
+
+    def run() -> None:
+        settings = Settings.model_validate({**WHOLE, table: entry, "budget": 5, "threshold": 1.0})
+        experiment = settings.load()
+        chosen = settings.certificate_options
+        chosen.kind.require_usable(chosen.confidence, 5)
+        validation = Validation(**{**vars(experiment.validation), "system": systems.Simulated(step)})
+        settings.campaign(replace(experiment, validation=validation), Store()).run(5)
+
+    with pytest.raises((ValueError, CtxvalError)):
+        run()
+    assert not counted
+
+
+def test_a_file_names_the_states_that_are_compared() -> None:
+    entry = {"type": "FinalState", "components": ["x"], "angles": ["x"]}
+    experiment = Settings.model_validate({**WHOLE, "distance": entry}).load()
+    assert experiment.validation.distance == distances.FinalState(components=(0,), angles=(0,))
+
+
+def test_a_wrong_file_that_was_told_is_replaced(invoke: Any) -> None:
+    target = changed(
+        (
+            'type = "Simulated"\nstep = { ref = "experiment_system:step" }',
+            'type = "Manual"\nstates = { position = "m", speed = "m/s" }\ninputs = { force = "N" }\ndt = 0.05',
+        ),
+        ("dt = 0.05               # time step in seconds\n", "\n"),
+    )
+    assert invoke("ask", target, "--store", "a.sqlite").exit_code == 0
+    refused = invoke("tell", "a.sqlite", "0", "--distance", "0.2", "--replace", "typing error")
+    assert refused.exit_code == 2
+    assert "has no result that was told by a person" in refused.stderr.replace("\n", " ")
+    assert invoke("tell", "a.sqlite", "0", "--distance", "0.1").exit_code == 0
+    assert invoke("tell", "a.sqlite", "0", "--distance", "0.2").exit_code == 2
+    assert invoke("tell", "a.sqlite", "0", "--distance", "0.2", "--replace", "typing error").exit_code == 0
+    store = Store("a.sqlite")
+    assert store.trials()[0].distance == 0.2
+    assert [change.why for change in store.history()] == ["typing error"]

@@ -240,7 +240,7 @@ def described(folder: Path, value: str, module: str = "step_here") -> Path:
     """Write an experiment file with a module and its data beside it."""
     folder.mkdir(exist_ok=True)
     (folder / f"{module}.py").write_text(f"def step(x, u):\n    return {value}\n")
-    Trajectory([0, 1, 2, 3], [[0], [1], [3], [2]], [[1], [0], [1]]).to_csv(folder / "run.csv")
+    Trajectory([0, 0.1, 0.2, 0.3], [[0], [1], [3], [2]], [[1], [0], [1]]).to_csv(folder / "run.csv")
     (folder / "experiment.toml").write_text(
         'name = "x"\nspace = { goal = [0.0, 1.0] }\n'
         'task = { initial_state = [0.0], goal = ["goal"], horizon = 3, dt = 0.1 }\n'

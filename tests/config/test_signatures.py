@@ -328,6 +328,43 @@ def test_a_store_of_an_older_version_asks_where_it_names_code(folder: Path) -> N
     done("ask", "a.sqlite")
 
 
+MODEL_OUTSIDE: dict[str, dict[str, Any]] = {
+    "data": {"type": "Linear", "data": "../secret.csv"},
+    "a list": {"type": "Linear", "data": ["runs.csv", "/etc/passwd"]},
+    "logs": {"type": "Linear", "data": {"logs": "../secret.csv", "states": {}, "inputs": {}}},
+    "a network": {"type": "Onnx", "source": "/home/you/network.onnx"},
+    "a link": {"type": "Onnx", "source": "link/network.onnx"},
+    "a mesh": {"type": "MuJoCo", "mjcf": "<mujoco><asset><mesh file='/home/you/a.stl'/></asset></mujoco>"},
+    "another folder": {"type": "Saved", "source": "model.npz"},
+}
+
+
+@pytest.mark.parametrize("name", MODEL_OUTSIDE)
+def test_a_foreign_store_without_code_names_no_file_outside_its_folder(name: str, folder: Path) -> None:
+    (folder / "link").symlink_to("/")
+    elsewhere = {"folder": "/home/you"} if name == "another folder" else {}
+    store_with({**PLAIN, "model": MODEL_OUTSIDE[name], **elsewhere})
+    for command in (
+        ("ask", "a.sqlite"),
+        ("report", "a.sqlite", "--out", "r.html"),
+        ("certify", "a.sqlite", "--audit", "3"),
+    ):
+        invoked = invoke(*command)
+        assert "names files outside its folder" in f"{invoked.output} {invoked.stderr}" or invoked.exit_code == 0
+        assert invoked.exit_code == 2 or command[0] == "report"
+    with pytest.raises(InputError, match=r"names files outside its folder: .* --experiment FILE.toml"):
+        trusted_settings(Store("a.sqlite"))
+    assert trusted_settings(Store("a.sqlite"), trust=True).model == MODEL_OUTSIDE[name]
+
+
+def test_a_store_names_files_in_its_folder_and_its_user_any_file(folder: Path) -> None:
+    store_with({**PLAIN, "model": {"type": "Linear", "data": "runs/a.csv"}})
+    assert trusted_settings(Store("a.sqlite")).model is not None
+    outside = {**PLAIN, "model": MODEL_OUTSIDE["data"]}
+    store_with(signed(outside, {}), "own.sqlite")
+    assert trusted_settings(Store("own.sqlite")).model == MODEL_OUTSIDE["data"]
+
+
 def test_an_experiment_that_was_moved_is_named_where_it_is_now(folder: Path) -> None:
     (folder / "old").mkdir()
     os.chdir(folder / "old")
@@ -534,6 +571,16 @@ def test_a_disk_without_hard_links_has_a_key_too(monkeypatch: pytest.MonkeyPatch
     assert [path.name for path in key_path().parent.iterdir()] == ["key"]
 
 
+@pytest.mark.skipif(os.name != "posix", reason="files have modes on POSIX")
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660])
+def test_a_key_that_others_can_read_is_refused(mode: int, folder: Path) -> None:
+    rig_store(folder)
+    key_path().chmod(mode)
+    assert "can be read or written by other users" in refusal("ask", "a.sqlite")
+    key_path().chmod(0o600)
+    assert verifies(Store("a.sqlite").settings())
+
+
 @pytest.mark.parametrize("content", [b"", b"short", b"x" * 33])
 def test_a_damaged_key_is_named(content: bytes, folder: Path) -> None:
     rig_store(folder)
@@ -626,7 +673,9 @@ def test_a_file_that_the_user_names_runs_what_it_says(folder: Path) -> None:
     settings = read_settings_of(content)
     os.chdir(folder.parent)
     system = settings.load().validation.system
-    assert system.describe()["command"] == [sys.executable, "rig.py"]  # wherever it is
+    described = system.describe()
+    assert described["program"] == Path(sys.executable).name  # wherever it is
+    assert list(described["files"]) == ["rig.py"]
     plan = settings.load().validation.plan(np.array([1.0]))
     assert system.execute(plan.controller, plan.task).states.shape == (5, 2)
 

@@ -6,7 +6,8 @@ from scipy.optimize import minimize
 
 from ctxval import Task
 from ctxval.controllers import ILQR, LQR
-from ctxval.core.model import Function, Model
+from ctxval.controllers.ilqr import ILQRSolution
+from ctxval.core.model import Function, Model, linearize
 from ctxval.core.rollout import rollout
 from ctxval.errors import DesignError, InputError, ModelError, ShapeError
 from ctxval.models import Linear
@@ -65,6 +66,88 @@ def textbook_riccati(model: Linear, task: Task, Q: np.ndarray, R: np.ndarray, Q_
     for gain in reversed(gains):
         states.append((A - B @ gain) @ states[-1])
     return np.array(states)[:, :n]
+
+
+def rounded_step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return the step of the pendulum in single precision, whose rounding stops iLQR before it converges."""
+    return rk4(derivative, DT)(x.astype(np.float32), u.astype(np.float32)).astype(np.float32)
+
+
+def riccati_gains(solution: ILQRSolution, model: Model, settings: ILQR, task: Task) -> np.ndarray:
+    """Return the gains of the Riccati recursion along a solution of one task, from differences of the model."""
+    controller, cost, h = solution.controller, settings.cost, 2e-3
+    P, gains = cost.Q_final, []
+    for x, u in zip(controller.states[::-1], controller.inputs[::-1], strict=True):
+        z, n = np.concatenate([x, u]), len(x)
+        moves = h * np.eye(len(z))
+        F = np.stack(
+            [(model.step(*np.split(z + e, [n])) - model.step(*np.split(z - e, [n]))) / (2 * h) for e in moves], axis=-1
+        )
+        A, B = F[:, :n].astype(float), F[:, n:].astype(float)
+        gains.append(-np.linalg.solve(cost.R + B.T @ P @ B, B.T @ P @ A))
+        P = cost.Q + A.T @ P @ (A + B @ gains[-1])
+    return np.array(gains[::-1])
+
+
+@pytest.mark.parametrize("goal", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize(
+    ("model", "settings"),
+    [
+        (Function(rounded_step, vectorized=True), REGULATOR),
+        (PENDULUM, ILQR([1.0, 0.1], [0.01], [10.0, 1.0], iterations=1)),
+        (PENDULUM, ILQR([1.0, 0.1], [0.01], [10.0, 1.0], iterations=2)),
+    ],
+)
+def test_the_gains_of_a_design_that_did_not_converge_are_those_of_an_undamped_step(
+    model: Model, settings: ILQR, goal: float
+) -> None:
+    task = swing(goal=goal)
+    solution = settings.solve(task, model)
+    assert not solution.converged
+    expected = riccati_gains(solution, model, settings, task)
+    np.testing.assert_allclose(solution.controller.gains, expected, rtol=0, atol=0.01 * np.abs(expected).max())
+
+
+def test_the_gains_hardly_depend_on_where_rounding_stops_the_iteration() -> None:
+    model, goals = Function(rounded_step, vectorized=True), 1 + 1e-9 * np.arange(20)
+    zeros = np.zeros(20)
+    start, goal = np.stack([zeros + np.pi, zeros], axis=-1), np.stack([goals, zeros], axis=-1)
+    limited = ILQR([1.0, 0.1], [0.01], [10.0, 1.0], limits=12.0, tolerance=1e-12)
+    solution = limited.solve(Task(start, goal=goal, horizon=15, dt=DT), model)
+    assert not solution.converged.all()
+    gains = solution.controller.gains
+    np.testing.assert_allclose(gains, np.broadcast_to(gains[0], gains.shape), rtol=0, atol=0.02 * np.abs(gains).max())
+    for k in (0, 7):
+        alone = limited.solve(swing(goal=goals[k]), model)
+        assert alone.converged == solution.converged[k]
+        np.testing.assert_allclose(alone.controller.gains, gains[k], rtol=0, atol=1e-3 * np.abs(gains).max())
+
+
+class Fails:
+    """The pendulum, whose Jacobian is not finite beyond an angle."""
+
+    def __init__(self, angle: float) -> None:
+        self._angle = angle
+
+    def step(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return PENDULUM.step(x, u)
+
+    def jacobian(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        A, B = linearize(PENDULUM, x, u)
+        return np.where((x[..., :1, None] < self._angle), np.nan, A), B
+
+
+def test_if_no_undamped_step_is_possible_the_gains_of_the_last_accepted_step_remain() -> None:
+    settings = ILQR([1.0, 0.1], [0.01], [10.0, 1.0], iterations=1)
+    usual = settings.solve(swing(), PENDULUM)
+    angle = float(usual.controller.states[:, 0].min())
+    free = np.pi - 1e-3  # without input the pendulum stays near its start
+    both = Task([[np.pi, np.pi], 0.0], goal=[[1.0, 3.0], 0.0], horizon=15, dt=DT)
+    solution = settings.solve(both, Fails((angle + free) / 2))
+    assert np.abs(solution.controller.gains[0]).max() > 0
+    assert np.abs(solution.controller.gains[0] - usual.controller.gains).max() > 1e-3
+    alone = settings.solve(both[1], PENDULUM)
+    np.testing.assert_allclose(solution.controller.gains[1], alone.controller.gains, rtol=1e-9)
 
 
 # On a linear model
@@ -313,7 +396,7 @@ def test_bad_weights_are_refused_by_value(weights: tuple[object, ...], sentence:
 
 @pytest.mark.parametrize("limits", [{"iterations": 0}, {"tolerance": 0.0}, {"tolerance": np.nan}])
 def test_a_limit_that_is_not_positive_is_refused_by_value(limits: dict[str, float]) -> None:
-    with pytest.raises(InputError, match=rf"must be positive, got .*{next(iter(limits.values()))}"):
+    with pytest.raises(InputError, match=rf"must be a positive .*, got {next(iter(limits.values()))}"):
         ILQR([1, 1], [1], **limits)
 
 

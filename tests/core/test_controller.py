@@ -148,16 +148,15 @@ def test_every_spelling_of_the_same_limits_is_the_same(pairs: list[tuple[float, 
         assert Limits.of(given_, len(rows)).describe() == limits.describe()
 
 
-def test_stores_of_version_0_1_0_know_their_limits() -> None:
+def test_limits_are_described_by_what_they_allow() -> None:
     stored = {"type": "Limits", "low": [-2.0, 0.0], "high": [2.0, 8.0]}
     rows = [[-2, 2], [0, 8]]
     for same in (rows, {"low": [-2, 0], "high": [2, 8]}):
         for kind in (controllers.LQR, controllers.StationaryLQR, controllers.ILQR):
             assert describe(kind([1], [1, 1], limits=same))["limits"] == stored
-        policy = describe(Policy(np.sum, limits=same))["limits"]
-        assert policy == [[-2.0, 0.0], [2.0, 8.0]]
+        assert describe(Policy(np.sum, limits=same))["limits"] == [[-2.0, 0.0], [2.0, 8.0]]
     assert describe(Policy(np.sum, limits=2.0))["limits"] == 2.0
-    # 0.1.0 described the list [1, 8], +-1 and +-8, and the tuple (1, 8) alike: neither may pass for 1 to 8 now.
+    # The tuple (1, 8) is +-1 and +-8.
     assert describe(Policy(np.sum, limits={"low": 1, "high": 8}))["limits"] != [1, 8]
 
 

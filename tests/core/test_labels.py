@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from conftest import make_validation
-from ctxval import Experiment, Labels, distances
+from ctxval import Experiment, Labels, distances, systems
 from ctxval.core.labels import labels_of
 from ctxval.errors import InputError
 
@@ -40,5 +40,37 @@ def test_other_parts_keep_the_labels() -> None:
     validation = make_validation().with_labels(labels)
     assert validation.with_space(validation.space).labels is labels
     assert validation.with_distance(validation.distance).labels is labels
-    with pytest.raises(InputError, match="labels must be Labels"):
+    with pytest.raises(InputError, match="labels must be a Labels"):
         validation.with_labels("m")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("states", "inputs"),
+    [
+        (("t",), ()),
+        (("time [s]",), ()),
+        (("angle", "angle"), ()),
+        (("angle [rad]", "angle [deg]"), ()),
+        (("angle",), ("angle",)),
+        (("",), ()),
+        ((" ",), ()),
+        (("[rad]",), ()),
+        ((" angle",), ()),
+        (("angle ",), ()),
+        (("an\ngle",), ()),
+        (("angle\x1b[31m",), ()),
+        (("angle",), ("t",)),
+    ],
+)
+def test_names_that_make_a_recording_unreadable_are_refused_where_they_are_declared(
+    states: tuple[str, ...], inputs: tuple[str, ...]
+) -> None:
+    message = "each state and input needs a name of its own"
+    with pytest.raises(InputError, match=message):
+        Labels(states, inputs)
+    named = [dict.fromkeys(names, "") for names in (states, inputs)]
+    if len(named[0]) == len(states):
+        with pytest.raises(InputError, match=message):
+            systems.Manual(states=named[0], inputs=named[1], dt=0.1)
+        with pytest.raises(InputError, match=message):
+            systems.Subprocess("true", timeout=1.0, states=named[0], inputs=named[1])

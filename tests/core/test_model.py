@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from ctxval.core.model import Function, Model, as_model, linearize
+from ctxval.core.model import Function, Model, as_model, central_differences, linearize
 from ctxval.errors import InputError, ModelError
 from ctxval.models import Linear
 
@@ -61,7 +63,7 @@ def test_a_model_stays_itself_and_a_function_becomes_a_model() -> None:
 
 
 def test_what_is_no_model_is_refused_by_value() -> None:
-    with pytest.raises(InputError, match=r"a step method or be a function \(x, u\) -> x_next, got 'model\.onnx'"):
+    with pytest.raises(InputError, match=r"step must be a function, got 'model\.onnx'"):
         as_model("model.onnx")
 
 
@@ -102,7 +104,7 @@ def test_differences_of_a_horizon_and_a_batch_take_one_call_and_many_points_take
 
     model = Function(counted, vectorized=True)
     linearize(model, *batch((40, 8)))
-    assert sizes == [40 * 8 * 2 * 3]
+    assert sizes == [3 * 4, 40 * 8 * 2 * 3]  # the first call finds out the precision of the model
     x, u = batch((2000,))
     A, B = linearize(model, x, u)
     assert max(sizes) <= 4096
@@ -110,6 +112,45 @@ def test_differences_of_a_horizon_and_a_batch_take_one_call_and_many_points_take
         expected = bend_jacobian(x[i], u[i])
         np.testing.assert_allclose(A[i], expected[0], atol=1e-8)
         np.testing.assert_allclose(B[i], expected[1], atol=1e-8)
+
+
+RNG = np.random.default_rng(0)
+INWARD, SHIFT, OUTWARD = RNG.normal(size=(3, 16)), RNG.normal(size=16), 0.3 * RNG.normal(size=(16, 2))
+
+
+def small_network(x: np.ndarray, u: np.ndarray, kind: type = np.float64) -> np.ndarray:
+    """Return a network that computes in this type, as a callable of torch or JAX does."""
+    hidden = np.tanh(np.concatenate([x, u], axis=-1).astype(kind) @ INWARD.astype(kind) + SHIFT.astype(kind))
+    return hidden @ OUTWARD.astype(kind)
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_a_model_in_single_precision_is_differentiated_with_steps_that_suit_it(count: int, scaled: bool) -> None:
+    def step(kind: type) -> Function:
+        def increments(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+            return x + 0.1 + 0.3 * small_network(x, u, kind)
+
+        def plain(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+            return small_network(x, u, kind)
+
+        return Function(increments if scaled else plain, vectorized=True)
+
+    x, u = RNG.normal(size=(count, 2)), RNG.normal(size=(count, 1))
+    for found, exact in zip(linearize(step(np.float32), x, u), linearize(step(np.float64), x, u), strict=True):
+        np.testing.assert_allclose(found, exact, rtol=0, atol=3e-4)  # steps of 6e-6 err by 1e-2
+    for alone, together in zip(linearize(step(np.float32), x[0], u[0]), linearize(step(np.float32), x, u), strict=True):
+        np.testing.assert_allclose(alone, together[0], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("at", [0.0, 1.0, 1e3])
+@pytest.mark.parametrize(
+    "step", [np.sin, np.cos, np.abs, lambda x: np.maximum(x, 0.5), lambda x: x**3, lambda x: 0 * x]
+)
+def test_a_model_in_double_precision_keeps_its_fine_steps(step: Callable[[np.ndarray], np.ndarray], at: float) -> None:
+    x = at + RNG.uniform(0.1, 0.2, size=(5, 1))
+    found, fine = (central_differences(lambda x, u: step(x), x, np.zeros((5, 0)), of) for of in (None, 2.0**-52))
+    np.testing.assert_array_equal(found[0], fine[0])
 
 
 def test_the_own_jacobian_of_a_model_is_taken() -> None:

@@ -75,6 +75,31 @@ def test_a_typed_number_comes_back_as_it_was_typed(low: int, width: int, share: 
         assert space.to_unit(space.from_unit(unit))[0] == unit[0]
 
 
+@given(spaces_and_unit_points())
+def test_a_rounded_task_is_found_again_exactly(given_: tuple[TaskSpace, np.ndarray]) -> None:
+    space, unit = given_
+    rounded = space.rounded(unit)
+    task = space.from_unit(rounded)
+    np.testing.assert_array_equal(space.rounded(rounded), rounded)
+    np.testing.assert_array_equal(space.from_unit(space.to_unit(task)), task)
+    assert ((space.low <= task) & (task <= space.high)).all()
+    np.testing.assert_allclose(rounded, unit, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(rounded[(unit == 0) | (unit == 1)], unit[(unit == 0) | (unit == 1)])
+
+
+@given(st.sampled_from([(-np.pi, np.pi), (-2.0, 2.0), (0.3, 1.8), (0.0, 1e-4), (-1e6, 1e5)]), st.floats(0.001, 0.999))
+def test_nine_digits_are_the_whole_rounded_task(bounds: tuple[float, float], unit: float) -> None:
+    space = TaskSpace(goal=bounds)
+    task = float(space.from_unit(space.rounded([unit]))[0])
+    assert float(f"{task:.9g}") == task
+    assert space.point({"goal": float(f"{task:.9g}")})[0] == task
+
+
+def test_a_narrow_range_far_from_zero_keeps_nine_digits_of_the_range() -> None:
+    space = TaskSpace(goal=(100.0, 100.5))
+    assert space.from_unit(space.rounded([1 / 3]))[0] == 100.166666667
+
+
 def test_a_number_with_a_longer_neighbour_comes_back_short() -> None:
     space = TaskSpace(p=(0.0, 3.0), q=(-0.7, 0.4))
     assert space.describe_point(space.from_unit(space.to_unit([0.2, -0.0]))) == {"p": 0.2, "q": 0.0}
@@ -253,7 +278,7 @@ def test_a_grid_has_both_ends_and_every_combination() -> None:
 
 @pytest.mark.parametrize("per_axis", [1, 0, -2])
 def test_a_grid_of_fewer_than_two_points_an_axis_is_refused(space: TaskSpace, per_axis: int) -> None:
-    with pytest.raises(InputError, match=rf"at least 2 points on each axis, got {per_axis}"):
+    with pytest.raises(InputError, match=rf"per_axis must be an integer of at least 2, got {per_axis}"):
         space.grid(per_axis)
 
 

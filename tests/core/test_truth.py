@@ -200,12 +200,12 @@ def test_another_validation_and_other_settings_have_other_truths(tmp_path: Path)
         "[]",
         '"text"',
         "{}",
-        '{"distance": "?", "parameters": {"wide": 0.3, "pair": [0.8, 1.0]}, "method": "known"}',
-        '{"distance": 2.0, "parameters": 3, "method": "known"}',
-        '{"distance": 2.0, "parameters": {"wide": 9.0, "pair": [0.8, 1.0]}, "method": "outside the box"}',
-        '{"distance": 2.0, "parameters": {"wide": 0.3, "pear": [0.8, 1.0]}, "method": "another space"}',
-        '{"distance": 2.1, "parameters": {"wide": 0.3, "pair": [0.8, 1.0]}, "method": "not what S does"}',
-        '{"distance": NaN, "parameters": {"wide": 0.3, "pair": [0.8, 1.0]}, "method": "not a number"}',
+        '[{"distance": "?", "parameters": {"wide": 0.3, "pair": [0.8, 1.0]}, "method": "known", "probes": []}]',
+        '[{"distance": 2.0, "parameters": 3, "method": "known", "probes": []}]',
+        '[{"distance": 2.0, "parameters": {"wide": 9.0, "pair": [0.8, 1.0]}, "method": "outside", "probes": []}]',
+        '[{"distance": 2.0, "parameters": {"wide": 0.3, "pear": [0.8, 1.0]}, "method": "another space", "probes": []}]',
+        '[{"distance": 2.1, "parameters": {"wide": 0.3, "pair": [0.8, 1.0]}, "method": "another S", "probes": []}]',
+        '[{"distance": NaN, "parameters": {"wide": 0.3, "pair": [0.8, 1.0]}, "method": "not a number", "probes": []}]',
     ],
 )
 def test_a_file_that_cannot_be_believed_is_written_again(tmp_path: Path, content: str) -> None:
@@ -214,7 +214,16 @@ def test_a_file_that_cannot_be_believed_is_written_again(tmp_path: Path, content
     only_file(tmp_path).write_text(content)
     assert cached_truth(of_surface(hill), compute, tmp_path).method == "known"
     assert compute.calls == 2
-    assert json.loads(only_file(tmp_path).read_text())["distance"] == 2.0
+    assert json.loads(only_file(tmp_path).read_text())[-1]["distance"] == 2.0
+
+
+def test_systems_that_differ_in_numbers_have_truths_of_their_own(tmp_path: Path) -> None:
+    def lower(gain: float) -> Validation:
+        return of_surface(lambda points: gain * hill(points))
+
+    heights = [cached_truth(lower(gain), Counted(2.0 * gain), tmp_path).distance for gain in (1.0, 0.5, 1.0, 0.5)]
+    assert heights == [2.0, 1.0, 2.0, 1.0]
+    assert len(json.loads(only_file(tmp_path).read_text())) == 2
 
 
 def test_a_folder_that_cannot_be_written_does_not_cost_the_answer(tmp_path: Path) -> None:

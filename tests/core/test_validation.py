@@ -461,11 +461,15 @@ def test_a_distance_without_one_value_a_task_is_refused_with_both_shapes(distanc
     ("part", "value", "sentence"),
     [
         ("space", (0, 1), r"space must be a TaskSpace, got \(0, 1\)"),
-        ("task", None, r"task must be a function p -> Task, got None"),
+        ("task", None, r"task must be a function, got None"),
         ("system", STEP, r"system must be a System with execute\(controller, task\), got "),
-        ("model", 3.0, r"a model must have a step method or be a function \(x, u\) -> x_next, got 3\.0"),
+        ("model", 3.0, r"model must be a Model with step\(x, u\) or a function, got 3\.0"),
         ("synthesizer", MODEL, r"synthesizer must be a Synthesizer with design\(task, model\), got "),
-        ("distance", 1, r"distance must be a function \(model_trajectory, system_trajectory, task\) -> d, got 1"),
+        (
+            "distance",
+            1,
+            r"distance must be a Distance with __call__\(model_trajectory, system_trajectory, task\)",
+        ),
     ],
 )
 def test_a_part_that_cannot_serve_is_refused_by_its_name(part: str, value: object, sentence: str) -> None:
@@ -478,7 +482,7 @@ def test_the_description_is_json_that_tells_validations_apart() -> None:
     assert described == json.dumps(make().describe())
     for change in (
         {"space": TaskSpace(goal=(-2, 2), start=(-1, 1.5))},
-        {"model": Linear(MODEL.A * 1.01, MODEL.B)},
+        {"model": lambda x, u: x},
         {"synthesizer": LQR([1.0, 0.2], [0.01], [10.0, 1.0])},
         {"distance": FinalState(norm=2)},
     ):

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ctxval._util.units import conversion
 from ctxval.data import Field, LogMapping, MemoryTable
-from ctxval.data.units import conversion
 from ctxval.errors import InputError, UnknownNameError
 
 TOML = """
@@ -58,7 +58,7 @@ def test_a_mapping_in_toml_is_that_in_python(tmp_path: Path) -> None:
         ({"longest_gap": -1}, "longest_gap of a mapping must be a positive number"),
         ({"delay": float("inf")}, "delay of a mapping must be a finite number"),
         ({"stamp": "lag"}, "no stamp is called 'lag'; did you mean 'log'"),
-        ({"time_unit": "h"}, "no known factor from h to s"),
+        ({"time_unit": "week"}, "no known factor from week to s"),
         ({"inputs": {"x": "u"}}, "x is a state and an input: give them different names"),
         ({"inputs": 3}, "inputs must be a table of fields or a list of paths, got 3"),
         ({"inputs": {"u": 3}}, "the field u must be a path or a table, got 3"),

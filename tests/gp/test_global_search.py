@@ -172,7 +172,3 @@ def test_the_same_randomness_finds_the_same_points() -> None:
     np.testing.assert_array_equal(first.elites, again.elites)
     other = search(lambda X: np.sin(9 * X).prod(axis=1), 5, seed=4)
     assert not np.array_equal(first.points, other.points)
-
-
-def test_what_is_shown_is_short() -> None:
-    assert repr(search(lambda X: X[:, 0], 1, evaluations=200)).startswith("GlobalMaximum(largest=1")

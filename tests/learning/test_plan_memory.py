@@ -57,7 +57,6 @@ def test_the_oldest_plans_make_room_for_new_ones(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(plan_memory, "_LARGEST", 0)
     plans.plan(POINTS[1:])
     assert not plans.has(POINTS[0])
-    assert repr(plans).startswith("PlanMemory(")
     assert synthesizer.designed >= len(POINTS)
 
 

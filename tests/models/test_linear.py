@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -110,13 +108,6 @@ def test_matrices_that_do_not_fit_are_refused_with_all_shapes(
 def test_a_matrix_that_is_not_finite_is_refused_by_name() -> None:
     with pytest.raises(InputError, match="A must be finite"):
         Linear([[np.nan]], [[1.0]])
-
-
-def test_the_description_is_json_with_all_that_a_step_depends_on() -> None:
-    model = draw_model(2, 1, 0)
-    again = Linear(**json.loads(json.dumps(model.describe())))
-    x, u = np.ones((3, 2)), np.ones((3, 1))
-    np.testing.assert_array_equal(again.step(x, u), model.step(x, u))
 
 
 def test_inputs_that_hardly_move_by_themselves_are_refused_by_name() -> None:

@@ -14,7 +14,6 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 
 from ctxval import Task, Transitions, controllers, testing
-from ctxval._util.describe import describe, first_difference
 from ctxval.core.model import linearize
 from ctxval.core.rollout import rollout
 from ctxval.errors import InputError, ShapeError
@@ -56,7 +55,6 @@ def test_linear_regression_finds_the_linear_model(increments: bool) -> None:
 def test_every_regressor_keeps_the_contract_of_a_model(regressor: Any) -> None:
     model = ScikitLearn.fit(regressor, recorded())
     testing.check_model(model, states=2, inputs=1)
-    assert first_difference(describe(model), describe(ScikitLearn(regressor))) is None
 
 
 def test_a_single_state_needs_no_second_axis() -> None:
@@ -72,11 +70,6 @@ def test_controllers_are_designed_on_it() -> None:
         found = rollout(model.step, synthesizer.design(task, model), task).states
         expected = rollout(TRUTH.step, synthesizer.design(task, TRUTH), task).states
         np.testing.assert_allclose(found, expected, atol=1e-4)
-
-
-def test_the_description_tells_fits_apart() -> None:
-    first, second = Ridge().fit(np.eye(3), np.eye(3)[:, :2]), Ridge().fit(np.eye(3), np.eye(3)[:, 1:])
-    assert first_difference(describe(ScikitLearn(first)), describe(ScikitLearn(second))) is not None
 
 
 def test_what_cannot_be_used_is_refused() -> None:
@@ -120,10 +113,10 @@ def test_the_exact_jacobian_agrees_with_differences_of_predictions(increments: b
     np.testing.assert_allclose(model.step(x, u), plain.step(x, u), rtol=0, atol=1e-12)
 
 
-def test_differences_over_a_horizon_and_a_batch_take_one_prediction() -> None:
+def test_differences_over_a_horizon_and_a_batch_take_one_prediction_and_one_of_the_precision() -> None:
     counted = Counted(Ridge().fit(np.eye(3), np.eye(3)[:, :2]))
     linearize(ScikitLearn(counted), np.zeros((40, 8, 2)), np.zeros((40, 8, 1)))
-    assert counted.calls == 1
+    assert counted.calls == 2
 
 
 def test_many_rows_are_differentiated_in_blocks_with_the_same_result() -> None:

@@ -252,11 +252,11 @@ def raises(data: Transitions) -> models.Model:
         (raises, InputError, "the fit failed: RuntimeError: no convergence"),
         (lambda data: lambda x, u: x * np.nan, ModelError, "NaN or infinity"),
         (lambda data: lambda x, u: x[:1], ModelError, "must return states of shape"),
-        (lambda data: 3, InputError, "must have a step method"),
+        (lambda data: 3, InputError, "step must be a function, got 3"),
         ("residul", InputError, "did you mean 'residual'"),
         ("parameters", InputError, "needs bounds"),
         ("fit", InputError, "needs a function"),
-        (3, InputError, "fit must be a function"),
+        (3, InputError, "method must be a text or a Method or a function, got 3"),
         (ParameterFit({"mass": (0.5, 2.0)}), InputError, "needs the function step"),
     ],
 )

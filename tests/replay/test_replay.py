@@ -148,6 +148,35 @@ def test_a_delay_of_the_inputs_is_suggested(steps: int) -> None:
     assert max(one.relative for one in corrected.errors) < 1e-12
 
 
+@pytest.mark.parametrize("steps", [0.4, 1.5, 2.3])
+def test_a_delay_of_a_part_of_a_step_is_found(steps: float) -> None:
+    rng, dt, logs = np.random.default_rng(0), 0.02, []
+    for number in range(4):
+        u, speed = rng.normal(size=301), np.zeros(301)
+        for k in range(300):
+            j = k - int(steps)
+            part = steps - int(steps)
+            acting = part * u[max(j - 1, 0)] + (1 - part) * u[max(j, 0)]  # the mean over the step
+            speed[k + 1] = 0.99 * speed[k] + dt * acting
+        logs.append(MemoryTable(f"run {number}", {"t": dt * np.arange(301), "speed": speed, "u": u}))
+    mapping = {"states": ["speed"], "inputs": ["u"]}
+    model = models.Linear([[0.99]], [[dt]])
+    (found,) = replay(model, recordings_of(logs, LogMapping.from_table(mapping))).suggestions
+    assert (found.kind, found.value) == ("delay", pytest.approx(steps * dt, abs=0.1 * dt))
+    assert f"({found.value / dt:.2g} steps) after" in found.sentence
+    corrected = replay(model, recordings_of(logs, LogMapping.from_table({**mapping, "delay": found.value})))
+    assert corrected.suggestions == ()
+    assert corrected.errors[0].relative < 1e-9
+
+
+def test_a_model_of_another_time_step_is_refused() -> None:
+    model = models.Linear.fit(RECORDED.transitions()[0])
+    assert model.data is not None
+    assert model.data.dt == DT
+    with pytest.raises(InputError, match=r"the model has steps of 0.05 s and the recording has steps of 0.1 s"):
+        replay(model, recorded(RUNS, dt=2 * DT))
+
+
 def test_a_model_that_was_learned_with_a_delay_is_found_by_the_recordings_themselves() -> None:
     runs = [delayed(one, 4) for one in RUNS]
     wrong = models.Linear.fit(Transitions.joined([one.transitions() for one in runs]))

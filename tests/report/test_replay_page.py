@@ -98,7 +98,7 @@ def test_a_page_is_written_where_it_is_asked_for_and_never_over_a_store(tmp_path
     assert path.read_text().startswith("<!DOCTYPE html>")
     store = tmp_path / "store.sqlite"
     store.write_bytes(b"SQLite format 3\x00 and more")
-    with pytest.raises(InputError, match="must not replace it"):
+    with pytest.raises(InputError, match="which is never replaced"):
         write_replay_page(report(), store)
     with pytest.raises(InputError, match="cannot be written"):
         write_replay_page(report(), path / "below" / "page.html")

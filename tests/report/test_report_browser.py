@@ -50,7 +50,7 @@ def by_hand(tmp_path: Path) -> ReportContext:
 
 REPORTS: dict[str, Callable[[Path], ReportContext]] = {
     "pendulum": lambda folder: case("pendulum", 15),
-    "dubins": lambda folder: case("dubins", 12),
+    "dubins": lambda folder: case("dubins", 4),
     "arm": lambda folder: arm(),
     "by hand": by_hand,
     "hostile": lambda folder: context_of_store(hostile_store(folder / "hostile.sqlite"), 1.0),

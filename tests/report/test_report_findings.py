@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from rig_pages import pendulum, plane
 
-from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, searches, systems
+from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, searches, systems
+from ctxval._util.arrays import Array
 from ctxval.certificates import CertificateOptions
 from ctxval.report import ReportContext, context_of_campaign
 from ctxval.report.diagnostics import diagnostics, not_tested, share_far_from_trials
@@ -26,7 +27,7 @@ def swing() -> ReportContext:
 
 @pytest.fixture(scope="module")
 def flat() -> ReportContext:
-    return context_of_campaign(plane(2, 24), threshold=0.05, certificate=CertificateOptions.posterior())
+    return context_of_campaign(plane(2, 24), threshold=0.02, certificate=CertificateOptions.posterior())
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +93,13 @@ def test_the_region_of_weak_tasks_is_described_by_its_parameters() -> None:
     assert model.sensitivity[1] < 0.1
 
 
+class _FromMiddle:
+    to_task = True
+
+    def __call__(self, model: Trajectory, system: Trajectory, task: Task) -> Array:
+        return np.abs(task.initial_state[..., 0] - 1.0)
+
+
 def distance_of_goal(space: TaskSpace) -> Validation:
     return Validation(
         space=space,
@@ -99,7 +107,7 @@ def distance_of_goal(space: TaskSpace) -> Validation:
         system=systems.Simulated(models.Linear([[1.0]], [[0.0]])),
         model=models.Linear([[1.0]], [[0.0]], [0.0]),
         synthesizer=controllers.Policy(lambda t, x, task: np.zeros_like(x)),
-        distance=lambda m, s, task: np.abs(task.initial_state[..., 0] - 1.0),
+        distance=_FromMiddle(),
     )
 
 
@@ -202,7 +210,9 @@ def test_designs_that_stop_early_are_counted(weak_motor: ReportContext) -> None:
     found = converged(weak_motor)
     assert found is not None
     assert found.light == "attention"
-    assert found.numbers["designs"] == 4
+    assert found.text == (
+        "The design of the controller did not converge at 4 of 4 executed tasks, among them the worst one."
+    )
 
 
 def test_motion_bias_and_states_have_numbers(swing: ReportContext) -> None:
@@ -230,3 +240,17 @@ def test_a_question_that_fails_does_not_hide_the_others(swing: ReportContext) ->
     assert found[0].light == "unknown"
     assert "odd data" in found[0].text
     assert len(found) == 2
+
+
+def test_neither_smooth_nor_alike_is_good_if_designs_did_not_converge(weak_motor: ReportContext) -> None:
+    assert weak_motor.designs is not None
+    assert "did not converge at 4 of 4 executed tasks, among them the worst one" in weak_motor.designs
+    good = Finding("Controllers of neighbouring tasks", "good", "They are alike.")
+    doubted = good.unless(weak_motor.designs)
+    assert doubted.light == "attention"
+    assert doubted.text.startswith("They are alike. But the design of the controller did not converge at 4 of 4")
+    assert good.unless(None) is good
+    assert replace(good, light="bad").unless("it jumps").light == "bad"
+    for finding in [*diagnostics(weak_motor), *insights(weak_motor)]:
+        if finding.name in ("Distance is smooth over the tasks", "Controllers of neighbouring tasks"):
+            assert finding.light != "good"

@@ -8,7 +8,10 @@ import pytest
 
 from ctxval.errors import InputError, UnknownNameError
 from ctxval.reproduce import QUICK, STUDIES, reproduce, studies_named
-from ctxval.reproduce.study import Columns, executions_within, running_estimate, spread
+from ctxval.reproduce.jobs import Job, Results
+from ctxval.reproduce.pendulum import _worst_goal
+from ctxval.reproduce.study import Claim, Columns, Scale, agreement, executions_within, running_estimate, spread
+from ctxval.reproduce.table import table_text
 
 
 def test_the_estimate_of_sc_is_the_largest_and_that_of_sd_the_sixth() -> None:
@@ -24,8 +27,35 @@ def test_executions_within_counts_from_one_and_never_is_infinite() -> None:
 
 def test_a_median_that_touches_never_is_never() -> None:
     assert spread([1.0, 2.0, np.inf, np.inf]) == (np.inf, 1.0, np.inf)
-    assert spread([1.0, 2.0, 3.0, np.inf])[0] == 3.0
+    assert spread([1.0, 2.0, 3.0, np.inf])[0] == 2.5
     assert spread([1.0, 2.0])[0] == 1.5
+    assert spread([7.0, 40.0, 44.0, np.inf])[0] == 42.0
+
+
+def test_numbers_decide_whether_they_agree_with_a_claim() -> None:
+    goals = np.linspace(-np.pi, np.pi, 101)
+
+    def agrees(size: float, place: float) -> str:
+        return _worst_goal("", [(goals, size - np.abs(goals - place))] * 3).agrees
+
+    assert [agrees(0.3, 2.0), agrees(0.3, 1.3), agrees(0.9, 2.0), agrees(0.9, 1.3)] == ["yes", "partly", "partly", "no"]
+    assert _worst_goal("", [(goals, 0.9 - np.abs(goals - 2))]).remark.startswith("the size differs")
+    assert [agreement(True), agreement(False, True), agreement(False)] == ["yes", "partly", "no"]
+
+
+def test_a_reason_is_given_only_for_a_difference(tmp_path: Path) -> None:
+    class Said:
+        name, title, case = "said", "Said", "linear"
+
+        def jobs(self, scale: Scale) -> list[Job]:
+            return []
+
+        def claims(self, results: Results, scale: Scale) -> list[Claim]:
+            return [Claim("a", "1", "yes", "why"), Claim("b", "2", "partly", "because")]
+
+    text = table_text(tmp_path / "paper", [Said()], Results(tmp_path), QUICK)  # type: ignore[list-item]
+    assert "| a | 1 | yes |  |" in text
+    assert "| b | 2 | partly | because |" in text
 
 
 def test_there_are_the_papers_eight_figures() -> None:

@@ -115,7 +115,7 @@ def test_a_number_is_never_measured() -> None:
 
 @pytest.mark.parametrize("thinking", [0, -3, True, 2.5, "slow", None])
 def test_other_thinking_is_refused(thinking: Any) -> None:
-    with pytest.raises(InputError, match="thinking must be 'balanced', 'fast', 'thorough' or a number"):
+    with pytest.raises(InputError, match="'balanced', 'fast', 'thorough' or a positive integer"):
         Auto(thinking)
 
 

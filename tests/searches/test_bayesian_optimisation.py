@@ -198,7 +198,8 @@ def test_a_suggestion_after_a_thousand_values_takes_seconds_at_most() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"), [({"beta": -1.0}, "beta must not be negative"), ({"initial": 0}, "initial point, got 0")]
+    ("options", "sentence"),
+    [({"beta": -1.0}, "a finite number >= 0"), ({"initial": 0}, "a positive integer, got 0")],
 )
 def test_options_that_cannot_be_are_refused_by_value(options: dict[str, float], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):

@@ -222,12 +222,12 @@ def test_the_surrogate_has_the_chosen_kernel_and_noise() -> None:
 
 @pytest.mark.parametrize("beta", [-1.0, np.nan])
 def test_a_beta_that_is_negative_is_refused_by_value(beta: float) -> None:
-    with pytest.raises(InputError, match=rf"beta must not be negative or infinite, got {beta}"):
+    with pytest.raises(InputError, match=rf"beta must be a finite number >= 0, got {beta}"):
         GPUCB(beta)
 
 
 def test_a_search_without_initial_points_is_refused() -> None:
-    with pytest.raises(InputError, match="at least one initial point, got 0"):
+    with pytest.raises(InputError, match="initial must be a positive integer, got 0"):
         GPUCB(initial=0)
 
 

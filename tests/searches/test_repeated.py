@@ -115,5 +115,5 @@ def test_a_campaign_estimates_the_largest_mean_distance() -> None:
 
 @pytest.mark.parametrize("times", [0, -1])
 def test_never_is_not_often_enough(times: int) -> None:
-    with pytest.raises(InputError, match="at least once"):
+    with pytest.raises(InputError, match="times must be a positive integer"):
         Repeated(Random(), times)

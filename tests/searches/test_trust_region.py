@@ -192,7 +192,8 @@ def test_a_reset_forgets_the_prediction() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"), [({"optimism": -1.0}, "optimism"), ({"misses": 0}, "one miss, got 0")]
+    ("options", "sentence"),
+    [({"optimism": -1.0}, "optimism"), ({"misses": 0}, "a positive integer, got 0")],
 )
 def test_options_that_cannot_be_are_refused_by_value(options: dict[str, float], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):

@@ -23,6 +23,8 @@ def test_other_campaigns_of_the_same_validation_are_found_and_nothing_is_changed
     rerun = campaign(tmp_path / "rerun.sqlite", seed=1)
     other_search = tmp_path / "search.db"
     Campaign(make_validation(), store=other_search).run(1)
+    learned = make_validation().model
+    campaign(tmp_path / "again.sqlite", model=models.Linear(learned.A, 1.01 * learned.B, data=learned.data))
     campaign(tmp_path / "other.sqlite", model=models.Linear([[1.0, 0.02], [0.1, 1.0]], [[0.0], [0.1]]))
     campaign(tmp_path / "empty.sqlite", seed=2, budget=0)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}

@@ -21,7 +21,6 @@ from ctxval import Campaign, Store, searches
 from ctxval.cli import app
 from ctxval.errors import CtxvalError, ForeignStoreError, StoreAccessError
 from ctxval.storage import schema
-from ctxval.storage.migrations import MIGRATIONS
 from ctxval.storage.recovery import recover
 
 FOREVER = "WITH RECURSIVE t(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM t) SELECT {} FROM t"
@@ -58,8 +57,7 @@ def said(path: Path, *command: str) -> str:
 
 def columns(table: str) -> str:
     connection = sqlite3.connect(":memory:")
-    for _, script in MIGRATIONS:
-        connection.executescript(script)
+    connection.executescript(schema.TABLES)
     names = [row[1] for row in connection.execute(f"PRAGMA table_info({table})")]
     connection.close()
     return ", ".join(names)
@@ -104,10 +102,10 @@ CRAFTED: dict[str, tuple[tuple[str, ...], str, int]] = {
         "its table 'trials' is another one",
         5,
     ),
-    "a version below zero": (("PRAGMA user_version = -3",), "its schema version is -3", 5),
-    "the lowest version": (("PRAGMA user_version = -2147483648",), "its schema version is -2147483648", 5),
-    "version zero": (("PRAGMA user_version = 0",), "it has a table 'migrations'", 5),
-    "an older version": (("PRAGMA user_version = 2",), "'settings'", 5),
+    "a version below zero": (("PRAGMA user_version = -3",), "has schema version -3 of an older", 5),
+    "the lowest version": (("PRAGMA user_version = -2147483648",), "has schema version -2147483648 of an older", 5),
+    "version zero": (("PRAGMA user_version = 0",), "has schema version 0 of an older", 5),
+    "an older version": (("PRAGMA user_version = 2",), "has schema version 2 of an older", 5),
 }
 
 
@@ -127,8 +125,8 @@ def test_a_crafted_store_is_refused_and_export_saves_the_rest(store: Path, tmp_p
 
 
 ROWS: dict[str, tuple[str, str]] = {
-    "no checksum": ("UPDATE trials SET distance = 0.0, checksum = NULL WHERE number = 2", "its trial 2"),
-    "no checksum of a trajectory": ("UPDATE trajectories SET checksum = NULL WHERE trial = 2", ""),
+    "no checksum": ("UPDATE trials SET distance = 0.0, checksum = 0 WHERE number = 2", "its trial 2"),
+    "no checksum of a trajectory": ("UPDATE trajectories SET checksum = 0 WHERE trial = 2", ""),
     "a gap": ("UPDATE trials SET number = 9000000000000000000 WHERE number = 2", "its trial 2"),
     "below zero": ("UPDATE trials SET number = -1 WHERE number = 2", "its trial 0"),
     "no JSON in the experiment": ("UPDATE experiment SET value = '{' WHERE key = 'seed'", "the experiment in it"),
@@ -355,7 +353,7 @@ def test_a_tree_without_end_is_one_sentence(store: Path, monkeypatch: pytest.Mon
 
 # Anything at all
 
-NAMES = st.sampled_from(["trials", "trajectories", "experiment", "settings", "migrations", "x", "sqlite_stat1"])
+NAMES = st.sampled_from(["trials", "trajectories", "experiment", "settings", "history", "x", "sqlite_stat1"])
 COLUMN = st.sampled_from(["number", "key", "value", "trial", "side", "npz", "checksum", "rowid", "state", "distance"])
 KIND = st.sampled_from(["", "INTEGER", "TEXT", "REAL", "BLOB", "INTEGER PRIMARY KEY", "AS (1)", "DEFAULT (random())"])
 TABLE = st.builds(

@@ -209,18 +209,20 @@ def test_a_form_that_cannot_be_used_is_refused_in_place(
 @pytest.mark.parametrize(
     ("content", "fields", "sentence"),
     [
-        (b"", {}, "run.csv must have a header and at least two rows."),
-        (b"a,b\n1,2\n3,4\n", {}, "run.csv must have the columns t, position [m], speed [m/s], force [N]; it has a, b."),
+        # Nothing of the file is in the sentence, because whoever sends a file may not learn what is in another one.
+        (b"", {}, "run.csv: it is not a recording of this trial. The columns or fields t [s], position [m], speed"),
+        (b"a,b\n1,2\n3,4\n", {}, "position [m], speed [m/s], force [N] are needed, with a finite number for each time"),
+        (b"t,position,speed,force\n0,0,0,1\n0.1,0,x,1\n0.2,0,0,1\n", {}, "run.csv, line 3: it is not a recording"),
         (SHORT, {}, "must have 21 times"),
-        (b"\x00\xff\xfe", {}, "run.csv cannot be read as CSV"),
-        (b"t,position [ft],speed,force\n0,0,0,1\n0.1,0,0,1\n", {}, "ft"),
+        (b"\x00\xff\xfe", {}, "run.csv: it is not a recording of this trial"),
+        (b"t,position [ft],speed,force\n0,0,0,1\n0.1,0,0,1\n", {}, "position [m]"),
         (
             b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n",
             {"tolerance": "wide"},
             "the start tolerance must be a number",
         ),
         (b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n", {"tolerance": "-1"}, "the start tolerance must be a finite"),
-        (b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n", {"resample": "on"}, "ends after 0.1 s, and 2 s are needed"),
+        (b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n", {"resample": "on"}, "for each time from 0 to 2 s"),
     ],
 )
 def test_a_wrong_file_is_refused_as_tell_refuses_it(
@@ -229,6 +231,19 @@ def test_a_wrong_file_is_refused_as_tell_refuses_it(
     answer = upload(server, 0, page, content, **fields)
     assert (answer.status, sentence in problem(answer)) == (422, True), problem(answer)
     assert "/tmp" not in problem(answer)
+    assert trials(folder)[0].state == "open"
+
+
+def test_an_upload_that_leads_to_a_file_of_the_user_is_refused(
+    server: Server, page: Response, folder: Path, tmp_path: Path
+) -> None:
+    h5py = pytest.importorskip("h5py")
+    (tmp_path / "key").write_bytes(b"secret of a user" * 16)
+    with h5py.File(tmp_path / "run.mat", "w", userblock_size=512) as file:
+        for name in ("t", "position", "speed", "force"):
+            file.create_dataset(name, (21,), "u1", external=[(str(tmp_path / "key"), 0, 21)])
+    answer = upload(server, 0, page, (tmp_path / "run.mat").read_bytes(), "run.mat")
+    assert (answer.status, "run.mat: it is not a recording of this trial" in problem(answer)) == (422, True)
     assert trials(folder)[0].state == "open"
 
 

@@ -54,9 +54,9 @@ def test_results_of_every_kind() -> None:
     path = Path("run.csv")
     assert result("failure", {"reason": " cut out "}, None) == ToldResult(failed="cut out")
     assert result("distance", {"distance": "0.5"}, None) == ToldResult(distance=0.5)
-    assert result("recording", {"tolerance": ""}, path) == ToldResult(path)
+    assert result("recording", {"tolerance": ""}, path) == ToldResult(path, uploaded=True)
     assert result("recording", {"resample": "on", "tolerance": "0.2"}, path) == ToldResult(
-        path, resample=True, start_tolerance=0.2
+        path, resample=True, start_tolerance=0.2, uploaded=True
     )
 
 

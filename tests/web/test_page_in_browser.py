@@ -128,7 +128,10 @@ def test_a_wrong_file_is_refused_in_place_and_the_right_one_taken(browser: Any, 
     files = one.files(number)
     one.upload(number, record(files, folder / "short.csv", steps=7))
     problem = one.trial(number).get_by_role("alert")
-    assert problem.inner_text() == "Not stored: the trajectory must have 21 times, 20 steps of 0.1 s, got 7."
+    assert problem.inner_text() == (
+        "Not stored: the trajectory must have 21 times, 20 steps of 0.1 s, got 7 with steps of 0.1 s; --resample "
+        "interpolates a recording to these times."
+    )
     one.page.locator("[data-focus]:focus").wait_for()
     assert one.page.title().startswith("Error: ")
     described = one.trial(number).locator("input[type=file]").get_attribute("aria-describedby")

@@ -10,6 +10,7 @@ pytest.importorskip("starlette", reason="starlette is not installed")
 
 from starlette.datastructures import Headers
 
+from ctxval.web.access import Access
 from ctxval.web.security import POLICY, Guard, Hosts, is_address, is_loopback, refusal
 
 LOCAL = Hosts.of("127.0.0.1")
@@ -81,4 +82,4 @@ def test_the_policy_permits_no_inline_code() -> None:
     assert "unsafe" not in POLICY
     assert "default-src 'none'" in POLICY
     assert "frame-ancestors 'none'" in POLICY
-    assert "LOCAL" not in repr(Guard(lambda *_: None, LOCAL))  # type: ignore[arg-type, return-value]
+    assert "LOCAL" not in repr(Guard(lambda *_: None, LOCAL, Access(None, 1)))  # type: ignore[arg-type, return-value]

@@ -32,11 +32,7 @@ _SHOWN.maxstring = _SHOWN.maxother = 200
 
 
 def as_floats(name: str, value: ArrayLike) -> Array:
-    """Return ``value`` as a float64 array.
-
-    Raises:
-        InputError: if the value is not numeric, or has masked entries.
-    """
+    """Return ``value`` as a float64 array."""
     if _is_masked(value):
         raise InputError(
             f"{name} must be numbers without masked entries; fill in the masked entries, or replace them with NaN."
@@ -45,7 +41,7 @@ def as_floats(name: str, value: ArrayLike) -> Array:
         if np.iscomplexobj(value):
             raise TypeError
         return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} must be numbers, got {_SHOWN.repr(value)}.") from error
 
 
@@ -57,11 +53,7 @@ def _is_masked(value: object) -> bool:
 
 
 def as_finite(name: str, value: ArrayLike) -> Array:
-    """Return ``value`` as a float64 array without NaN and infinity.
-
-    Raises:
-        InputError: if the value is not numeric, or not finite.
-    """
+    """Return ``value`` as a float64 array without NaN and infinity."""
     array = as_floats(name, value)
     finite = np.isfinite(array)
     if not finite.all():
@@ -72,38 +64,8 @@ def as_finite(name: str, value: ArrayLike) -> Array:
     return array
 
 
-def positive_count(sentence: str, count: object) -> int:
-    """Return a positive integer.
-
-    Args:
-        sentence: the beginning of the message, which says what must be positive.
-        count: the value.
-
-    Raises:
-        InputError: if the value is no integer, or is below 1.
-    """
-    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
-        raise InputError(f"{sentence}, got {count!r}.")
-    return int(count)
-
-
-def count_from_zero(name: str, count: object) -> int:
-    """Return an integer that is at least 0, such as a seed.
-
-    Raises:
-        InputError: if the value is no integer, or is below 0.
-    """
-    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 0:
-        raise InputError(f"{name} must be an integer >= 0, got {count!r}.")
-    return int(count)
-
-
 def require_shape(name: str, array: Array, expected: tuple[int, ...]) -> Array:
-    """Return ``array`` if its last axes are ``expected``.
-
-    Raises:
-        ShapeError: if the last axes differ; the message names both shapes.
-    """
+    """Return ``array`` if its last axes are ``expected``."""
     if array.shape[array.ndim - len(expected) :] != expected or array.ndim < len(expected):
         wanted = ", ".join(["...", *map(str, expected)])
         raise ShapeError(f"{name} must have shape ({wanted}), got {array.shape}.")
@@ -111,12 +73,7 @@ def require_shape(name: str, array: Array, expected: tuple[int, ...]) -> Array:
 
 
 def as_weight(name: str, value: ArrayLike) -> Array:
-    """Return a square weight matrix from a matrix or from its diagonal.
-
-    Raises:
-        ShapeError: if the value is neither a square matrix nor a diagonal.
-        InputError: if the matrix is not finite, not symmetric, or has a negative eigenvalue.
-    """
+    """Return a square weight matrix from a matrix or from its diagonal."""
     array = as_finite(name, value)
     if array.ndim == 1:
         array = np.diag(array)
@@ -145,17 +102,6 @@ def vector_norm(vectors: Array, order: float) -> Array:
     return np.asarray(np.sqrt((magnitudes**2).sum(axis=-1)))
 
 
-def as_norm_order(value: float) -> float:
-    """Return the order of a norm.
-
-    Raises:
-        InputError: if the value is not 1, 2 or infinity.
-    """
-    if value not in (1, 2, np.inf):
-        raise InputError(f"norm must be 1, 2 or inf, got {value!r}.")
-    return float(value)
-
-
 @functools.cache
 def _thread_pools() -> ThreadpoolController:
     return ThreadpoolController()
@@ -165,3 +111,25 @@ def single_threaded() -> AbstractContextManager[Any]:
     """Limit BLAS to one thread inside the context."""
     limits: AbstractContextManager[Any] = _thread_pools().limit(limits=1)
     return limits
+
+
+def held_means(times: Array, values: Array, edges: Array, slack: float) -> Array:
+    """Return the mean of values that hold until the next one, in each interval between two edges.
+
+    Args:
+        times: when each value begins, increasing, shape ``(N,)``; the first value also holds before.
+        values: shape ``(N, m)``.
+        edges: increasing, shape ``(K + 1,)``.
+        slack: a time so close to an edge is that of the edge.
+
+    Returns:
+        The means, shape ``(K, m)``.
+    """
+    first = np.maximum(np.searchsorted(times, edges[:-1] + slack, side="right") - 1, 0)
+    last = np.maximum(np.searchsorted(times, edges[1:] - slack) - 1, first)
+    areas = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values[:-1] * np.diff(times)[:, None], axis=0)])
+    until = areas[last] + values[last] * (edges[1:] - times[last])[:, None]
+    since = areas[first] + values[first] * (edges[:-1] - times[first])[:, None]
+    means = (until - since) / np.diff(edges)[:, None]
+    within = np.clip(means, values.min(axis=0), values.max(axis=0))  # in spite of rounding
+    return np.asarray(np.where((first == last)[:, None], values[first], within))

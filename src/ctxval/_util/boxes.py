@@ -63,11 +63,6 @@ def separated_rows(points: Array, reach: float, count: int) -> list[int]:
     """Return the first rows of points ``(n, d)`` that are farther than ``reach`` from every row chosen before them.
 
     Of points that are sorted by their values, these are the best ones that are not neighbours of a better one.
-
-    Args:
-        points: what is chosen from.
-        reach: the least distance.
-        count: how many rows are wanted.
     """
     chosen: list[int] = []
     left = np.ones(len(points), dtype=bool)

@@ -1,18 +1,18 @@
-"""The code of a function or class: a digest of its syntax tree, and the outer names that it uses."""
+"""Digests of source: of the functions, classes and constants of users that an object reaches, and of modules."""
 
 from __future__ import annotations
 
 import ast
-import dis
 import functools
 import hashlib
+import importlib.util
 import inspect
 import linecache
 import sys
 import sysconfig
 import types
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +21,49 @@ _OWN = __name__.partition(".")[0]
 _SKIPPED = ("ctx", "kind", "type_comment", "returns", "annotation")
 """Fields of a syntax tree that do not affect the computation."""
 
+_MOST_ITEMS = 100
+"""Largest container whose items are searched for functions; a longer one holds data."""
+
+_INSTALLED = {"site-packages", "dist-packages"}
+"""Names of the folders of installed packages."""
+
 _Function = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 
 
 @dataclass(frozen=True)
-class Code:
-    """The identity of the code of a function or class.
+class _Global:
+    """A name in a module of users, whose definition is source, whatever its value is."""
 
-    Attributes:
-        digest: digest of the syntax tree, without the name, docstrings, annotations and the place in the file.
-        names: dotted names that the code looks up outside itself, such as ``np.sin`` and ``GAIN``.
+    module: types.ModuleType
+    name: str
+
+
+def source_digest(value: Any) -> str | None:
+    """Return a digest of the source of all functions, classes and constants of users that an object reaches.
+
+    They are reached by names, closures, attributes and base classes. No value is part of the digest, because it may be
+    a secret. Returns None if the object reaches none, for example if it belongs to a library.
     """
+    reached: dict[Any, Any] = {}
+    digests: set[str] = set()
+    waiting = [value]
+    while waiting:
+        item = waiting.pop()
+        key = item if isinstance(item, _Global) else id(item)
+        if key in reached:
+            continue
+        reached[key] = item  # also keeps it alive, so that its id stays its own
+        waiting += _reached_from(item)
+        if isinstance(item, _Global):
+            digests.update(_hashed(_plain(node)) for node in _source_of(item.module).assigned.get(item.name, ()))
+        elif isinstance(item, types.FunctionType | type) and not is_library(item):
+            digests.add(_code_digest(item))
+    return _hashed(sorted(digests)) if digests else None
 
-    digest: str
-    names: tuple[str, ...]
+
+def module_digest(source: str) -> str:
+    """Return a digest of a module's syntax tree, without its imports, docstrings, annotations and layout."""
+    return _hashed(_plain(_WithoutImports().visit(ast.parse(source))))
 
 
 def is_own(value: Any) -> bool:
@@ -45,17 +74,12 @@ def is_own(value: Any) -> bool:
 def is_library(value: Any) -> bool:
     """Return whether a module, function or class belongs to an installed package or to Python, or has no file."""
     module = value if inspect.ismodule(value) else sys.modules.get(getattr(value, "__module__", None) or "")
-    if module is None:
-        return False
-    if module.__name__ == "__main__":
+    if module is None or module.__name__ == "__main__":
         return False
     file = getattr(module, "__file__", None)
-    return file is None or _top_level(module) == _OWN or any(Path(file).is_relative_to(place) for place in _installed())
-
-
-def same_package(value: Any, other: Any) -> bool:
-    """Return whether two modules, functions or classes belong to the same top-level package."""
-    return _top_level(value) == _top_level(other)
+    if file is None or _top_level(module) == _OWN or _INSTALLED & set(Path(file).parts):
+        return True
+    return any(Path(file).is_relative_to(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib"))
 
 
 def _top_level(value: Any) -> str:
@@ -63,40 +87,162 @@ def _top_level(value: Any) -> str:
     return str(name).partition(".")[0]
 
 
-@functools.cache
-def _installed() -> tuple[Path, ...]:
-    return tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+def enclosed(function: types.FunctionType) -> list[Any]:
+    """Return what a function closes over; None for a variable that has no value yet."""
+    found: list[Any] = []
+    for cell in function.__closure__ or ():
+        try:
+            found.append(cell.cell_contents)
+        except ValueError:
+            found.append(None)
+    return found
 
 
-def code_of(value: Any) -> Code | None:
-    """Return the code of a Python function or class; None if its source cannot be read."""
-    node = _class_node(value) if isinstance(value, type) else _function_node(value)
+# What source may use
+
+
+def _reached_from(item: Any) -> list[Any]:
+    """Return what the source of an object may use: definitions, classes, functions, and objects that may hold some."""
+    if type(item) in (list, tuple, dict):
+        items = list(item.values() if isinstance(item, dict) else item)
+        return items if len(items) <= _MOST_ITEMS else []
+    if isinstance(item, functools.partial):
+        return [item.func, *item.args, *item.keywords.values()]
+    if isinstance(item, types.MethodType):
+        return [item.__func__, item.__self__]
+    if isinstance(item, types.FunctionType):
+        defaults = (*(item.__defaults__ or ()), *(item.__kwdefaults__ or {}).values())
+        used = [] if is_library(item) else _globals(sys.modules.get(item.__module__), _names(item.__code__))
+        return [*enclosed(item), *defaults, *used]
+    if isinstance(item, type):
+        return [] if is_library(item) else [*item.__bases__, *_of_class(item)]
+    if isinstance(item, _Global):
+        known = _source_of(item.module)
+        body = known.assigned.get(item.name, ())
+        return [vars(item.module)[item.name], *known.imported(item), *_globals(item.module, _loaded(body))]
+    try:
+        attributes = vars(item)
+    except TypeError:
+        return [type(item)]
+    if inspect.ismodule(item):
+        return []
+    if is_library(type(item)) and not is_own(type(item)):
+        return [attributes["__wrapped__"]] if "__wrapped__" in attributes else []  # e.g. functools.cache
+    return [type(item), *attributes.values()]
+
+
+def _of_class(cls: type) -> list[Any]:
+    """Return the functions of a class, without generated ones, and the definitions that its body uses."""
+    node = _class_node(cls)
+    functions = [function for member in vars(cls).values() for function in functions_in(member)]
     if node is None:
-        return None
-    digest = _hashed(_plain(node, top=True))
-    loaded = _loaded_by_class(value, node) if isinstance(value, type) else _loaded(value.__code__)
-    return Code(digest, tuple(sorted(name for name in _names(node) if name.partition(".")[0] in loaded)))
+        return functions
+    written = [function for function in functions if not function.__code__.co_filename.startswith("<")]
+    return [*written, *_globals(sys.modules.get(cls.__module__), _loaded([node]))]
 
 
-def module_digest(source: str) -> str:
-    """Return a digest of a module's syntax tree, without its imports, docstrings, annotations and layout.
+def functions_in(item: Any) -> list[types.FunctionType]:
+    """Return the Python functions of a class attribute: a method, the functions of a property, wrapped functions."""
+    found: list[types.FunctionType] = []
+    seen: list[Any] = []
+    waiting = [item]
+    while waiting:
+        one = waiting.pop()
+        if any(one is other for other in seen):
+            continue
+        seen.append(one)
+        if isinstance(one, types.FunctionType):
+            found.append(one)
+        inner = (getattr(one, name, None) for name in ("fget", "fset", "__func__", "func", "__wrapped__"))
+        waiting.extend(each for each in inner if callable(each))
+    return found
 
-    Raises:
-        SyntaxError: the source is not Python.
-    """
-    return _hashed(_plain(_WithoutImports().visit(ast.parse(source))))
+
+def _globals(module: types.ModuleType | None, names: set[str]) -> list[_Global]:
+    """Return the definitions behind the names that source in a module uses, also those in users' modules."""
+    if module is None:
+        return []
+    found = [_Global(module, name) for name in sorted(names & vars(module).keys())]
+    modules = [used for one in found if inspect.ismodule(used := vars(module)[one.name]) and not is_library(used)]
+    return [*found, *(_Global(used, name) for used in modules for name in sorted(names & vars(used).keys()))]
 
 
-def bytecode_digest(value: Any) -> str | None:
-    """Return a digest of the names and constants of a function or class. It serves if the source cannot be read.
+def _names(code: types.CodeType) -> set[str]:
+    """Return the global names and the attributes that a function and the functions inside it use."""
+    inner = (_names(item) for item in code.co_consts if isinstance(item, types.CodeType))
+    return set(code.co_names).union(*inner)
 
-    The instructions are left out because they differ between versions of Python. Returns None if there is no code.
-    """
-    if isinstance(value, type):
-        functions = {name: functions_in(item) for name, item in vars(value).items()}
-        known: Any = {name: [_constants(one.__code__) for one in found] for name, found in functions.items() if found}
-        return hashlib.sha256(repr(sorted(known.items())).encode()).hexdigest()[:16] if known else None
-    return _constants(value.__code__) if isinstance(value, types.FunctionType) else None
+
+def _loaded(nodes: Iterable[ast.AST]) -> set[str]:
+    """Return the names and attributes in statements, outside functions."""
+    names: set[str] = set()
+    for node in nodes:
+        names |= {node.id} if isinstance(node, ast.Name) else {node.attr} if isinstance(node, ast.Attribute) else set()
+        names |= _loaded(child for child in ast.iter_child_nodes(node) if not isinstance(child, _Function))
+    return names
+
+
+# The syntax tree
+
+
+@dataclass
+class _Source:
+    """The definitions in one source file, by name."""
+
+    functions: dict[str, list[_Function]] = field(default_factory=dict)
+    classes: dict[str, ast.AST] = field(default_factory=dict)
+    assigned: dict[str, list[ast.stmt]] = field(default_factory=dict)
+    imports: dict[str, tuple[str, str]] = field(default_factory=dict)
+
+    def imported(self, item: _Global) -> list[_Global]:
+        """Return the definition in another module of a name that a module imports from there."""
+        source, name = self.imports.get(item.name, ("", ""))
+        package = item.module.__package__ or item.module.__name__
+        module = sys.modules.get(importlib.util.resolve_name(source, package)) if source else None
+        return [_Global(module, name)] if module is not None and name in vars(module) else []
+
+
+def _source_of(module: types.ModuleType | None) -> _Source:
+    file = None if module is None or is_library(module) else getattr(module, "__file__", None)
+    return _read(file)
+
+
+def _read(file: str | None) -> _Source:
+    if file is None:
+        return _Source()
+    linecache.checkcache(file)
+    return _parsed("".join(linecache.getlines(file)))
+
+
+@functools.lru_cache(maxsize=64)
+def _parsed(source: str) -> _Source:
+    found = _Source()
+    try:
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError, RecursionError):
+        return found
+    for node in ast.walk(tree):
+        if isinstance(node, _Function):
+            found.functions.setdefault(getattr(node, "name", "<lambda>"), []).append(node)
+        elif isinstance(node, ast.ImportFrom):
+            place = "." * node.level + (node.module or "")
+            found.imports.update((alias.asname or alias.name, (place, alias.name)) for alias in node.names)
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
+            for name in ast.walk(node):
+                if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store):
+                    found.assigned.setdefault(name.id, []).append(node)
+    found.classes.update(_classes(tree, ""))
+    return found
+
+
+def _code_digest(value: Any) -> str:
+    """Return the digest of the syntax tree of a function or class, or of its constants if it has no source."""
+    node = _class_node(value) if isinstance(value, type) else _function_node(value.__code__)
+    if node is not None:
+        return _hashed(_plain(node, top=True))
+    # The instructions differ between versions of Python.
+    return "" if isinstance(value, type) else _constants(value.__code__)
 
 
 def _constants(code: types.CodeType) -> str:
@@ -106,10 +252,44 @@ def _constants(code: types.CodeType) -> str:
         else repr(sorted(map(repr, item)) if isinstance(item, frozenset) else item)
         for item in code.co_consts
     ]
-    return hashlib.sha256(repr((code.co_names, constants)).encode()).hexdigest()[:16]
+    return _hashed((code.co_names, constants))
 
 
-# The syntax tree
+def _class_node(cls: type) -> ast.AST | None:
+    module = sys.modules.get(cls.__module__)
+    return _read(getattr(module, "__file__", None)).classes.get(cls.__qualname__)
+
+
+def _classes(node: ast.AST, path: str) -> Iterator[tuple[str, ast.AST]]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.ClassDef):
+            yield f"{path}{child.name}", child
+            yield from _classes(child, f"{path}{child.name}.")
+        elif isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield from _classes(child, f"{path}{child.name}.<locals>.")
+        else:
+            yield from _classes(child, path)
+
+
+def _function_node(code: types.CodeType) -> ast.AST | None:
+    found = [node for node in _read(code.co_filename).functions.get(code.co_name, ()) if _is_of(node, code)]
+    return min(found, key=lambda node: sum(1 for _ in ast.walk(node)), default=None)
+
+
+def _is_of(node: _Function, code: types.CodeType) -> bool:
+    if isinstance(node, ast.Lambda):
+        return all(_covers(node.body, place) for place in code.co_positions())
+    return code.co_firstlineno == min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
+
+
+def _covers(node: ast.expr, place: tuple[int | None, int | None, int | None, int | None]) -> bool:
+    line, last_line, column, last_column = place
+    if line is None or last_line is None or column is None or last_column is None:
+        return True
+    if (line, column) == (last_line, last_column):
+        return True  # an instruction that the compiler added, such as the one at the start of a function
+    end = (node.end_lineno or 0, node.end_col_offset or 0)
+    return (node.lineno, node.col_offset) <= (line, column) and (last_line, last_column) <= end
 
 
 class _WithoutImports(ast.NodeTransformer):
@@ -128,68 +308,6 @@ class _WithoutImports(ast.NodeTransformer):
 
 def _hashed(tree: Any) -> str:
     return hashlib.sha256(repr(tree).encode()).hexdigest()[:16]
-
-
-def _tree(file: str | None) -> ast.Module | None:
-    if file is None:
-        return None
-    linecache.checkcache(file)
-    return _parsed("".join(linecache.getlines(file)))
-
-
-@functools.lru_cache(maxsize=64)
-def _parsed(source: str) -> ast.Module | None:
-    try:
-        return ast.parse(source) if source else None
-    except (SyntaxError, ValueError, RecursionError):
-        return None
-
-
-def _function_node(function: Any) -> ast.AST | None:
-    code = getattr(function, "__code__", None)
-    tree = _tree(code.co_filename) if isinstance(code, types.CodeType) else None
-    if tree is None or code is None:
-        return None
-    found = [node for node in ast.walk(tree) if isinstance(node, _Function) and _is_of(node, code)]
-    return min(found, key=_extent, default=None)
-
-
-def _is_of(node: _Function, code: types.CodeType) -> bool:
-    if isinstance(node, ast.Lambda):
-        return code.co_name == "<lambda>" and all(_covers(node.body, place) for place in code.co_positions())
-    first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
-    return code.co_name == node.name and first == code.co_firstlineno
-
-
-def _covers(node: ast.expr, place: tuple[int | None, int | None, int | None, int | None]) -> bool:
-    line, last_line, column, last_column = place
-    if line is None or last_line is None or column is None or last_column is None:
-        return True
-    if (line, column) == (last_line, last_column):
-        return True  # an instruction that the compiler added, such as the one at the start of a function
-    end = (node.end_lineno or 0, node.end_col_offset or 0)
-    return (node.lineno, node.col_offset) <= (line, column) and (last_line, last_column) <= end
-
-
-def _extent(node: ast.AST) -> int:
-    return sum(1 for _ in ast.walk(node))
-
-
-def _class_node(cls: type) -> ast.AST | None:
-    module = sys.modules.get(cls.__module__)
-    tree = _tree(getattr(module, "__file__", None))
-    return None if tree is None else dict(_classes(tree, "")).get(cls.__qualname__)
-
-
-def _classes(node: ast.AST, path: str) -> Iterator[tuple[str, ast.AST]]:
-    for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.ClassDef):
-            yield f"{path}{child.name}", child
-            yield from _classes(child, f"{path}{child.name}.")
-        elif isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
-            yield from _classes(child, f"{path}{child.name}.<locals>.")
-        else:
-            yield from _classes(child, path)
 
 
 def _plain(node: Any, *, top: bool = False) -> Any:
@@ -212,63 +330,3 @@ def _without_docstring(node: ast.AST, body: Any) -> Any:
     if documented and body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
         return body[1:]
     return body
-
-
-def _loaded(code: types.CodeType) -> set[str]:
-    """Return the global names that a function and the functions inside it look up."""
-    names = {step.argval for step in dis.get_instructions(code) if step.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
-    inner = (_loaded(item) for item in code.co_consts if isinstance(item, types.CodeType))
-    return names.union(*inner)
-
-
-def _loaded_by_class(cls: type, node: ast.AST) -> set[str]:
-    functions = [function for item in vars(cls).values() for function in functions_in(item)]
-    methods = (_loaded(function.__code__) for function in functions)
-    return _loaded_outside_functions(node).union(*methods)
-
-
-def _loaded_outside_functions(node: ast.AST) -> set[str]:
-    found = {node.id} if isinstance(node, ast.Name) else set()
-    inner = (_loaded_outside_functions(n) for n in ast.iter_child_nodes(node) if not isinstance(n, _Function))
-    return found.union(*inner)
-
-
-def functions_in(item: Any) -> list[types.FunctionType]:
-    """Return the Python functions of a class attribute: a method, the functions of a property, wrapped functions."""
-    found: list[types.FunctionType] = []
-    seen: list[Any] = []
-    waiting = [item]
-    while waiting:
-        one = waiting.pop()
-        if any(one is other for other in seen):
-            continue
-        seen.append(one)
-        if isinstance(one, types.FunctionType):
-            found.append(one)
-        inner = (getattr(one, name, None) for name in ("fget", "fset", "__func__", "func", "__wrapped__"))
-        waiting.extend(each for each in inner if callable(each))
-    return found
-
-
-def _names(node: ast.AST) -> set[str]:
-    found = {name for child in _computing(node) if (name := _dotted(child)) is not None}
-    # "np.linalg" and "np" are left out if "np.linalg.norm" is there.
-    return {name for name in found if not any(other.startswith(f"{name}.") for other in found)}
-
-
-def _computing(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield a node and all nodes below it, except annotations."""
-    yield node
-    for field, value in ast.iter_fields(node):
-        for child in value if isinstance(value, list) else [value]:
-            if isinstance(child, ast.AST) and field not in _SKIPPED:
-                yield from _computing(child)
-
-
-def _dotted(node: ast.AST) -> str | None:
-    if isinstance(node, ast.Name):
-        return node.id
-    if isinstance(node, ast.Attribute):
-        before = _dotted(node.value)
-        return None if before is None else f"{before}.{node.attr}"
-    return None

@@ -9,16 +9,7 @@ from ctxval.errors import InputError
 
 
 def require_extra(module: str, extra: str, purpose: str) -> Any:
-    """Return a module of an extra.
-
-    Args:
-        module: the module to import.
-        extra: the extra of this package that installs it.
-        purpose: what needs it, for the message.
-
-    Raises:
-        InputError: if it is not installed.
-    """
+    """Return a module of an extra."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -8,16 +8,15 @@ The message of an error of reading is only the reason; the caller puts the name 
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 import secrets
 import stat
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 from ctxval.errors import InputError
 
@@ -27,8 +26,12 @@ MOST_BYTES = 256 * 2**20
 MOST_JSON = 16 * 2**20
 """Largest size of a JSON file in bytes; reading it takes twenty times as much memory."""
 
-MOST_ROW = 2**20
-"""Largest number of characters in a row of a CSV file."""
+MADE_BY = "Made by ctxval"
+"""What every file contains that an option of a command names, so that the next run may replace it."""
+
+_MOST_OWN = 2**32
+
+_DATABASE = b"SQLite format 3\0"
 
 _KINDS = {
     stat.S_IFDIR: "it is a folder",
@@ -40,15 +43,7 @@ _KINDS = {
 
 
 def open_regular(path: str | Path, most: int = MOST_BYTES) -> BinaryIO:
-    """Open a regular file for reading, also through a symbolic link; never block.
-
-    Args:
-        path: the file.
-        most: largest size of the file in bytes.
-
-    Raises:
-        InputError: if the file does not exist, is not a regular file (a FIFO, a device), or is too large.
-    """
+    """Open a regular file for reading, also through a symbolic link; never block."""
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except (OSError, ValueError) as error:  # a ValueError for a NUL in the name
@@ -70,20 +65,12 @@ def _why_not_opened(path: str | Path, error: OSError | ValueError) -> str:
 
 
 def require_regular_file(path: str | Path) -> None:
-    """Check that a path names a regular file that can be opened.
-
-    Raises:
-        InputError: if the file does not exist, is not a regular file, or cannot be opened.
-    """
+    """Check that a path names a regular file that can be opened."""
     open_regular(path).close()
 
 
 def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
-    """Return the content of a regular file.
-
-    Raises:
-        InputError: if the file cannot be opened or read, or has more bytes than ``most``.
-    """
+    """Return the content of a regular file."""
     with open_regular(path, most) as file:
         try:
             size = os.fstat(file.fileno()).st_size
@@ -96,11 +83,7 @@ def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
 
 
 def read_json(path: str | Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        InputError: if the file cannot be read, is not JSON in UTF-8, is too large, or is nested too deeply.
-    """
+    """Return the content of a JSON file."""
     content = read_bytes(path, MOST_JSON)
     try:
         return json.loads(content.decode("utf-8"))
@@ -110,12 +93,20 @@ def read_json(path: str | Path) -> Any:
         raise InputError(f"it is not JSON: {error}") from error
 
 
-def make_folder_of(path: str | Path) -> None:
-    """Make the folder of a file that will be written, if there is none.
+def require_made_by_us(path: Path, mark: bytes = MADE_BY.encode()) -> None:
+    """Check that ctxval wrote a file, if there is one, so that it may be replaced."""
+    try:
+        known = not path.exists() or mark in read_bytes(path, _MOST_OWN)
+    except InputError as error:
+        raise InputError(f"{path} cannot be written: {error}.") from error
+    if not known:
+        raise InputError(
+            f"{path} is there already, and ctxval did not write it: give another name, or --force to replace it."
+        )
 
-    Raises:
-        InputError: if it cannot be made; the message names the file.
-    """
+
+def make_folder_of(path: str | Path) -> None:
+    """Make the folder of a file that will be written, if there is none."""
     try:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -123,18 +114,17 @@ def make_folder_of(path: str | Path) -> None:
 
 
 @contextmanager
-def written_whole(path: str | Path) -> Iterator[BinaryIO]:
+def written_whole(path: str | Path, *, text: bool = False) -> Iterator[IO[Any]]:
     """Yield a file to write to, which gets its name at the end: it is complete or, after an error or a kill, missing.
 
     Two processes may write the same file at once: one of the two complete files stays.
-
-    Raises:
-        InputError: if the file cannot be written; the message names it.
     """
     target = Path(os.path.realpath(path))  # a link stays a link
+    if _is_database(target):
+        raise InputError(f"{path} is a store or another database, which is never replaced.")
     beside = target.with_name(f"{target.name}.{secrets.token_hex(4)}.part")
     try:
-        with beside.open("xb") as file:
+        with beside.open("x", encoding="utf-8", newline="") if text else beside.open("x+b") as file:
             yield file
         beside.replace(target)
     except OSError as error:
@@ -144,47 +134,17 @@ def written_whole(path: str | Path) -> Iterator[BinaryIO]:
             beside.unlink(missing_ok=True)
 
 
-def csv_rows(path: str | Path, most: int = MOST_BYTES) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows of a CSV file that are not blank, each with the number of its last line.
-
-    Raises:
-        InputError: if the file cannot be read, is not CSV in UTF-8, or has a row that is too long.
-    """
-    with open_regular(path, most) as file, io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text:
-        lines = _Lines(text, most)
-        reader = csv.reader(lines)
-        try:
-            for row in reader:
-                lines.in_row = 0
-                if row:
-                    yield reader.line_num, row
-        except (OSError, UnicodeDecodeError, csv.Error) as error:
-            raise InputError(str(error)) from error
+def write_text(path: str | Path, content: str) -> Path:
+    """Write a text; its folder is made if there is none."""
+    make_folder_of(path)
+    with written_whole(path, text=True) as file:
+        file.write(content)
+    return Path(path)
 
 
-class _Lines:
-    """The lines of a text; a row of CSV may extend over several lines.
-
-    Attributes:
-        in_row: number of characters since the end of the last row; the reader of rows resets it to 0.
-    """
-
-    def __init__(self, text: io.TextIOWrapper, most: int) -> None:
-        self.text, self.left, self.in_row = text, most, 0
-
-    def __iter__(self) -> _Lines:
-        return self
-
-    def __next__(self) -> str:
-        line = self.text.readline(MOST_ROW + 1)
-        if not line:
-            raise StopIteration
-        self.in_row += len(line)
-        self.left -= len(line)
-        if self.in_row > MOST_ROW:
-            raise InputError(f"it has a row of more than {MOST_ROW} characters")
-        if self.left < 0:
-            raise InputError("it grew while it was read")
-        if "\0" in line:
-            raise InputError("it is not text in UTF-8: it has NUL bytes")
-        return line
+def _is_database(path: Path) -> bool:
+    try:
+        with open_regular(path, sys.maxsize) as file:
+            return file.read(len(_DATABASE)) == _DATABASE
+    except (InputError, OSError):
+        return False

@@ -59,11 +59,7 @@ class Interrupts:
             self._shielded = before
 
     def raise_if_asked(self) -> None:
-        """Stop here if SIGINT was received.
-
-        Raises:
-            KeyboardInterrupt: if SIGINT was received.
-        """
+        """Stop here if SIGINT was received."""
         if self.asked:
             raise KeyboardInterrupt
 

@@ -46,12 +46,7 @@ class JsonLines(Mapping[Key, Record]):
         return [record for record in self.values() if all(record.get(name) == fields[name] for name in fields)]
 
     def append(self, record: Mapping[str, Any]) -> None:
-        """Store one more record.
-
-        Raises:
-            InputError: the record lacks a field of the key.
-            OSError: the file cannot be written.
-        """
+        """Store one more record."""
         # What is read again later is what is known now: tuples are lists, for instance.
         line = json.dumps(dict(record))
         stored: Record = json.loads(line)

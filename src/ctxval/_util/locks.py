@@ -36,12 +36,7 @@ class FileLock:
         self._lock: _Flock | _Transaction = _Flock(path) if LOCKS_FILE_ITSELF else _Transaction(path)
 
     def acquire(self) -> None:
-        """Take the lock; it is held until it is released or the process ends.
-
-        Raises:
-            LockedError: if the lock is held already.
-            OSError: if this file cannot be locked.
-        """
+        """Take the lock; it is held until it is released or the process ends."""
         self._lock.acquire()
 
     def release(self) -> None:

@@ -83,19 +83,11 @@ class Archive:
         return name in self._entries
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """Return the shape of an array, without reading its numbers.
-
-        Raises:
-            InputError: if there is no such array, or it holds neither numbers nor text.
-        """
+        """Return the shape of an array, without reading its numbers."""
         return self._header(name).shape
 
     def numbers(self, name: str) -> npt.NDArray[np.float64]:
-        """Return an array of real numbers.
-
-        Raises:
-            InputError: if there is no such array, or it does not hold real numbers, is damaged, or is too large.
-        """
+        """Return an array of real numbers."""
         header = self._header(name)
         if header.dtype.kind not in "fiub":
             raise InputError(f"its array {name} must be real numbers")
@@ -106,11 +98,7 @@ class Archive:
             return np.asarray(shaped, dtype=np.float64)
 
     def text(self, name: str) -> str:
-        """Return an array that is one text.
-
-        Raises:
-            InputError: if there is no such array, or it is not one text, is damaged, or is too large.
-        """
+        """Return an array that is one text."""
         header = self._header(name)
         if header.dtype.kind not in "US" or header.count != 1:
             raise InputError(f"its array {name} must be one text")

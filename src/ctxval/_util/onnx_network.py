@@ -64,12 +64,7 @@ class OnnxNetwork:
         return {"onnx": self._digest}
 
     def __call__(self, *inputs: Array) -> Array:
-        """Return the first output ``(..., l)`` of the network for one array ``(..., k)`` for each of its inputs.
-
-        Raises:
-            ShapeError: if the number of inputs or the width of a row differs from the network's.
-            ModelError: if the network cannot be evaluated.
-        """
+        """Return the first output ``(..., l)`` of the network for one array ``(..., k)`` for each of its inputs."""
         if len(inputs) != len(self.widths):
             raise ShapeError(f"the network has {len(self.widths)} inputs, {', '.join(self.names)}, got {len(inputs)}.")
         for name, width, array in zip(self.names, self.widths, inputs, strict=True):

@@ -84,14 +84,7 @@ def mute() -> None:
 
 @contextmanager
 def stage(name: str, expected: float | None = None, unit: str = "", done: float = 0) -> Iterator[None]:
-    """Report that long work begins, and its end.
-
-    Args:
-        name: what is being done.
-        expected: how much there will be in all; None if it is not known.
-        unit: what is counted.
-        done: how much was done before.
-    """
+    """Report that long work begins, and its end."""
     listener = _listener.get()
     if listener is None:
         yield

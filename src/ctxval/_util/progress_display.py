@@ -30,12 +30,7 @@ _SILENCE = 30.0
 
 @contextmanager
 def progress_shown(wanted: bool | None = None, console: Console | None = None) -> Iterator[None]:
-    """Show the progress of everything within this context on standard error.
-
-    Args:
-        wanted: None to show it at a terminal and in a notebook, unless somebody listens already.
-        console: the console of rich to print to; standard error by default.
-    """
+    """Show the progress of everything within this context on standard error."""
     if is_heard() and wanted is not False:
         yield
         return
@@ -155,12 +150,7 @@ def _in_one_line(text: str) -> str:
 
 
 def amount(progress: Progress, elapsed: float) -> str:
-    """Return how much of a stage is done, and how many seconds are left if that can be told.
-
-    Args:
-        progress: the report.
-        elapsed: seconds since the stage began.
-    """
+    """Return how much of a stage is done, and how many seconds are left if that can be told."""
     if progress.expected is None:
         return f"{progress.done:,.0f} {progress.unit}".strip() if progress.done else ""
     text = f"{progress.done:,.0f}/{progress.expected:,.0f} {progress.unit}".strip()

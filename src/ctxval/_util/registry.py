@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from ctxval._util.checked import checked
 from ctxval._util.texts import reason_of
 from ctxval.errors import CtxvalError, InputError, UnknownNameError
 
@@ -52,7 +53,7 @@ def part(
     functions: Mapping[str, str] | None = None,
     aliases: tuple[str, ...] = (),
 ) -> Callable[[Part], Part]:
-    """Declare a class, or a function that makes an object, as a part that is found by name.
+    """Declare a class, or a function that makes an object, as a part that is found by name; check its arguments.
 
     A part of this package is found once its package exports it in ``__all__``.
 
@@ -62,7 +63,7 @@ def part(
     """
 
     def declare(made: Part) -> Part:
-        called = made.__name__ if name is None else name
+        called, made = made.__name__ if name is None else name, checked(made)
         _declarations[made] = Declaration(called, runs_code, files, folder, functions or {}, aliases)
         return made
 
@@ -144,12 +145,7 @@ class Registry(Mapping[str, Any], Generic[Made]):
         return declared is None or not declared.runs_code
 
     def find(self, name: str) -> Any:
-        """Return the class or the function that has a name.
-
-        Raises:
-            UnknownNameError: nothing has the name; the message has the nearest name.
-            InputError: it belongs to an installed package and cannot be loaded, or two packages have it.
-        """
+        """Return the class or the function that has a name."""
         present = self.aliases.get(name, name)
         if present in self._built_in:
             return self._built_in[present]
@@ -165,30 +161,16 @@ class Registry(Mapping[str, Any], Generic[Made]):
         return self._loaded(points[0])
 
     def summary(self, name: str) -> str:
-        """Return the first line of a part's docstring, without its full stop.
-
-        Raises:
-            UnknownNameError: nothing has the name.
-            InputError: the part cannot be loaded.
-        """
+        """Return the first line of a part's docstring, without its full stop."""
         lines = (inspect.getdoc(self.find(name)) or "").splitlines()
         return lines[0].removesuffix(".") if lines else ""
 
     def make(self, name: str, /, **arguments: Any) -> Made:
-        """Return a new part from its name and its arguments.
-
-        Raises:
-            UnknownNameError: nothing has the name, or the part takes no such argument.
-            InputError: the part cannot be loaded, or refuses these arguments.
-        """
+        """Return a new part from its name and its arguments."""
         return self.require_made(name, construct(f"the {self.kind} {name}", self.find(name), arguments))
 
     def require_made(self, name: str, made: Any) -> Made:
-        """Return a part that was made if it has the method of its kind.
-
-        Raises:
-            InputError: it has not.
-        """
+        """Return a part that was made if it has the method of its kind."""
         if self.method is not None and not callable(getattr(made, self.method, None)):
             got = type(made).__qualname__
             raise InputError(f"the {self.kind} {name} must have the method {self.method}; its class, {got}, has none.")
@@ -246,18 +228,7 @@ def _package(point: EntryPoint) -> str:
 
 
 def construct(what: str, build: Any, arguments: Mapping[str, Any], *first: Any) -> Any:
-    """Call a class, or a function that makes a part.
-
-    Args:
-        what: how the part is called in messages.
-        build: the class or the function.
-        arguments: by name.
-        first: arguments by position, before them.
-
-    Raises:
-        UnknownNameError: it takes no such argument; the message has the nearest one.
-        InputError: it refuses these arguments.
-    """
+    """Call a class, or a function that makes a part."""
     try:
         taken = inspect.signature(build).parameters
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values()):

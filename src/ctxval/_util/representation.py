@@ -83,12 +83,7 @@ def lines(head: str, *rows: str) -> str:
 
 
 def call(owner: object, /, *items: object, **fields: object) -> str:
-    """Return ``Name(item, field=value)`` in one line; fields that are None are left out.
-
-    Args:
-        owner: the object, or its name.
-        items, fields: values of any kind, see :func:`shown`.
-    """
+    """Return ``Name(item, field=value)`` in one line; fields that are None are left out."""
     name = owner if isinstance(owner, str) else type(owner).__name__
     inside = [
         *map(shown, items),

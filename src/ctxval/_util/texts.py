@@ -56,6 +56,11 @@ def visible(text: str) -> str:
     return _ACTED_UPON.sub(lambda found: _written_out(ord(found[0])), text)
 
 
+def quoted(value: object, longest: int = 100) -> str:
+    """Return a text of a file for a message: in one line, shortened, and with control characters written out."""
+    return shortened(visible(" ".join(plain(value).split())), longest)
+
+
 def _written_out(code: int) -> str:
     return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
@@ -90,12 +95,7 @@ def markdown_text(text: str) -> str:
 
 
 def aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> str:
-    """Return rows of texts as columns of plain text.
-
-    Args:
-        rows: the rows, the head first; all have the same number of cells.
-        right: whether all columns but the first are aligned to the right, as numbers are.
-    """
+    """Return rows of texts as columns of plain text."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:

@@ -6,7 +6,7 @@ import concurrent.futures as cf
 from collections.abc import Callable
 from pathlib import Path
 
-from ctxval._util.arrays import count_from_zero, positive_count
+from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display, remeasuring
 from ctxval.campaign.choices import Choice, OpenTrial
@@ -28,6 +28,7 @@ from ctxval.storage.store import Store
 __all__ = ["Campaign", "OpenTrial"]
 
 
+@checked
 class Campaign(OperatedCampaign):
     """A search for the worst task, with every trial stored before and after its execution.
 
@@ -56,16 +57,12 @@ class Campaign(OperatedCampaign):
         *,
         search: Search | None = None,
         store: Store | str | Path | None = None,
-        seed: int = 0,
+        seed: NonNegativeInt = 0,
         name: str = "",
         accept_change: str | None = None,
         remeasure: bool = False,
     ) -> None:
-        if not isinstance(validation, Validation):
-            raise InputError(f"validation must be a Validation, got {validation!r}.")
-        self.seed = count_from_zero("seed", seed)
-        if search is not None and not isinstance(search, Search):
-            raise InputError(f"search must have reset, ask and tell, got {search!r}.")
+        self.seed = int(seed)
         self.name = name
         trials = store if isinstance(store, Store) else Store(store)
         self.search: Search = search_of(trials) if search is None else search
@@ -77,17 +74,18 @@ class Campaign(OperatedCampaign):
 
     # Running
 
+    @checked
     def run(
         self,
-        budget: int,
+        budget: PositiveInt,
         on_trial: Callable[[Trial], None] | None = None,
         *,
         until: Callable[[Campaign], bool] | None = None,
-        workers: int | None = None,
+        workers: PositiveInt | None = None,
         executor: cf.Executor | None = None,
-        timeout: float | None = None,
-        retries: int = 2,
-        retry_failures: int = 0,
+        timeout: Seconds | None = None,
+        retries: NonNegativeInt = 2,
+        retry_failures: NonNegativeInt = 0,
         progress: bool | None = None,
     ) -> Campaign:
         """Execute tasks until the total number of executions is ``budget``, including earlier ones.
@@ -116,8 +114,7 @@ class Campaign(OperatedCampaign):
                 executions are stored, and running again continues after the trial that failed.
             CampaignError: if there are no workers any more.
         """
-        total = positive_count("budget must be a positive integer", budget)
-        by_search = Choice(planned_draws=total if until is None else 0)
+        by_search = Choice(planned_draws=budget if until is None else 0)
 
         def rule() -> Choice | None:
             return None if until is not None and until(self) else by_search
@@ -126,12 +123,13 @@ class Campaign(OperatedCampaign):
         if retry_failures and pool is None:
             raise InputError("retry_failures needs workers, an executor or a timeout.")
         with progress_shown(progress):
-            return self._execute(Schedule(self._recorder, rule, total), pool, on_trial, retry)
+            return self._execute(Schedule(self._recorder, rule, budget), pool, on_trial, retry)
 
+    @checked
     def run_until_decided(
         self,
-        threshold: float,
-        budget: int,
+        threshold: PositiveFloat,
+        budget: PositiveInt,
         on_trial: Callable[[Trial], None] | None = None,
         *,
         confidence: float = CONFIDENCE,
@@ -139,9 +137,9 @@ class Campaign(OperatedCampaign):
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
         audited: bool = False,
-        workers: int | None = None,
+        workers: PositiveInt | None = None,
         executor: cf.Executor | None = None,
-        timeout: float | None = None,
+        timeout: Seconds | None = None,
         progress: bool | None = None,
     ) -> Campaign:
         """Execute tasks until the model is validated or falsified for a threshold, or the budget is spent.
@@ -166,21 +164,21 @@ class Campaign(OperatedCampaign):
             InputError, ModelError, DesignError, DistanceError, CampaignError: as in :meth:`run`.
             CertificateError: if an option of the certificate is not valid.
         """
-        total = positive_count("budget must be a positive integer", budget)
         by = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
-        decision = UntilDecided(self._recorder, threshold, by, total, audited)
+        decision = UntilDecided(self._recorder, threshold, by, budget, audited)
         pool = self._pool(workers, executor, timeout)
         with self._recorder.predicting(decision.predicts), progress_shown(progress):
-            return self._execute(Schedule(self._recorder, decision.choose, total), pool, on_trial)
+            return self._execute(Schedule(self._recorder, decision.choose, budget), pool, on_trial)
 
+    @checked
     def audit(
         self,
-        draws: int,
+        draws: PositiveInt,
         on_trial: Callable[[Trial], None] | None = None,
         *,
-        workers: int | None = None,
+        workers: PositiveInt | None = None,
         executor: cf.Executor | None = None,
-        timeout: float | None = None,
+        timeout: Seconds | None = None,
         progress: bool | None = None,
     ) -> Campaign:
         """Execute independent draws from the distribution of tasks until the trials contain this number of them.
@@ -197,13 +195,12 @@ class Campaign(OperatedCampaign):
             CertificateError: if people are executing open trials.
             ModelError, DesignError, DistanceError: as in :meth:`run`.
         """
-        planned = positive_count("an audit needs a positive number of draws", draws)
 
         def missing() -> int:
-            return max(0, planned - sum(trial.origin == "iid" for trial in self.trials))
+            return max(0, draws - sum(trial.origin == "iid" for trial in self.trials))
 
         def rule() -> Choice | None:
-            return Choice(self._recorder.draw(), "iid", planned_draws=planned) if missing() else None
+            return Choice(self._recorder.draw(), "iid", planned_draws=draws) if missing() else None
 
         pool = self._pool(workers, executor, timeout)
         self._require_no_open_trials()
@@ -221,7 +218,9 @@ class Campaign(OperatedCampaign):
                 "before an audit."
             )
 
-    def _pool(self, workers: int | None, executor: cf.Executor | None, timeout: float | None) -> WorkerPool | None:
+    def _pool(
+        self, workers: PositiveInt | None, executor: cf.Executor | None, timeout: Seconds | None
+    ) -> WorkerPool | None:
         system = self.validation.system
         if getattr(system, "manual", False):
             raise InputError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +45,8 @@ class Choice:
         planned_draws: the planned number of independent draws, which is stored with each draw; 0 if the results decide
             the number, None if it is not known.
         note: what is recorded about the choice, in types that JSON has.
+        rejected: the number of tasks that were tested and are not steady; None if this task is to be tested.
+        parameters: the task parameters as a person gave them; None if they are those of the point, rounded.
     """
 
     unit_point: Array | None = None
@@ -51,3 +54,5 @@ class Choice:
     because: str | None = None
     planned_draws: int | None = None
     note: dict[str, Any] | None = None
+    rejected: int | None = None
+    parameters: Mapping[str, Any] | None = None

@@ -55,9 +55,6 @@ class ThinkingCosts:
         Args:
             validation: the map p -> d(p).
             points: tasks of these executions, each ``(d,)``.
-
-        Raises:
-            ModelError, DesignError: if a task cannot be planned.
         """
         parts, task = validation, validation.task(validation.space.parameters(points[0]))
         design = _cpu_seconds(lambda: parts.synthesizer.design(task, parts.model))
@@ -101,13 +98,7 @@ def _cpu_now() -> float:
 
 
 def costs_of(prediction: Prediction, validation: Validation, trials: Sequence[Trial]) -> Costs:
-    """Return the costs that decide how long a search thinks.
-
-    Args:
-        prediction: the prediction of a task, which is timed. It designs a controller and runs two closed loops.
-        validation: contains the system. If people execute it, an execution costs more than all thinking.
-        trials: the trials, which contain the seconds of their executions.
-    """
+    """Return the costs that decide how long a search thinks."""
     batched = bool(getattr(validation.synthesizer, "batched", False))
     with stage("timing predictions", unit="designs"):
         each, batch, more = _measured(prediction, validation.space.dimension, batched)

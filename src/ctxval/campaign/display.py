@@ -67,16 +67,13 @@ def to_dataframe(trials: Sequence[Trial], space: TaskSpace) -> DataFrame:
 
     A vector parameter has one column for each component, ``name[0], name[1], ...``. If a parameter has the name of
     another column, such as ``distance``, its column is ``parameters.distance``. Unknown values are missing values.
-
-    Raises:
-        InputError: if pandas is not installed.
     """
     try:
         from pandas import DataFrame
     except ImportError as error:
         raise InputError("a table of trials needs pandas, which is not installed: pip install pandas.") from error
     columns: dict[str, list[Any]] = {name: [getattr(trial, name) for trial in trials] for name in _BEFORE}
-    points = [space.from_unit(trial.unit_point).tolist() for trial in trials]
+    points = [space.point(trial.parameters).tolist() for trial in trials]
     for axis, name in enumerate(space.names):
         own = f"parameters.{name}" if name in (*_BEFORE, *_AFTER) else name
         columns[own] = [point[axis] for point in points]

@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.describe import rounded
 from ctxval._util.progress import stage
-from ctxval._util.representation import call
 from ctxval._util.texts import reason_of
 from ctxval.campaign.history import executed_trials
-from ctxval.certificates.dynamics import bound_of
+from ctxval.certificates.dynamics import MOST_DRAWS, bound_of
 from ctxval.certificates.dynamics_diagnostics import DENSE, PREDICTIONS, doubt_of, jumps
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
@@ -27,7 +25,7 @@ from ctxval.certificates.dynamics_evidence import (
 )
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Trial
+from ctxval.core.trial import REDEFINED, Trial
 from ctxval.core.validation import Validation
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import Coverage, Gap
@@ -45,8 +43,6 @@ NEAR = 0.02
 _RECOMPUTED = PREDICTIONS + 1
 """Number of the last trials whose predictions are computed afterwards, if none were stored."""
 
-_MOST_DRAWS = 400
-"""Largest number of draws; a higher confidence than they give is refused."""
 
 _REMEMBERED = 6
 """Number of sets of executions whose dynamics are kept."""
@@ -62,14 +58,16 @@ class CampaignDynamics:
         description: what the experiment is, as the store describes it.
 
     Attributes:
-        experiment: a digest of the description; a stored prediction belongs to one experiment.
+        experiment: a digest of the description and of how often the distance has changed; a stored prediction belongs
+            to one experiment.
         elsewhere: returns recordings of the same system that belong to no trial of this campaign. They teach the
             dynamics, and they are no executions of this model's controllers.
         failure: the exception because of which the last :meth:`evidence` was None, in words; None if there was none.
     """
 
     def __init__(self, validation: Validation, store: Store, seed: int, description: Mapping[str, Any]) -> None:
-        text = json.dumps(rounded(description.get("validation"), 6), sort_keys=True)
+        redefined = sum(change.why == REDEFINED for change in store.history())
+        text = json.dumps([redefined, description.get("validation")], sort_keys=True)
         self.experiment = hashlib.sha256(text.encode()).hexdigest()[:16]
         self._study = DynamicsStudy(validation, seed)
         self._store = store
@@ -78,12 +76,7 @@ class CampaignDynamics:
         self._learned: dict[tuple[int, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]] = {}
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
-        """Return what the completed trials teach; None if they teach nothing.
-
-        Args:
-            trials: the trials.
-            alone: leave out the recordings from elsewhere, which may be later than these trials.
-        """
+        """Return what the completed trials teach; None if they teach nothing."""
         executed, others = executed_trials(self._store, trials), () if alone else self.elsewhere()
         # The recordings are kept with what they taught, so that their identities stay theirs.
         key = (*(trial.number for trial, _ in executed), -1, *map(id, others))
@@ -110,13 +103,8 @@ class CampaignDynamics:
             return None
 
     def evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
-        """Return what the learned dynamics say about d*; None if nothing can be learned.
-
-        Args:
-            trials: all trials.
-            confidence: the probability with which a bound must hold; it sets the least number of draws.
-        """
-        draws = min(_MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
+        """Return what the learned dynamics say about d*; None if nothing can be learned."""
+        draws = min(MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
         with stage("searching the learned dynamics", self._study.search.expected_loops(draws), "closed loops"):
             learned = self.learned(trials)
             return None if learned is None else self._evidence_or_none(learned, trials, draws, confidence)
@@ -226,9 +214,6 @@ class CampaignDynamics:
     def to_note(self, prediction: ExecutionPrediction) -> dict[str, Any]:
         """Return a prediction as it is stored, with what identifies the experiment that it belongs to."""
         return {PREDICTION: {**prediction.to_json(), "experiment": self.experiment}}
-
-    def __repr__(self) -> str:
-        return call(self, self._study)
 
 
 def _with_jumps(found: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ctxval._util.arrays import count_from_zero
+from ctxval._util.checked import NonNegativeInt, checked
 from ctxval._util.interrupts import Interrupts, exits_as_exceptions
 from ctxval._util.progress import advance, is_heard, stage
 from ctxval.campaign.choices import Choice, OpenTrial
@@ -14,7 +14,7 @@ from ctxval.campaign.remeasuring import remeasure
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import ExecutionResult, WorkerPool, execute_task
 from ctxval.core.plan import Measurement, Plan
-from ctxval.core.trial import Trial
+from ctxval.core.trial import CONVERGED, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, ExecutionError, InputError
 
@@ -22,6 +22,7 @@ OnTrial = Callable[[Trial], None]
 """Called with each trial that has ended."""
 
 
+@checked
 @dataclass(frozen=True)
 class RetryPolicy:
     """Limits on the repetitions of the execution of one trial.
@@ -29,17 +30,10 @@ class RetryPolicy:
     Attributes:
         retries: the largest number of repetitions if the worker is lost.
         retry_failures: the largest number of repetitions if the system fails.
-
-    Raises:
-        InputError: if a number is not an integer >= 0.
     """
 
-    retries: int = 2
-    retry_failures: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("retries", "retry_failures"):
-            count_from_zero(name, getattr(self, name))
+    retries: NonNegativeInt = 2
+    retry_failures: NonNegativeInt = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +62,7 @@ class Schedule:
 
 
 def execute_schedule(schedule: Schedule, pool: WorkerPool | None, on_trial: OnTrial | None, retry: RetryPolicy) -> None:
-    """Execute a schedule to its end, as the only process that runs the store.
-
-    Args:
-        schedule: the trials to execute.
-        pool: the workers; None to execute one trial after the other in this process.
-        on_trial: called with each trial that has ended.
-        retry: the limits on repetitions by workers.
-    """
+    """Execute a schedule to its end, as the only process that runs the store."""
     recorder = schedule.recorder
     with recorder.store.sole_writer(), Interrupts() as interrupts, exits_as_exceptions():
         recorder.refresh()
@@ -103,10 +90,13 @@ def _report(recorder: TrialRecorder, ended: Trial, on_trial: OnTrial | None) -> 
 def _result(recorder: TrialRecorder, ended: Trial) -> str:
     """Return the result of a trial in one sentence."""
     pace = "" if ended.seconds is None else f" in {ended.seconds:.2g} s"
+    design = "" if (ended.note or {}).get(CONVERGED) is not False else "; the design of its controller did not converge"
     if ended.distance is None:
-        return f"trial {ended.number} failed{pace}: {ended.failure}"
+        return f"trial {ended.number} failed{pace}: {ended.failure}{design}"
     largest = max(trial.distance for trial in recorder.trials if trial.distance is not None)
-    return f"trial {ended.number} has distance {ended.distance:.4g}{pace}, largest {largest:.4g}"
+    offset = recorder.start_offset(ended)
+    start = f"; its start was off by {offset.text}" if offset is not None and offset.size else ""
+    return f"trial {ended.number} has distance {ended.distance:.4g}{pace}, largest {largest:.4g}{start}{design}"
 
 
 def _execute_in_turn(schedule: Schedule, on_trial: OnTrial | None, interrupts: Interrupts) -> None:
@@ -127,11 +117,7 @@ def _execute_in_turn(schedule: Schedule, on_trial: OnTrial | None, interrupts: I
 
 
 def _measured(validation: Validation, plan: Plan, result: ExecutionResult) -> Measurement:
-    """Return the distance of an execution.
-
-    Raises:
-        ExecutionError: if the execution failed.
-    """
+    """Return the distance of an execution."""
     if result.failure is not None:
         raise ExecutionError(result.failure)
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 
-from ctxval._util.representation import call
 from ctxval.core.labels import labels_of
 from ctxval.core.plan import Plan
 from ctxval.core.soundness import MISSED, goal_misses
@@ -63,6 +62,3 @@ class GoalsOfModel:
             f"{names[int(found.states[column])]} for the task {where}. A validation against such a model says little: "
             "see `ctxval check --aspect1`."
         )
-
-    def __repr__(self) -> str:
-        return call(self, plans=len(self._plans))

@@ -40,13 +40,7 @@ def executed_trials(store: Store, trials: Sequence[Trial]) -> list[tuple[Trial, 
 
 
 def predict_from(predictor: DistancePredictor, store: Store, trials: Sequence[Trial]) -> Prediction | None:
-    """Return the distance predicted from the executed trajectories; None if no prediction is possible.
-
-    Args:
-        predictor: predicts d(p) from executions.
-        store: the store of the trajectories.
-        trials: all trials.
-    """
+    """Return the distance predicted from the executed trajectories; None if no prediction is possible."""
     executed = executed_trials(store, trials)
     prediction = predictor.predict([(trial.unit_point, trajectory) for trial, trajectory in executed])
     known = [trial for trial in history_of(trials) if trial.distance is not None]
@@ -59,13 +53,7 @@ def predict_from(predictor: DistancePredictor, store: Store, trials: Sequence[Tr
 
 
 def _by_known_value(prediction: Prediction, points: Array, executed: Rows) -> Prediction:
-    """Return a prediction with one row for each known value.
-
-    Args:
-        prediction: a prediction with one row for each trajectory.
-        points: the points of the known values, shape ``(n, d)``.
-        executed: the row of the trajectory of each value, ``(n,)``; -1 if there is none.
-    """
+    """Return a prediction with one row for each known value."""
 
     def left_out_of(one: Prediction) -> Callable[[Rows], Array]:
         def left_out(rows: Rows) -> Array:

@@ -10,23 +10,18 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, differences
-from ctxval._util.mjcf import COMPILED
 from ctxval.core.distance import Distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Change, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreMismatchError
-from ctxval.searches import DEFAULT, NAMES, Auto, Repeated, Search, by_name
-from ctxval.searches.auto import present_options
+from ctxval.searches import DEFAULT, NAMES, Repeated, Search, by_name
 from ctxval.storage.store import Store
-
-VERSION = 2
-"""Version of descriptions; those of ctxval 0.1.0 have none."""
 
 _RECOMPUTED = 1e-4
 """Largest difference between a recomputed and a stored closed loop on the model, as a fraction of each range."""
 
-_REMEASURED = 1e-6
+REMEASURED = 1e-6
 """Largest relative difference between a recomputed and a stored distance."""
 
 _QUESTION = ("name", "seed", "search", "validation.space")
@@ -38,17 +33,13 @@ _DISTANCE = "validation.distance"
 def description_of(validation: Validation, search: Search, seed: int, name: str) -> dict[str, Any]:
     """Return the description that identifies an experiment in a store, in the form that JSON returns."""
     described = {"name": name, "seed": seed, "search": describe(search), "validation": validation.describe()}
-    plain: dict[str, Any] = json.loads(json.dumps({**described, "version": VERSION}))
+    plain: dict[str, Any] = json.loads(json.dumps(described))
     return plain
 
 
 def search_of(store: Store) -> Search:
-    """Return the search of a store, made from its description; the default search for a new store.
-
-    Raises:
-        StoreMismatchError: if the search cannot be made from its description.
-    """
-    described = _with_present_names(store.description()).get("search")
+    """Return the search of a store, made from its description; the default search for a new store."""
+    described = store.description().get("search")
     search = by_name(DEFAULT) if described is None else _search_described(described)
     if search is None:
         kind = described.get("type", "unknown") if isinstance(described, dict) else described
@@ -111,28 +102,16 @@ def identify(
 
     Besides the descriptions, some stored closed loops on the model and some distances are compared with recomputed
     ones. Only this detects, for example, that the private weights of a model have changed.
-
-    Args:
-        store: the store of the trials.
-        validation: the present validation.
-        description: the description of the present experiment, from :func:`description_of`.
-        accept: the reason why a difference does not matter, or the repair of the system; the store keeps it.
-        remeasuring: whether all distances will be recomputed next.
-
-    Raises:
-        StoreMismatchError: if another experiment made the store; the message names the first difference and the
-            remedies.
-        InputError: if the reason is empty.
     """
     if accept is not None and not accept.strip():
         raise InputError('accepting a change needs a reason, such as "gripper replaced".')
-    stored = _with_present_names(store.describe_first(description))
-    present = _without_new(description if "version" in stored else _as_before(description, stored), stored)
-    found = list(differences(stored, present))
+    store.describe_first(description)
+    with store.snapshot():
+        stored, trials = store.description(), store.trials()
+    found = list(differences(stored, description))
     asked = [sentence for path, sentence in found if path.startswith(_QUESTION)]
     if asked:
         raise _mismatch(store, asked[0], "use another store")
-    trials = store.trials()
     loop = _changed_loop(store, validation, trials)
     if loop is not None:
         raise _mismatch(store, next((sentence for _, sentence in found), loop), _LOOP_CHANGED)
@@ -145,8 +124,6 @@ def identify(
     kept = _with_distance(description, stored) if remeasuring else description
     if others or accept is not None:
         store.describe_anew(kept, Change("accepted", str(accept), {"differences": others, "trials": len(trials)}))
-    elif "version" not in stored:
-        store.describe_anew(kept, Change("described anew", "made by an older version", {}))
 
 
 def _with_distance(description: dict[str, Any], stored: dict[str, Any]) -> dict[str, Any]:
@@ -203,14 +180,20 @@ def _changed_loop(store: Store, validation: Validation, trials: Sequence[Trial])
             gap = _gap(stored, now)
             # Results that differ from one call to the next, such as those of a random planner, cannot be compared.
             if gap > _RECOMPUTED and _gap(now, _loop(validation, trial)) <= _RECOMPUTED:
+                if stored.states.shape != now.states.shape or stored.inputs.shape != now.inputs.shape:
+                    return f"{what} had {_size(stored)} and has now {_size(now)}"
                 return f"{what} differs from the stored one by {100 * min(gap, 1e6):.2g} % of its range"
         except CtxvalError as error:
             return f"{what} cannot be computed any more ({error})"
     return None
 
 
+def _size(loop: Trajectory) -> str:
+    return f"{loop.horizon} steps of {loop.states.shape[-1]} states and {loop.inputs.shape[-1]} inputs"
+
+
 def _loop(validation: Validation, trial: Trial) -> Trajectory:
-    return validation.plan(validation.space.from_unit(trial.unit_point)).model_trajectory
+    return validation.plan(validation.space.point(trial.parameters)).model_trajectory
 
 
 def _gap(one: Trajectory, other: Trajectory) -> float:
@@ -234,80 +217,12 @@ def _changed_distance(store: Store, validation: Validation, trials: Sequence[Tri
         model, system = store.trajectory(trial.number, "model"), store.trajectory(trial.number, "system")
         if trial.distance is None or model is None or system is None:
             continue
-        point = validation.space.from_unit(trial.unit_point)
         try:
+            point = validation.space.point(trial.parameters)
             now = validation.remeasure(point, model, system)
             again = validation.remeasure(point, model, system)
-        except DistanceError as error:
+        except (DistanceError, InputError) as error:
             return f"the distance of trial {trial.number} cannot be computed any more ({error})"
-        if now == again and not np.isclose(now, trial.distance, rtol=_REMEASURED, atol=1e-12):
+        if now == again and not np.isclose(now, trial.distance, rtol=REMEASURED, atol=1e-12):
             return f"the distance of trial {trial.number} was {trial.distance:.6g} and is now {now:.6g}"
     return None
-
-
-# Descriptions of older versions
-
-_RENAMED = {"Scalar": "BayesianOptimisation", "Climbs": "TrustRegion"}
-"""Classes of searches by the names that older stores have, and their present names."""
-
-
-def _with_present_names(stored: dict[str, Any]) -> dict[str, Any]:
-    """Return a stored description with the present names of searches and their options; the store keeps the old ones.
-
-    A search may be inside another one, such as ``Repeated``, or in the code of a user's search.
-    """
-
-    def renamed(value: Any, key: str = "") -> Any:
-        if isinstance(value, dict):
-            items = {name: renamed(item, name) for name, item in value.items()}
-            return present_options(items) if items.get("type") == Auto.__name__ else items
-        if isinstance(value, list):
-            return [renamed(item) for item in value]
-        if not isinstance(value, str):
-            return value
-        start = "ctxval." if value.startswith("ctxval.") else ""
-        old = value.removeprefix(start)
-        return start + _RENAMED[old] if old in _RENAMED and (start or key == "type") else value
-
-    return {**stored, "search": renamed(stored["search"])} if "search" in stored else stored
-
-
-def _without_new(present: Any, stored: Any) -> Any:
-    """Return a description without the numbers of MuJoCo models, if an older version described the stored models."""
-    if isinstance(present, dict) and isinstance(stored, dict):
-        kept = {key: value for key, value in present.items() if key != COMPILED or key in stored}
-        return {key: _without_new(value, stored.get(key)) for key, value in kept.items()}
-    if isinstance(present, list) and isinstance(stored, list) and len(present) == len(stored):
-        return [_without_new(a, b) for a, b in zip(present, stored, strict=True)]
-    return present
-
-
-def _as_before(present: dict[str, Any], stored: dict[str, Any]) -> dict[str, Any]:
-    """Return a description that can be compared with one of version 0.1.0, without the descriptions of code.
-
-    The recomputed results show whether the code still computes the same.
-    """
-    bounds = present["validation"]["space"].items()
-    space = {name: bound[:2] if isinstance(bound, list) else bound for name, bound in bounds}
-    before = {**present, "validation": {**present["validation"], "space": space}}
-    merged = _without_code({key: value for key, value in before.items() if key != "version"}, stored)
-    assert isinstance(merged, dict)
-    return merged
-
-
-_CODE = ("function", "constants", "digest", "uses", "code")
-
-
-def _without_code(present: Any, stored: Any) -> Any:
-    """Return the present description with the descriptions of code from the stored one."""
-    if isinstance(present, dict) and isinstance(stored, dict):
-        own = {key: _without_code(value, stored.get(key)) for key, value in present.items() if key not in _CODE}
-        return {**{key: value for key, value in stored.items() if key in _CODE}, **own}
-    if isinstance(present, list) and isinstance(stored, list) and len(present) == len(stored):
-        return [_without_code(a, b) for a, b in zip(present, stored, strict=True)]
-    named = isinstance(stored, str) and (isinstance(present, dict) and "function" in present)
-    if named or (isinstance(stored, dict) and "function" in stored and isinstance(present, str)):
-        return stored
-    if isinstance(stored, str) and isinstance(present, str) and stored.rpartition(".")[2] == present.rpartition(".")[2]:
-        return stored
-    return present

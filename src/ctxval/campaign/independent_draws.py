@@ -5,12 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from typing import Any
+from contextlib import suppress
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.describe import describe, rounded
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError
@@ -36,38 +35,47 @@ class IndependentDraws:
     def __init__(self, store: Store, validation: Validation, seed: int) -> None:
         self._store, self._validation, self._seed = store, validation, seed
 
-    def search_seed(self, trials: Sequence[Trial]) -> int:
+    def search_seed(self) -> int:
         """Return the seed of a search that depends on the model, because of independent draws or a refined model."""
-        entropy = [self._seed, *self.of_model(trials)]
-        return self._seed if len(entropy) == 1 else int(np.random.SeedSequence(entropy).generate_state(1)[0])
+        return int(np.random.SeedSequence([self._seed, self.of_model()]).generate_state(1)[0])
 
     def point(self, trials: Sequence[Trial]) -> Array:
         """Return the next draw from the distribution of tasks, a point of the unit cube ``(d,)``."""
-        entropy = [self._seed, len(trials), _AUDIT, *self.of_model(trials)]
+        entropy = [self._seed, len(trials), _AUDIT, self.of_model()]
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
-        return np.asarray(self._validation.space.unit_draws(1, rng)[0])
+        space = self._validation.space
+        return space.rounded(space.unit_draws(1, rng)[0])
 
-    def of_model(self, trials: Sequence[Trial]) -> list[int]:
-        """Return the number of the model in a list; empty for stores of version 0.1.0 that have draws without it."""
+    def of_model(self) -> int:
+        """Return the number of the model, which the store keeps, because another processor rounds differently."""
         kept = self._store.draws()
-        if kept is None and not any(trial.origin == "iid" for trial in trials):
-            self._store.keep_draws(_digest_of_model(self._validation))
+        if kept is None:
+            self._store.keep_draws(_number_of_model(self._validation))
             kept = self._store.draws()
-        return [] if kept is None else [kept]
+        return kept or 0
 
 
-def _digest_of_model(validation: Validation) -> int:
-    """Return a number that identifies a model; it changes if the model is learned again.
+_STEPS = 2000
+"""Number of steps of a model, from states and inputs around those of its closed loops, that identify it."""
+
+
+def _number_of_model(validation: Validation) -> int:
+    """Return a number that identifies a model by what it computes; it changes if the model is learned again.
 
     Independent draws of tasks depend on it, so that a model is never judged by the tasks of an earlier model.
     """
     space = validation.space
-    loops: list[list[Any]] = []
+    rows: list[Array] = []
     for point in (space.low, 0.5 * (space.low + space.high), space.high):
-        try:
-            trajectory = validation.plan(point).model_trajectory
-            loops.append([trajectory.states.ravel().tolist(), trajectory.inputs.ravel().tolist()])
-        except CtxvalError as error:
-            loops.append([str(type(error).__name__)])
-    content = json.dumps(rounded([describe(validation.model, private=True), loops], 5, least=1e-12), sort_keys=True)
+        with suppress(CtxvalError):
+            loop = validation.plan(point).model_trajectory
+            rows.append(np.hstack([loop.states[:-1], loop.inputs]))
+    if not rows:
+        return 0
+    visited, n = np.concatenate(rows), loop.states.shape[-1]
+    low, high = visited.min(axis=0), visited.max(axis=0)
+    with suppress(CtxvalError):
+        z = np.random.default_rng(0).uniform(2 * low - high, 2 * high - low, (_STEPS, len(low)))
+        rows.append(validation.model.step(z[:, :n], z[:, n:]))
+    content = json.dumps([[f"{0.0 if abs(value) < 1e-12 else value:.5g}" for value in row.ravel()] for row in rows])
     return int.from_bytes(hashlib.sha256(content.encode()).digest()[:8], "big")

@@ -54,9 +54,6 @@ class TrialResult:
         trajectory: the recorded trajectory.
         distance: d(p), if there is no recording.
         failed: the reason why there is no result.
-
-    Raises:
-        InputError: if not exactly one of them is given.
     """
 
     trajectory: Trajectory | None = None
@@ -71,20 +68,8 @@ class TrialResult:
 def check_known(
     validation: Validation, point: Array, result: TrialResult, start_tolerance: float | None = None
 ) -> KnownExecution:
-    """Check and measure an earlier execution; nothing is stored.
-
-    Args:
-        validation: the map p -> d(p).
-        point: the parameters of the task, shape ``(d,)``.
-        result: the result of the execution.
-        start_tolerance: replaces the start tolerance of the validation.
-
-    Raises:
-        ExecutionError, InputError: if the result is not a result of this task.
-        ModelError, DesignError: if the task cannot be planned.
-    """
-    unit_point = validation.space.to_unit(point)
-    plan = validation.plan(validation.space.from_unit(unit_point))
+    """Check and measure an earlier execution; nothing is stored."""
+    unit_point, plan = validation.space.to_unit(point), validation.plan(point)
     measurement = None
     if result.trajectory is not None:
         measurement = validation.accept(plan, result.trajectory, start_tolerance)
@@ -94,11 +79,7 @@ def check_known(
 
 
 def measurement_of(distance: float) -> Measurement:
-    """Return the measurement of a distance that is given without a trajectory.
-
-    Raises:
-        InputError: if it is not a finite number >= 0.
-    """
+    """Return the measurement of a distance that is given without a trajectory."""
     valid = isinstance(distance, int | float | np.number) and not isinstance(distance, bool)
     if not valid or not (np.isfinite(distance) and distance >= 0):
         raise InputError(f"the distance must be a finite number >= 0, got {distance!r}.")

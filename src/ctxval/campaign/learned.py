@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call
 from ctxval.campaign.dynamics import CampaignDynamics
 from ctxval.campaign.history import predict_from
 from ctxval.certificates import DynamicsEvidence
@@ -53,11 +52,7 @@ class LearnedFromTrials:
         return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
 
     def dynamics(self, confidence: float) -> DynamicsEvidence | None:
-        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned.
-
-        Raises:
-            CertificateError: if a part of the experiment raises an exception meanwhile.
-        """
+        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
         found = self.study.evidence(self.trials, confidence)
         if found is None and self.study.failure is not None:
             raise CertificateError(f"no dynamics can be learned: {self.study.failure.rstrip('.')}.")
@@ -73,6 +68,3 @@ class LearnedFromTrials:
             earlier = [trial for trial in self.trials if trial.number < before]
             self._predictions[before] = predict_from(self._predictor, self.store, earlier)
         return self._predictions[before]
-
-    def __repr__(self) -> str:
-        return call(self, trials=len(self.trials))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, positive_count
+from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, checked
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.known import KnownExecution, TrialResult, check_known, measurement_of
@@ -26,13 +26,14 @@ class OperatedCampaign(CampaignResults):
     None of its methods executes the system: people do.
     """
 
+    @checked
     def ask(
         self,
         parameters: Mapping[str, Any] | None = None,
         *,
         draw: bool = False,
         because: str | None = None,
-        wait: float = 0.0,
+        wait: NonNegativeFloat = 0.0,
         progress: bool | None = None,
     ) -> OpenTrial:
         """Open the next trial: the search's choice, the task with these parameters, or an independent draw.
@@ -57,20 +58,24 @@ class OperatedCampaign(CampaignResults):
         with progress_shown(progress), self.store.sole_writer(wait), self._recorder.predicting(predicts):
             self._recorder.refresh()
             if parameters is not None:
-                return self._recorder.open(Choice(self._unit_point(parameters), "manual", because))
+                point = self.validation.space.point(parameters)
+                given = self.validation.space.describe_point(point)
+                unit_point = self.validation.space.to_unit(point)
+                return self._recorder.open(Choice(unit_point, "manual", because, parameters=given))
             return self._recorder.open(Choice(self._recorder.draw(), "iid") if draw else Choice())
 
+    @checked
     def ask_until_decided(
         self,
-        threshold: float,
-        budget: int,
+        threshold: PositiveFloat,
+        budget: PositiveInt,
         *,
         confidence: float = CONFIDENCE,
         stochastic: bool = False,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
         audited: bool = False,
-        wait: float = 0.0,
+        wait: NonNegativeFloat = 0.0,
         progress: bool | None = None,
     ) -> OpenTrial | None:
         """Open the trial that :meth:`ctxval.Campaign.run_until_decided` would execute next, for people who execute it.
@@ -87,34 +92,39 @@ class OperatedCampaign(CampaignResults):
             InputError, StoreAccessError, ModelError, DesignError: as in :meth:`ask`.
             CertificateError: if an option of the certificate is not valid.
         """
-        total = positive_count("budget must be a positive integer", budget)
         by = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         with progress_shown(progress), self.store.sole_writer(wait):
             self._recorder.refresh()
-            decision = UntilDecided(self._recorder, threshold, by, total, audited)
+            decision = UntilDecided(self._recorder, threshold, by, budget, audited)
             waiting = sum(trial.state == "open" for trial in self.trials)
             with self._recorder.predicting(decision.predicts):
-                choice = decision.choose() if self.executions + waiting < total else None
+                choice = decision.choose() if self.executions + waiting < budget else None
                 return None if choice is None else self._recorder.open(choice)
 
-    def reopen(self, number: int) -> OpenTrial:
+    def reopen(self, number: int, *, ended: bool = False) -> OpenTrial:
         """Return an open trial again, with its task and controller.
 
+        Args:
+            number: the number of the trial.
+            ended: return a trial whose result was told, to replace the result.
+
         Raises:
-            InputError: if there is no such trial, or it is not open.
+            InputError: if there is no such trial, or it is in another state.
         """
         self._recorder.refresh()
-        trial = self._recorder.open_trial(number)
+        trial = self._recorder.told_trial(number) if ended else self._recorder.open_trial(number)
         return OpenTrial(trial, self._recorder.plan(trial))
 
+    @checked
     def tell(
         self,
-        opened: OpenTrial | int,
+        opened: OpenTrial | NonNegativeInt,
         trajectory: Trajectory | None = None,
         *,
-        distance: float | None = None,
+        distance: NonNegativeFloat | None = None,
         failed: str | None = None,
-        start_tolerance: float | None = None,
+        start_tolerance: NonNegativeFloat | None = None,
+        replace: str | None = None,
     ) -> Trial:
         """Record the result of an open trial: its trajectory, its distance, or the reason of its failure.
 
@@ -124,38 +134,45 @@ class OperatedCampaign(CampaignResults):
             distance: the distance, if there is no recording.
             failed: the reason why there is no result.
             start_tolerance: replaces the start tolerance of the validation.
+            replace: why this result replaces one that was told before, such as "wrong file". The history of the store
+                keeps the earlier result with its trajectory.
 
         Raises:
-            InputError: if not exactly one result is given, if the trial is not open, or if the trajectory belongs to
+            InputError: if not exactly one result is given, if the trial is not open (with ``replace``: if its result
+                was not told by a person), or if the trajectory belongs to
                 another task.
             ExecutionError: if the trajectory is not a complete execution of the task; the trial stays open.
             DistanceError: if the distance function gives no usable number; the execution is stored.
         """
         recorder = self._recorder
         recorder.refresh()
-        trial = recorder.open_trial(opened.number if isinstance(opened, OpenTrial) else int(opened))
+        if replace is not None and not replace.strip():
+            raise InputError('replace needs a reason, such as "wrong file".')
+        known = recorder.open_trial if replace is None else recorder.told_trial
+        trial = known(opened.number if isinstance(opened, OpenTrial) else opened)
         if isinstance(opened, OpenTrial) and not np.array_equal(opened.trial.unit_point, trial.unit_point):
             raise InputError(f"the open trial {opened.number} belongs to another campaign.")
         result = TrialResult(trajectory, distance, failed)
         with recorder.not_executing(trial):
-            trial = recorder.open_trial(trial.number)
+            trial = known(trial.number)
             if result.failed is not None:
-                return recorder.fail(trial, result.failed)
+                return recorder.fail(trial, result.failed, replacing=replace)
             if result.distance is not None:
-                return recorder.complete(trial, measurement_of(result.distance))
+                return recorder.complete(trial, measurement_of(result.distance), replacing=replace)
             plan = opened.plan if isinstance(opened, OpenTrial) else recorder.plan(trial)
             measurement = self.validation.accept(plan, result.trajectory, start_tolerance)
-            return recorder.complete(trial, measurement, result.trajectory)
+            return recorder.complete(trial, measurement, result.trajectory, replacing=replace)
 
+    @checked
     def add(
         self,
         parameters: Mapping[str, Any],
         trajectory: Trajectory | None = None,
         *,
-        distance: float | None = None,
+        distance: NonNegativeFloat | None = None,
         failed: str | None = None,
-        start_tolerance: float | None = None,
-        wait: float = 0.0,
+        start_tolerance: NonNegativeFloat | None = None,
+        wait: NonNegativeFloat = 0.0,
     ) -> Trial | None:
         """Record an earlier execution as a trial with the origin manual. It counts as an execution.
 
@@ -168,11 +185,11 @@ class OperatedCampaign(CampaignResults):
         """
         point = self.validation.space.point(parameters)
         result = TrialResult(trajectory, distance, failed)
-        return self.add_known(check_known(self.validation, point, result, start_tolerance), wait)
+        return self.add_known([check_known(self.validation, point, result, start_tolerance)], wait)[0]
 
-    def add_known(self, known: KnownExecution, wait: float = 0.0) -> Trial | None:
-        """Record an execution after ``campaign.known.check_known``; return None if it is already in the store."""
-        return self._recorder.add(known, wait)
+    def add_known(self, executions: Sequence[KnownExecution], wait: NonNegativeFloat = 0.0) -> list[Trial | None]:
+        """Record executions after ``campaign.known.check_known``; None if one is already in the store."""
+        return self._recorder.add(executions, wait)
 
     def refresh(self) -> None:
         """Read the trials again if another process has changed the store.
@@ -181,6 +198,3 @@ class OperatedCampaign(CampaignResults):
             StoreMismatchError: if the store now belongs to another experiment.
         """
         self._recorder.refresh()
-
-    def _unit_point(self, parameters: Mapping[str, Any]) -> Array:
-        return self.validation.space.to_unit(self.validation.space.point(parameters))

@@ -12,21 +12,26 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
-from ctxval._util.representation import call
-from ctxval._util.texts import shortened
+from ctxval._util.texts import enumerated, shortened
+from ctxval.campaign.choices import Choice
 from ctxval.campaign.costs import costs_of
 from ctxval.campaign.dynamics import AUDIT, PREDICTION
 from ctxval.campaign.history import predict_from
-from ctxval.core.trial import Trial
+from ctxval.campaign.steadiness import Steadiness
+from ctxval.core.trial import CONVERGED, UNSTEADY, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
+from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.prediction import DistancePredictor
-from ctxval.searches import BaseSearch
+from ctxval.searches import BaseSearch, SequentialSearch
 from ctxval.storage.store import Store
+
+_MOVED = 0x6D6F
+"""Identifies the random stream of moves away from tasks that are not steady."""
 
 
 class Proposals:
-    """Asks the search of a campaign for points.
+    """Asks the search of a campaign for points, and tests points before they are executed.
 
     Args:
         validation: the map p -> d(p).
@@ -37,24 +42,32 @@ class Proposals:
     def __init__(self, validation: Validation, search: BaseSearch, store: Store) -> None:
         self._validation, self._search, self._store = validation, search, store
         self._predictor = DistancePredictor(validation)
+        self._planner = LoopPlanner(validation)
 
-    def next(self, trials: Sequence[Trial]) -> tuple[Array, dict[str, Any] | None]:
-        """Return the search's next point ``(d,)`` and its note.
-
-        Args:
-            trials: all trials, as the search knows them.
-
-        Raises:
-            InputError: if the search returns no point of the unit cube, or a note that JSON does not have.
-        """
+    def next(self, trials: Sequence[Trial], rejected: int = 0) -> tuple[Array, dict[str, Any] | None]:
+        """Return the search's next point ``(d,)`` and its note."""
+        steady = Steadiness(self._planner)
         if not self._search.uses_prediction:
-            return self._asked(), _plain_note(self._search.note())
+            return self._executable(self._asked(), trials, steady, rejected)
         with stage("choosing a task", unit="designs"):
             prediction = predict_from(self._predictor, self._store, trials)
             if prediction is not None:
-                prediction = replace(prediction, costs=partial(costs_of, prediction, self._validation, trials))
+                expected = prediction.expected
+                steady = Steadiness(self._planner, lambda points: expected(points)[0])
+                costs = partial(costs_of, prediction, self._validation, trials)
+                prediction = replace(prediction, costs=costs, steady=steady)
             self._search.use_prediction(prediction)
-            return self._asked(), _plain_note(self._search.note())
+            return self._executable(self._asked(), trials, steady, rejected)
+
+    def tested(self, choice: Choice, trials: Sequence[Trial]) -> tuple[Array, dict[str, Any] | None]:
+        """Return the point ``(d,)`` of a choice that another part has made, rounded and tested, and its note."""
+        assert choice.unit_point is not None
+        if choice.parameters is not None or choice.origin == "iid":
+            return choice.unit_point, choice.note
+        steady, point, rejected = Steadiness(self._planner), choice.unit_point, choice.rejected
+        if rejected is None:
+            point, rejected = self._steady(point, trials, steady), steady.rejected
+        return self._validation.space.rounded(point), _with_rejected(choice.note, rejected)
 
     def _asked(self) -> Array:
         asked, dimension = self._search.ask(1), self._validation.space.dimension
@@ -69,18 +82,39 @@ class Proposals:
             )
         return np.asarray(point[0])
 
-    def __repr__(self) -> str:
-        return call(self, self._search)
+    def _executable(
+        self, point: Array, trials: Sequence[Trial], steady: Steadiness, rejected: int
+    ) -> tuple[Array, dict[str, Any] | None]:
+        """Return a proposed point, tested and rounded, and its note; tell the search which point it has become.
+
+        The point of an earlier trial stays, and independent draws are only rounded.
+        """
+        note = _plain_note(self._search.note())
+        if any(np.array_equal(point, trial.unit_point) for trial in trials):
+            return point, note
+        if not self._search.iid:
+            point = self._steady(point, trials, steady)
+        rounded = self._validation.space.rounded(point)
+        if isinstance(self._search, SequentialSearch):
+            self._search.amend(rounded)
+        return rounded, _with_rejected(note, rejected + steady.rejected)
+
+    def _steady(self, point: Array, trials: Sequence[Trial], steady: Steadiness) -> Array:
+        """Return a steady point: the given one, or one next to it."""
+        if self._validation.is_on_model:
+            return point  # no distance depends on how a controller would react to errors of M
+        return point if steady(point) else steady.moved(point, np.random.default_rng([len(trials), _MOVED]))
+
+
+def _with_rejected(note: dict[str, Any] | None, rejected: int) -> dict[str, Any] | None:
+    return {**(note or {}), UNSTEADY: rejected} if rejected else note
 
 
 def _plain_note(note: Any) -> dict[str, Any] | None:
-    """Return a search's note, which is stored as JSON.
-
-    Raises:
-        InputError: if it is not a dictionary of plain values, or has a key of the campaign's own.
-    """
-    if isinstance(note, dict) and {PREDICTION, AUDIT} & set(note):
-        raise InputError(f"the note of a search must not have the keys {PREDICTION!r} and {AUDIT!r}.")
+    """Return a search's note, which is stored as JSON."""
+    reserved = (PREDICTION, AUDIT, CONVERGED, UNSTEADY)
+    if isinstance(note, dict) and set(reserved) & set(note):
+        raise InputError(f"the note of a search must not have the keys {enumerated(reserved, 10)}.")
     try:
         if note is None or (isinstance(note, dict) and json.dumps(note, allow_nan=False)):
             return note

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.checked import PositiveFloat, checked
 from ctxval._util.progress import stage
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display
@@ -15,6 +16,7 @@ from ctxval.campaign.learned import LearnedFromTrials
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import RESOLUTION, CertificateOptions, Provenance, Verdict, judge
 from ctxval.certificates.options import CONFIDENCE
+from ctxval.core.preflight import StartOffset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
@@ -81,6 +83,10 @@ class CampaignResults:
         """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored."""
         return self.store.trajectory(trial.number, "model"), self.store.trajectory(trial.number, "system")
 
+    def start_offset(self, trial: Trial) -> StartOffset | None:
+        """Return how far an execution started from the initial state of its task; None if it was not recorded."""
+        return self._recorder.start_offset(trial)
+
     @property
     def worst(self) -> Trial | None:
         """The completed trial with the largest distance."""
@@ -95,9 +101,10 @@ class CampaignResults:
         """
         return self._recorder.search.estimate(*self._distances())
 
+    @checked
     def verdict(
         self,
-        threshold: float,
+        threshold: PositiveFloat,
         confidence: float = CONFIDENCE,
         *,
         stochastic: bool = False,
@@ -130,9 +137,12 @@ class CampaignResults:
     @property
     def provenance(self) -> Provenance:
         """What a certificate needs besides the trials: the task space, the search, changes, and what M predicts."""
-        known = Provenance.of(self.store.description(), self.store.history())
+        with self.store.snapshot():
+            known = Provenance.of(self.store.description(), self.store.history())
         learned = LearnedFromTrials(self.validation, self.store, self.trials, self._recorder.dynamics)
-        return replace(known, space=self.validation.space, learned=learned)
+        offsets = [(self.start_offset(trial), trial.number) for trial in self.completed]
+        start = max(((o.size, f"{o.text} (trial {n})") for o, n in offsets if o is not None), default=None)
+        return replace(known, space=self.validation.space, learned=learned, start=start)
 
     def surrogate(self) -> Surrogate:
         """Return the Gaussian process of the distance over the task space, for every search.

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.progress import advance, stage
 from ctxval._util.texts import text_of
 from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.dynamics import CampaignDynamics
@@ -21,13 +23,15 @@ from ctxval.campaign.independent_draws import IndependentDraws
 from ctxval.campaign.known import KnownExecution, is_execution_of
 from ctxval.campaign.proposals import Proposals
 from ctxval.certificates import PLANNED
+from ctxval.core.controller import converged_of
 from ctxval.core.plan import Measurement, Plan
+from ctxval.core.preflight import StartOffset, start_offset, try_distance
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Origin, State, Trial
+from ctxval.core.trial import CONVERGED, Origin, State, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError, StoreError
 from ctxval.models import Refined
-from ctxval.searches import BaseSearch, Search
+from ctxval.searches import BaseSearch, Search, SequentialSearch
 from ctxval.storage.store import Store
 
 
@@ -64,6 +68,7 @@ class TrialRecorder:
         self._goals_of_model = GoalsOfModel(validation)
         self._proposals = Proposals(validation, self.search, store)
         self._seed = seed
+        self._distance_tried = False
         self._executing: set[int] = set()
         self.replay()
 
@@ -91,20 +96,31 @@ class TrialRecorder:
         return next((trial for trial in begun if trial.number not in self._executing), None)
 
     def open_trial(self, number: int) -> Trial:
-        """Return the open trial of this number.
-
-        Raises:
-            InputError: if there is no such trial, or it is not open.
-        """
+        """Return the open trial of this number."""
         if not 0 <= number < len(self._trials):
             raise InputError(f"there is no trial {number}; the campaign has {len(self._trials)}.")
         if self._trials[number].state != "open":
             raise InputError(f"trial {number} is {self._trials[number].state}, so nothing more can be told of it.")
         return self._trials[number]
 
+    def told_trial(self, number: int) -> Trial:
+        """Return the trial of this number, whose result a person has told."""
+        if not 0 <= number < len(self._trials):
+            raise InputError(f"there is no trial {number}; the campaign has {len(self._trials)}.")
+        trial = self._trials[number]
+        if trial.state == "open" or trial.attempts or not trial.executed:
+            raise InputError(f"trial {number} has no result that was told by a person, so none can be replaced.")
+        return trial
+
     def plan(self, trial: Trial) -> Plan:
         """Return the plan of a trial, as :meth:`ctxval.Validation.plan` makes it."""
-        return self.validation.plan(self.validation.space.from_unit(trial.unit_point))
+        return self.validation.plan(self.validation.space.point(trial.parameters))
+
+    def start_offset(self, trial: Trial) -> StartOffset | None:
+        """Return how far an execution started from the initial state of its task; None if it was not recorded."""
+        executed = self.store.trajectories([trial.number], "system").get(trial.number)
+        point = self.validation.space.point(trial.parameters)
+        return None if executed is None else start_offset(self.validation, point, executed)
 
     def draw(self) -> Array:
         """Return the next independent draw of a task, a point of the unit cube ``(d,)``."""
@@ -114,11 +130,12 @@ class TrialRecorder:
 
     def replay(self) -> None:
         """Read the trials from the store, reset the search and tell it all trials."""
-        self._trials = self.store.trials()
-        self._changes = self.store.signature()[2]
+        with self.store.snapshot():
+            self._trials = self.store.trials()
+            self._changes = self.store.signature()[2]
         # A refined model has learned from the tasks of the model before: the same initial tasks would not test it.
         of_model = self.search.iid or isinstance(self.validation.model, Refined)
-        seed = self.draws.search_seed(self._trials) if of_model else self._seed
+        seed = self.draws.search_seed() if of_model else self._seed
         self.search.reset(self.validation.space.dimension, seed)
         history = history_of(self._trials)
         if history:
@@ -127,11 +144,7 @@ class TrialRecorder:
             self.search.remember([trial.note for trial in history])
 
     def refresh(self) -> None:
-        """Read the trials again if other processes have changed the store.
-
-        Raises:
-            StoreMismatchError: if the store now belongs to another experiment.
-        """
+        """Read the trials again if other processes have changed the store."""
         own = (len(self._trials), sum(trial.state == "open" for trial in self._trials), self._changes)
         stored = self.store.signature()
         if stored[2] != self._changes:
@@ -141,7 +154,7 @@ class TrialRecorder:
 
     def redefine(self, validation: Validation, description: dict[str, Any]) -> None:
         """Continue with another distance, after its values were stored."""
-        self.validation, self.description = validation, description
+        self.validation, self.description, self._distance_tried = validation, description, False
         elsewhere = self.dynamics.elsewhere
         self.dynamics = CampaignDynamics(validation, self.store, self._seed, description)
         self.dynamics.elsewhere = elsewhere
@@ -151,19 +164,11 @@ class TrialRecorder:
     # Opening
 
     def open(self, choice: Choice) -> OpenTrial:
-        """Store a new trial that people execute.
-
-        Raises:
-            ModelError, DesignError: if the task cannot be planned; the trial is stored as failed.
-        """
+        """Store a new trial that people execute."""
         return self._open(choice, attempts=0)
 
     def start(self, chosen: Choice | Trial) -> OpenTrial:
-        """Store that an execution starts: the first one of a new trial, or a repetition of an interrupted trial.
-
-        Raises:
-            ModelError, DesignError: if the task cannot be planned; the trial is stored as failed without an execution.
-        """
+        """Store that an execution starts: the first one of a new trial, or a repetition of an interrupted trial."""
         if isinstance(chosen, Choice):
             return self._open(chosen, attempts=1)
         try:
@@ -198,6 +203,14 @@ class TrialRecorder:
             failed = replace(trial, state="failed", failure=text_of(error), attempts=0)
             self.store.record_failed_plan(failed, changes=self._changes)
             raise
+        if not self._distance_tried:
+            try_distance(self.validation, plan)
+            self._distance_tried = True
+        if not self._trials and self.store.path is not None:
+            self.draws.of_model()  # by which other stores of the same model are found
+        with suppress(InputError):  # an attribute of a user's controller that has this name and is something else
+            if (converged := converged_of(plan.controller)) is not None:
+                trial = replace(trial, note={**(trial.note or {}), CONVERGED: bool(converged)})
         self.store.open_trial(trial, plan.model_trajectory, changes=self._changes)
         self._trials.append(trial)
         if attempts:
@@ -213,18 +226,22 @@ class TrialRecorder:
             choice = replace(choice, unit_point=self.draw(), origin="iid")
         if choice.unit_point is None:
             origin = self._origin()
-            unit_point, note = self._proposals.next(self._trials)
+            if not isinstance(self.search, SequentialSearch):
+                self.replay()  # such a search may still know the point that it proposed, and not the rounded one
+            unit_point, note = self._proposals.next(self._trials, choice.rejected or 0)
             note = {**(note or {}), **choice.note} if choice.note else note
         else:
-            unit_point, origin, note = choice.unit_point, choice.origin, choice.note
+            origin = choice.origin
+            unit_point, note = self._proposals.tested(choice, self._trials)
             self.search.tell(unit_point[None], [np.nan])
         if origin == "iid" and choice.planned_draws is not None:
             note = {**(note or {}), PLANNED: choice.planned_draws}
         if self.predicts and (predicted := self.dynamics.predict(self._trials, unit_point)) is not None:
             note = {**(note or {}), **self.dynamics.to_note(predicted)}
-        parameters = self.validation.space.describe_point(self.validation.space.from_unit(unit_point))
-        number = len(self._trials)
-        return Trial(number, origin, "open", unit_point, parameters, attempts, note=note, because=choice.because)
+        space, number = self.validation.space, len(self._trials)
+        same = (trial.parameters for trial in self._trials if np.array_equal(trial.unit_point, unit_point))
+        parameters = choice.parameters or next(same, None) or space.describe_point(space.from_unit(unit_point))
+        return Trial(number, origin, "open", unit_point, dict(parameters), attempts, note=note, because=choice.because)
 
     def _origin(self) -> Origin:
         if self.search.iid:
@@ -239,13 +256,9 @@ class TrialRecorder:
         measurement: Measurement,
         trajectory: Trajectory | None = None,
         seconds: float | None = None,
+        replacing: str | None = None,
     ) -> Trial:
-        """Store an execution with its distance, or as unmeasured; return the trial in its final state.
-
-        Raises:
-            DistanceError: if the distance gave no usable number; the execution is stored as unmeasured.
-            StoreError, InputError: if the store cannot record it; the message names the file that keeps the result.
-        """
+        """Store an execution with its distance, or as unmeasured; return the trial in its final state."""
         ended = replace(
             trial,
             state="completed" if measurement.unusable is None else "unmeasured",
@@ -254,7 +267,7 @@ class TrialRecorder:
             failure=measurement.unusable,
             seconds=seconds,
         )
-        self._close(ended, trajectory)
+        self._close(ended, trajectory, replacing)
         if measurement.unusable is not None:
             raise DistanceError(
                 f"{measurement.unusable} The execution of trial {ended.number} is stored: correct the distance, and "
@@ -262,17 +275,27 @@ class TrialRecorder:
             )
         return ended
 
-    def fail(self, trial: Trial, reason: object, *, seconds: float | None = None, executed: bool = True) -> Trial:
-        """Store the reason why a trial failed; return the failed trial.
-
-        Raises:
-            StoreError, InputError: if the store cannot record it; the message names the file that keeps the result.
-        """
-        ended = replace(trial, state="failed", executed=executed, failure=text_of(reason), seconds=seconds)
-        self._close(ended, None)
+    def fail(
+        self,
+        trial: Trial,
+        reason: object,
+        *,
+        seconds: float | None = None,
+        executed: bool = True,
+        replacing: str | None = None,
+    ) -> Trial:
+        """Store the reason why a trial failed; return the failed trial."""
+        failure = text_of(reason)
+        ended = replace(trial, state="failed", executed=executed, distance=None, failure=failure, seconds=seconds)
+        self._close(ended, None, replacing)
         return ended
 
-    def _close(self, ended: Trial, trajectory: Trajectory | None) -> None:
+    def _close(self, ended: Trial, trajectory: Trajectory | None, replacing: str | None = None) -> None:
+        """Store the result of an open trial, or of a trial whose result it replaces for a reason."""
+        if replacing is not None:
+            self.store.replace_result(self._trials[ended.number], ended, trajectory, replacing, changes=self._changes)
+            self.redefine(self.validation, self.description)
+            return
         try:
             self.store.close_trial(ended, trajectory, changes=self._changes)
         except (StoreError, InputError) as error:
@@ -286,32 +309,42 @@ class TrialRecorder:
         """End the executions of this process; the trials that are still open become interrupted ones."""
         self._executing.clear()
 
-    def add(self, known: KnownExecution, wait: float = 0.0) -> Trial | None:
-        """Store an earlier execution; return None if it is already in the store.
-
-        Args:
-            known: the execution.
-            wait: seconds to wait while another process is running the store.
-        """
-        with self.store.sole_writer(wait):
+    def add(self, executions: Sequence[KnownExecution], wait: float = 0.0) -> list[Trial | None]:
+        """Store earlier executions in one transaction; return their trials, None if one is already in the store."""
+        with self.store.sole_writer(wait), stage("importing", len(executions), "runs"):
             self.refresh()
-            if any(is_execution_of(trial, known) for trial in self._trials):
-                return None
-            state: State = "completed" if known.distance is not None else "unmeasured"
-            trial = Trial(
-                len(self._trials),
-                "manual",
-                state if known.failed is None else "failed",
-                known.unit_point,
-                self.validation.space.describe_point(known.plan.parameters.points),
-                executed=True,
-                distance=known.distance,
-                failure=known.failure,
-            )
-            self.store.record_known(trial, known.plan.model_trajectory, known.trajectory, changes=self._changes)
-            self._trials.append(trial)
-            self.search.tell(known.unit_point[None], [np.nan if known.distance is None else known.distance])
-        return trial
+            known = defaultdict[bytes, list[Trial]](list)
+            for trial in self._trials:
+                known[(trial.unit_point + 0.0).tobytes()].append(trial)
+            added = list[Trial | None]()
+            new = list[tuple[Trial, KnownExecution]]()
+            for one in executions:
+                same = known[(one.unit_point + 0.0).tobytes()]
+                if any(is_execution_of(trial, one) for trial in same):
+                    added.append(None)
+                    continue
+                state: State = "completed" if one.distance is not None else "unmeasured"
+                trial = Trial(
+                    len(self._trials) + len(new),
+                    "manual",
+                    state if one.failed is None else "failed",
+                    one.unit_point,
+                    self.validation.space.describe_point(one.plan.parameters.points),
+                    executed=True,
+                    distance=one.distance,
+                    failure=one.failure,
+                )
+                same.append(trial)
+                added.append(trial)
+                new.append((trial, one))
+                advance(1)
+            if new:
+                stored = [(trial, one.plan.model_trajectory, one.trajectory) for trial, one in new]
+                self.store.record_known(stored, changes=self._changes)
+                self._trials += [trial for trial, _ in new]
+                values = [np.nan if trial.distance is None else trial.distance for trial, _ in new]
+                self.search.tell(np.array([trial.unit_point for trial, _ in new]), values)
+        return added
 
     @contextmanager
     def predicting(self, predicts: bool) -> Iterator[None]:
@@ -324,11 +357,7 @@ class TrialRecorder:
 
     @contextmanager
     def not_executing(self, trial: Trial) -> Iterator[None]:
-        """Refuse the result of a trial that a process is executing: that process records the result.
-
-        Raises:
-            InputError: if a process is executing the trial.
-        """
+        """Refuse the result of a trial that a process is executing: that process records the result."""
         refusal = (
             f"trial {trial.number} is being executed: its result cannot be recorded before the execution has ended."
         )

@@ -7,15 +7,15 @@ If no dynamics can be learned, or if most predictions fail, it is the posterior 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import record
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import AUDIT, NEAR
+from ctxval.campaign.steadiness import Steadiness
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
 from ctxval.certificates.anytime import AnytimeAudit
@@ -24,9 +24,10 @@ from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.dynamics_diagnostics import AUDITED, FEWEST, held, uncovered, untested, untried_parameter
 from ctxval.certificates.posterior import Posterior
-from ctxval.certificates.verdict import counterexample, require_threshold
+from ctxval.certificates.verdict import counterexample
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
+from ctxval.learning.closed_loops import LoopPlanner
 
 _FAILING = 6
 """Number of the last predictions, of which at least half must hold."""
@@ -59,8 +60,8 @@ class UntilDecided:
     audited: bool = False
 
     def __post_init__(self) -> None:
-        require_threshold(self.threshold)
         require_decisive(self.options)
+        self.options.kind.require_usable(self.options.confidence, self.budget)
 
     @property
     def predicts(self) -> bool:
@@ -87,9 +88,14 @@ class UntilDecided:
             return self._by_distance(trials)
         known = _points(trials, self._dimension)
         best = max((trial.distance or 0.0 for trial in trials), default=0.0)
-        point = next_task(evidence, known, best, self.threshold, self.options.confidence)
+        learned = self.recorder.dynamics.learned(trials)
+        if learned is None:
+            steady = Steadiness(LoopPlanner(self.recorder.validation))
+        else:  # its planner knows already whether designs take batches
+            steady = Steadiness(learned.study.planner, learned.expected)
+        point = next_task(evidence, known, best, self.threshold, self.options.confidence, steady)
         # The results decide when the campaign ends, so the number of independent draws is not planned.
-        return Choice(point, "covering", planned_draws=0)
+        return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     @property
     def _dimension(self) -> int:
@@ -127,7 +133,8 @@ class UntilDecided:
         # Every second task has coordinates at bounds, where dynamics are most often other than within.
         point = self.recorder.draw()
         snapped = np.random.default_rng([done, len(self.recorder.trials)]).random(len(point)) < 0.5 * (done % 2)
-        return Choice(np.where(snapped, np.round(point), point), "covering", planned_draws=0, note={AUDIT: done + 1})
+        task, note = np.where(snapped, np.round(point), point), {AUDIT: done + 1}
+        return Choice(task, "covering", planned_draws=0, note=note, rejected=0)
 
     def _by_draws(self, trials: Sequence[Trial], kind: AnytimeAudit) -> Choice | None:
         """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
@@ -147,16 +154,9 @@ class UntilDecided:
         now = rule.decide(trials, self.budget - self.recorder.executions)
         return None if now.decided else Choice(now.next_point, "covering", planned_draws=0)
 
-    def __repr__(self) -> str:
-        return record(self)
-
 
 def require_decisive(options: CertificateOptions) -> None:
-    """Check that executions can be chosen for a certificate.
-
-    Raises:
-        InputError: if they cannot, because of its kind, or because an anytime audit may leave out no volume.
-    """
+    """Check that executions can be chosen for a certificate."""
     kind = options.kind
     if not isinstance(kind, Automatic | Dynamics | Posterior | AnytimeAudit):
         raise InputError(
@@ -167,7 +167,12 @@ def require_decisive(options: CertificateOptions) -> None:
 
 
 def next_task(
-    evidence: DynamicsEvidence, known: Array, best: float, threshold: float, confidence: float
+    evidence: DynamicsEvidence,
+    known: Array,
+    best: float,
+    threshold: float,
+    confidence: float,
+    steady: Callable[[Array], bool] = lambda point: True,
 ) -> Array | None:
     """Return the task to execute next, a point ``(d,)``; None if the search is to choose it.
 
@@ -182,6 +187,7 @@ def next_task(
         best: the largest executed distance.
         threshold: tau, in the distance's units.
         confidence: the probability with which the bound holds.
+        steady: whether a task may be executed, because its distance is that of its neighbours.
     """
     order = np.argsort(evidence.maxima, kind="stable")
     rank = evidence.rank(confidence)
@@ -202,15 +208,9 @@ def next_task(
         candidates = [largest, highest, farthest]
     else:
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]
-    return _first_new(np.concatenate(candidates), known)
-
-
-def _first_new(points: Array, known: Array) -> Array | None:
-    """Return the first of some points that is not near a known one; None if all are."""
-    for point in points:
-        if not len(known) or np.abs(known - point).max(axis=1).min() > NEAR:
-            return np.asarray(point)
-    return None
+    points = np.concatenate(candidates)
+    new = (point for point in points if not len(known) or np.abs(known - point).max(axis=1).min() > NEAR)
+    return next(filter(steady, new), None)
 
 
 def _points(trials: Sequence[Trial], dimension: int) -> Array:

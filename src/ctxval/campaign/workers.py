@@ -85,12 +85,7 @@ class WorkerPool(ABC):
 
     @abstractmethod
     def start(self, number: int, plan: Plan) -> None:
-        """Start the execution of a trial on a free worker.
-
-        Raises:
-            InputError: if the system or the controller cannot be sent to another process.
-            CampaignError: if there is no worker any more.
-        """
+        """Start the execution of a trial on a free worker."""
 
     @abstractmethod
     def wait(self) -> tuple[int, ExecutionResult]:
@@ -337,12 +332,7 @@ class ExecutorPool(WorkerPool):
             self._await_scheduler()
 
     def _await_scheduler(self) -> None:
-        """Wait while a Dask client searches for a scheduler that it has lost.
-
-        Raises:
-            CampaignError: if the client gives up. The trials stay open, so the campaign can continue with another
-                scheduler.
-        """
+        """Wait while a Dask client searches for a scheduler that it has lost."""
         while self._status() == "connecting":
             time.sleep(_POLL_INTERVAL)
         if self._status() == "closed":
@@ -379,11 +369,7 @@ def worker_pool(
     executor: cf.Executor | None = None,
     timeout: float | None = None,
 ) -> WorkerPool | None:
-    """Return a pool of workers; None if the executions run one after the other in this process.
-
-    Raises:
-        InputError: if a value cannot be used.
-    """
+    """Return a pool of workers; None if the executions run one after the other in this process."""
     if workers is not None and (not isinstance(workers, int) or isinstance(workers, bool) or workers < 1):
         raise InputError(f"workers must be a positive integer, got {workers!r}.")
     if timeout is not None and not (isinstance(timeout, int | float) and 0 < timeout < float("inf")):

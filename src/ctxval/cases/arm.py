@@ -121,11 +121,7 @@ def record(system: systems.MuJoCo, settings: Settings, seed: int) -> Transitions
 
 
 def learn(model: str, data: Transitions, settings: Settings, seed: int) -> models.Model:
-    """Return one of the three models, learned from recorded transitions.
-
-    Raises:
-        UnknownNameError: if there is no such model.
-    """
+    """Return one of the three models, learned from recorded transitions."""
     if model == "fnn":
         return models.FeedforwardReLU.fit(
             data, (8, 8), seed=seed, restarts=settings.restarts, iterations=settings.training
@@ -138,11 +134,7 @@ def learn(model: str, data: Transitions, settings: Settings, seed: int) -> model
 
 
 def experiment(seed: int = 0, model: str = "fnn", settings: Settings | None = None) -> Experiment:
-    """Return the case with one of the three models; the seed draws the data, which are the same for all models.
-
-    Raises:
-        UnknownNameError: if there is no such model.
-    """
+    """Return the case with one of the three models; the seed draws the data, which are the same for all models."""
     settings = Settings() if settings is None else settings
     system = arm(settings)
     rest = system.state([0.0, 0.0])  # extended along y
@@ -200,11 +192,7 @@ class Aspects:
 
 
 def aspects(seed: int = 0, model: str = "fnn", settings: Settings | None = None, *, per_axis: int = 21) -> Aspects:
-    """Return the final distances of model and arm from a grid of targets. S is executed for each target.
-
-    Raises:
-        UnknownNameError: if there is no such model.
-    """
+    """Return the final distances of model and arm from a grid of targets. S is executed for each target."""
     validation = experiment(seed, model, settings).validation
     targets = validation.space.grid(per_axis)
     task = validation.task(validation.space.parameters(targets))

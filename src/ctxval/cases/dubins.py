@@ -49,7 +49,7 @@ of the distance between the positions alone."""
 
 @dataclass(frozen=True)
 class Dubins:
-    """A car that cannot slip sideways: ``y' = v cos phi``, ``z' = v sin phi``, ``phi' = w`` (eq. 13)."""
+    """A car that cannot slip sideways: ``y' = v cos phi``, ``z' = v sin phi``, ``phi' = w`` (eq. 12)."""
 
     def derivative(self, x: Array, u: Array) -> Array:
         """Return (y', z', phi') in m/s and rad/s for states (y, z, phi) ``(..., 3)`` and inputs (v, w) ``(..., 2)``."""
@@ -64,9 +64,9 @@ class Settings:
 
     The paper gives the horizon, the start and the task space. It reports a largest average deviation of 3.5 m, found
     in 100 executions, and that 500 random tasks stay below 2 to 3 m. With the root mean square as the average, this
-    case agrees in the median over seeds: d* is 3.6 m, of which GP-UCB finds 3.2 m and random tasks 1.8 m. The printed
-    formula gives a tenth of these values. The mean deviation of the position is at most 1.4 m. A mean deviation of
-    3.5 m, three times the mean height of the waves, would need a closed loop on S that is nearly unstable.
+    case agrees in the median over seeds (docs/reproduction.md). The printed formula gives a tenth of these values. The
+    mean deviation of the position is smaller: 3.5 m, several times the mean height of the waves, would need a closed
+    loop on S that is nearly unstable.
 
     Attributes:
         horizon: steps, the paper's H.
@@ -143,17 +143,7 @@ def reference(end: Array, amplitudes: Array, horizon: int) -> Array:
 def experiment(
     seed: int = 0, variant: str = "paper", distance: str | None = None, settings: Settings | None = None
 ) -> Experiment:
-    """Return the case; the seed draws the data that the linear model is learned from.
-
-    Args:
-        seed: seed of the data, not negative.
-        variant: a name of ``VARIANTS``.
-        distance: a name of ``DISTANCES``; by default the distance of the variant. Other distances have no threshold.
-        settings: settings that replace those of the variant.
-
-    Raises:
-        UnknownNameError: if there is no such variant or distance.
-    """
+    """Return the case; the seed draws the data that the linear model is learned from."""
     if settings is None:
         if variant not in VARIANTS:
             raise UnknownNameError.among("variant of the case 'dubins'", variant, VARIANTS)

@@ -126,9 +126,6 @@ def experiment(seed: int = 0, dim: int = 4, settings: Settings | None = None) ->
     """Return the case with n = ``dim`` states, whose task space has 2 n dimensions.
 
     The seed draws K, then independently A and B of the system and A and B of the model.
-
-    Raises:
-        InputError: if dim is not an integer from 1 to 10.
     """
     if not isinstance(dim, int | np.integer) or isinstance(dim, bool) or dim not in DIMENSIONS:
         raise InputError(f"dim, the number of states, must be an integer from 1 to 10, got {dim!r}.")

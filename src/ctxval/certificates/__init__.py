@@ -7,14 +7,13 @@ from ctxval.certificates.assessment import Assessment, assess
 from ctxval.certificates.audit import Audit, certify_audit
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.base import Certificate, CertificateKind
-from ctxval.certificates.convergence import Convergence, TheoremConstants, certify_convergence, rate
+from ctxval.certificates.convergence import is_validated, rate
 from ctxval.certificates.covering import (
     RESOLUTION,
     bare_corners,
     covering,
     farthest_task,
     most_contested,
-    require_resolution,
 )
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.dynamics_evidence import (
@@ -63,7 +62,6 @@ __all__ = [
     "CertificateKind",
     "CertificateOptions",
     "CheckedPrediction",
-    "Convergence",
     "Diagnosis",
     "Dynamics",
     "DynamicsEvidence",
@@ -83,7 +81,6 @@ __all__ = [
     "StateInputGap",
     "StoppingDecision",
     "StoppingRule",
-    "TheoremConstants",
     "UntriedParameter",
     "Verdict",
     "assess",
@@ -91,7 +88,6 @@ __all__ = [
     "certify",
     "certify_anytime",
     "certify_audit",
-    "certify_convergence",
     "certify_dynamics",
     "certify_mean",
     "certify_posterior",
@@ -103,13 +99,13 @@ __all__ = [
     "farthest_task",
     "forecast",
     "instantaneous_bound",
+    "is_validated",
     "judge",
     "judge_by",
     "most_contested",
     "rate",
     "require_learned",
     "require_possible",
-    "require_resolution",
     "require_use",
     "samples_needed",
     "settle_maxima",

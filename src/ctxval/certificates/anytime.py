@@ -25,9 +25,10 @@ from scipy.optimize import brentq
 from scipy.special import betainc, betaln
 
 from ctxval._util.arrays import Array, Mask
+from ctxval._util.checked import PositiveFloat, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import at_most, drawn_from, of_tasks, require_probability
+from ctxval.certificates.bounds import at_most, drawn_from, of_tasks
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.scenario import ABOUT_DRAWS, rests_on_draws
@@ -70,7 +71,8 @@ class AnytimeAudit(CertificateKind):
         return rests_on_draws(certificate)
 
 
-def certify_anytime(sample: Sample, threshold: float, confidence: float = 0.95) -> Certificate:
+@checked
+def certify_anytime(sample: Sample, threshold: PositiveFloat, confidence: Probability = 0.95) -> Certificate:
     """Bound the volume of the tasks above a threshold, by the independent draws among the trials.
 
     A draw without a distance counts as a violation, so that failures cannot help.
@@ -83,7 +85,7 @@ def certify_anytime(sample: Sample, threshold: float, confidence: float = 0.95) 
     Raises:
         CertificateError: there is no independent draw, or the confidence is not a probability.
     """
-    beta = 1 - require_probability("confidence", confidence)
+    beta = 1 - confidence
     drawn = sample.only("iid")
     if not len(drawn):
         raise CertificateError("an anytime audit needs independent draws of tasks, and there is none; use --audit N.")

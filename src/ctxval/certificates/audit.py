@@ -10,9 +10,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from ctxval._util.checked import Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import at_most, of_tasks, require_probability
+from ctxval.certificates.bounds import at_most, of_tasks
 from ctxval.certificates.draws import countable_draws, draws_left_out, how_drawn, not_counted
 from ctxval.certificates.sample import Sample, advice_to_remeasure
 from ctxval.certificates.scenario import ABOUT_DRAWS, rests_on_draws, violations, volume_bound
@@ -43,7 +44,8 @@ class Audit(CertificateKind):
         return draws_left_out(certificate)
 
 
-def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
+@checked
+def certify_audit(sample: Sample, confidence: Probability = 0.95) -> Certificate:
     """Return a bound on the volume of the tasks whose distance exceeds the largest one known, from independent draws.
 
     Let h be the largest of N independent distances. The volume of tasks above h is bounded for any distance function.
@@ -59,7 +61,7 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
         CertificateError: if there is no independent draw, if the number of draws depended on their distances, or if
             the execution of a draw failed.
     """
-    beta = 1 - require_probability("confidence", confidence)
+    beta = 1 - confidence
     drawn = countable_draws(sample, "an audit")
     _require_distances(drawn)
     volume, h = volume_bound(len(drawn), 0, beta), sample.best
@@ -88,11 +90,7 @@ def certify_audit(sample: Sample, confidence: float = 0.95) -> Certificate:
 
 
 def _require_distances(drawn: Sample) -> None:
-    """Refuse draws without a distance.
-
-    Raises:
-        CertificateError: if there is one.
-    """
+    """Refuse draws without a distance."""
     if drawn.failed:
         raise CertificateError(
             f"{violations(drawn)}; to audit the other tasks, start a new store whose task space excludes these tasks."

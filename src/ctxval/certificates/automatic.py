@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from ctxval._util.checked import PositiveFloat
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION
@@ -29,20 +30,13 @@ class Automatic(CertificateKind):
 
     Attributes:
         stochastic, resolution: as for the posterior bound.
-
-    Raises:
-        CertificateError: if the resolution is not positive.
-        InputError: if an option has another type.
     """
 
     name: ClassVar[str] = "auto"
     needs_model: ClassVar[bool] = True
 
     stochastic: bool = False
-    resolution: float = RESOLUTION
-
-    def __post_init__(self) -> None:
-        self.posterior  # noqa: B018 (it checks the options)
+    resolution: PositiveFloat = RESOLUTION
 
     @property
     def posterior(self) -> Posterior:

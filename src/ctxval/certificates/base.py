@@ -197,6 +197,17 @@ class CertificateKind(ABC):
             CertificateError: if the certificate would be refused whatever the distances of the draws are.
         """
 
+    def require_usable(self, confidence: float, executions: int) -> None:  # noqa: B027 (most kinds always are)
+        """Check that this certificate can be computed, before the executions are paid for.
+
+        Args:
+            confidence: the probability with which the statement must hold.
+            executions: the planned number of trials.
+
+        Raises:
+            CertificateError: if it would be refused whatever the distances are.
+        """
+
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
         """Return what a validation by a certificate rests on: each entry completes a sentence "It rests on ...".

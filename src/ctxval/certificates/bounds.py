@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctxval.errors import CertificateError, InputError
-
 ERRORS = 2.0
 """Number of its standard errors by which a bound from random draws must stay below a threshold."""
 
@@ -57,17 +55,6 @@ def drawn_from(distribution: str | None) -> str:
     return f"follow the stated distribution of tasks ({distribution})"
 
 
-def require_probability(name: str, value: float) -> float:
-    """Return a probability, which must be strictly between 0 and 1.
-
-    Raises:
-        CertificateError: if the value is not strictly between 0 and 1.
-    """
-    if not 0 < value < 1:
-        raise CertificateError(f"{name} must be strictly between 0 and 1, got {value!r}.")
-    return float(value)
-
-
 def as_text(value: object) -> str:
     """Return a number, a list of numbers or a table of numbers as text; floats have four significant digits."""
     match value:
@@ -81,25 +68,3 @@ def as_text(value: object) -> str:
             return ", ".join(f"{name} {as_text(item)}" for name, item in value.items())
         case _:
             return str(value)
-
-
-def require_number(name: str, value: object) -> float:
-    """Return a real number.
-
-    Raises:
-        InputError: if it is not one.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise InputError(f"{name} must be a number, got {value!r}.")
-    return float(value)
-
-
-def require_count(name: str, value: object, least: int) -> int:
-    """Return an integer that is not below the least one allowed.
-
-    Raises:
-        CertificateError: if it is no integer, or too small.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise CertificateError(f"{name} must be an integer of at least {least}, got {value!r}.")
-    return int(value)

@@ -10,8 +10,6 @@ from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
 from ctxval._util.arrays import Array
-from ctxval.certificates.bounds import require_number
-from ctxval.errors import CertificateError
 
 RESOLUTION = 0.125
 """Default of the largest distance from a task to its nearest trial, in diagonals of the task space. Farther away the
@@ -26,17 +24,6 @@ near a corner tells little about it: no trial lies beyond, and d often rises ste
 
 _MOST_PARAMETERS = 4
 """Largest number of parameters for which corners must be executed, since there are 2^d of them."""
-
-
-def require_resolution(value: float) -> float:
-    """Return the resolution: the largest distance from a task to its nearest trial, in diagonals of the task space.
-
-    Raises:
-        CertificateError: if it is not a positive number.
-    """
-    if not 0 < require_number("the resolution", value) < float("inf"):
-        raise CertificateError(f"the resolution must be a positive number of diagonals, got {value!r}.")
-    return float(value)
 
 
 def resolved_volume(resolution: float, dimension: int) -> float:

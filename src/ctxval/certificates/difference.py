@@ -30,7 +30,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.representation import record
 from ctxval.certificates.bets import log_wealth_of_bets, weights_so_far
 
 _LARGEST = 0.9
@@ -96,9 +95,6 @@ class PairedDifferences:
             wealth = np.logaddexp(plain, powered) - np.log(2)
         return np.asarray(np.maximum.accumulate(np.maximum(wealth, 0.0), axis=-1))
 
-    def __repr__(self) -> str:
-        return record(self)
-
 
 @dataclass(frozen=True)
 class MeanDifference:
@@ -121,9 +117,6 @@ class MeanDifference:
     decided_after: int | None
     tasks: int
     variance_left: float | None
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 def mean_difference(differences: PairedDifferences, beta: float) -> MeanDifference:

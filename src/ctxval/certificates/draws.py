@@ -17,9 +17,6 @@ def countable_draws(sample: Sample, kind: str) -> Sample:
     Args:
         sample: trials of any origin.
         kind: the certificate, for messages, such as "an audit".
-
-    Raises:
-        CertificateError: if there are no such draws.
     """
     everything = sample.only("iid")
     if not len(everything):

@@ -19,9 +19,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ctxval._util.checked import Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import require_probability, with_error
+from ctxval.certificates.bounds import with_error
 from ctxval.certificates.dynamics_diagnostics import PREDICTIONS, counted, doubt_of, held
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence, with_units
 from ctxval.certificates.learned import require_learned
@@ -29,6 +30,9 @@ from ctxval.certificates.posterior import both_outcomes
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.core.space import TaskSpace
 from ctxval.errors import CertificateError
+
+MOST_DRAWS = 400
+"""The largest number of draws of the dynamics, which limits the confidence."""
 
 _RAISE = 0.5
 """Share of the largest excess over predictions by which the bound is raised."""
@@ -58,6 +62,14 @@ class Dynamics(CertificateKind):
                 "the dynamics bound is for deterministic systems, and this one is declared stochastic: use --kind "
                 "posterior or an audit."
             )
+
+    def require_usable(self, confidence: float, executions: int) -> None:
+        """Refuse a confidence that needs too many draws of the dynamics.
+
+        Raises:
+            CertificateError: if it does.
+        """
+        _require_draws(MOST_DRAWS, confidence)
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_dynamics` of the trials and of what is learned from their trajectories.
@@ -101,11 +113,7 @@ class Dynamics(CertificateKind):
 
 
 def require_executions(sample: Sample) -> None:
-    """Check that the trials allow a bound from learned dynamics.
-
-    Raises:
-        CertificateError: if an execution failed or could not be measured, or if all distances are 0.
-    """
+    """Check that the trials allow a bound from learned dynamics."""
     failed = [number for number, distance in zip(sample.numbers, sample.distances, strict=True) if np.isnan(distance)]
     if failed:
         raise CertificateError(
@@ -119,7 +127,8 @@ def require_executions(sample: Sample) -> None:
         )
 
 
-def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: float = 0.95) -> Certificate:
+@checked
+def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Probability = 0.95) -> Certificate:
     """Return the bound that d* stays below with the confidence, under the prior on the dynamics.
 
     Args:
@@ -130,10 +139,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: flo
     Raises:
         CertificateError: if the confidence is too high for the number of draws, or draws diverge.
     """
-    require_probability("confidence", confidence)
-    draws = len(evidence.maxima)
-    if np.ceil((draws + 1) * confidence - 1e-9) > draws:
-        raise CertificateError(f"a confidence of {confidence:g} needs more than the {draws} draws of the dynamics.")
+    _require_draws(len(evidence.maxima), confidence)
     raised, error = bound_of(evidence, sample.best, confidence), evidence.error(confidence)
     if not np.isfinite(raised + error):
         raise CertificateError(
@@ -155,6 +161,11 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: flo
         doubt=both_outcomes(sample, stochastic=False) or doubt_of(evidence, sample.best, raised),
         error=error,
     )
+
+
+def _require_draws(draws: int, confidence: float) -> None:
+    if np.ceil((draws + 1) * confidence - 1e-9) > draws:
+        raise CertificateError(f"a confidence of {confidence:g} needs more than the {draws} draws of the dynamics.")
 
 
 def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> float:

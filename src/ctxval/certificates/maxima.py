@@ -12,16 +12,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.checked import Probability, checked
 from ctxval._util.progress import advance, stage
 from ctxval._util.representation import call
-from ctxval.certificates.bounds import ERRORS, require_probability
+from ctxval.certificates.bounds import ERRORS
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.errors import CertificateError
 from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
 from ctxval.gp.sample_paths import draw_paths, maxima
+from ctxval.gp.subset import kept_rows
 
 FEWEST = 4
 """The fewest trials for a bound."""
+
+MOST = 160
+"""The largest number of trials that a process is conditioned on; the effort of a draw grows with its cube."""
 
 STOCHASTIC = (1e-6, 1.0)
 """Bounds of the noise variance of a stochastic system, relative to the variance of the distance."""
@@ -70,20 +75,22 @@ class Maxima:
     def __repr__(self) -> str:
         return call(self, len(self.draws), draws=self.draws, points=self.points, hyperparameters=len(self.conditioned))
 
-    def upper(self, confidence: float) -> float:
+    @checked
+    def upper(self, confidence: Probability) -> float:
         """Return the bound on d* that holds with this probability.
 
         Raises:
-            CertificateError: if the confidence is no probability, or too high for so few draws.
+            CertificateError: if the confidence is too high for so few draws.
         """
-        rank = max(1, int(np.ceil((len(self.draws) + 1) * require_probability("confidence", confidence) - 1e-9)))
+        rank = max(1, int(np.ceil((len(self.draws) + 1) * confidence - 1e-9)))
         if rank > len(self.draws):
             raise CertificateError(
                 f"a confidence of {confidence:g} needs more than the {len(self.draws)} draws of d* that were made."
             )
         return float(self.draws[rank - 1])
 
-    def error(self, confidence: float) -> float:
+    @checked
+    def error(self, confidence: Probability) -> float:
         """Return the standard error of the bound: its standard deviation over seeds of the draws.
 
         It is computed by a block bootstrap over the chain of hyperparameters, because successive draws are correlated,
@@ -91,7 +98,7 @@ class Maxima:
         spread may be too small. The bound with fewer draws below it has an error too, and the larger of the two
         is returned.
         """
-        share = require_probability("confidence", confidence)
+        share = confidence
         blocks = min(_BLOCKS, len(self.conditioned))
         if blocks < 2:
             return 0.0
@@ -134,9 +141,9 @@ def draw_maxima(
         CertificateError: if an execution failed, there are too few trials, their distances are all equal or too
             extreme, or two executions of one task differ although the system is not declared stochastic.
     """
-    X, y = _required_data(sample)
     if not stochastic:
         _require_one_distance_each(sample)
+    X, y = _required_data(representative(sample))
     rng = np.random.default_rng(seed)
     # No logarithm with noise: the exponential of an expected logarithm is not the expected distance.
     # No second chain on well-spread trials: only all trials together can separate noise from roughness.
@@ -160,6 +167,14 @@ def draw_maxima(
     order = np.argsort(tops, kind="stable")
     owners = np.repeat(np.arange(len(conditioned)), paths)
     return Maxima(tops[order], np.concatenate([where for _, where in found])[order], conditioned, owners[order])
+
+
+def representative(sample: Sample) -> Sample:
+    """Return the trials that the process is conditioned on: of many trials, the largest, latest and well-spread ones.
+
+    The smallest distances are left out, which does not lower the bound.
+    """
+    return sample.rows(kept_rows(sample.points, sample.distances, MOST, MOST + 1).tolist())
 
 
 def settle_maxima(
@@ -193,11 +208,7 @@ def _pooled(chains: list[Maxima]) -> Maxima:
 
 
 def _required_data(sample: Sample) -> tuple[Array, Array]:
-    """Return points ``(n, d)`` and distances ``(n,)`` of trials that allow a bound.
-
-    Raises:
-        CertificateError: if an execution has no distance, or if the distances are too few, all equal or too extreme.
-    """
+    """Return points ``(n, d)`` and distances ``(n,)`` of trials that allow a bound."""
     failed = sample.failed - len(sample.numbers_of("unmeasured"))
     if failed:
         raise CertificateError(
@@ -228,11 +239,7 @@ def _required_data(sample: Sample) -> tuple[Array, Array]:
 
 
 def _require_one_distance_each(sample: Sample) -> None:
-    """Refuse trials of a stochastic system.
-
-    Raises:
-        CertificateError: if two executions of one task have different distances.
-    """
+    """Refuse trials of a stochastic system."""
     y, numbers = sample.distances, sample.numbers
     _, tasks = np.unique(sample.points, axis=0, return_inverse=True)
     for row, task in enumerate(tasks.ravel()):

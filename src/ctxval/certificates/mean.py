@@ -7,14 +7,15 @@ lowers the variance of the estimate and never makes it wrong. See :mod:`ctxval.c
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.checked import Must, PositiveFloat, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import at_least, at_most, require_count, require_probability
+from ctxval.certificates.bounds import at_least, at_most
 from ctxval.certificates.draws import countable_draws, how_drawn, not_counted
 from ctxval.certificates.intervals import Interval, asymptotic_interval, betting_interval, quantile_ranks
 from ctxval.certificates.learned import LearnedDistance, require_learned
@@ -48,9 +49,9 @@ class Mean(CertificateKind):
         "threshold"
     )
 
-    quantile: float | None = None
-    largest_possible: float | None = None
-    predictions: int = 2000
+    quantile: Probability | None = None
+    largest_possible: PositiveFloat | None = None
+    predictions: Annotated[int, Must("an integer of at least 2", lambda value: value >= 2)] = 2000
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_mean` of the trials."""
@@ -78,7 +79,8 @@ class _Draws:
     unpredicted: int
 
 
-def certify_mean(sample: Sample, confidence: float = 0.95, options: Mean | None = None) -> Certificate:
+@checked
+def certify_mean(sample: Sample, confidence: Probability = 0.95, options: Mean | None = None) -> Certificate:
     """Return a two-sided confidence interval of the expected distance, and of a quantile if one is asked for.
 
     Args:
@@ -88,11 +90,10 @@ def certify_mean(sample: Sample, confidence: float = 0.95, options: Mean | None 
 
     Raises:
         CertificateError: if the experiment is not loaded, there are too few independent draws, their number depended
-            on their distances, a draw failed and no largest possible distance is stated, or an option is not valid.
+            on their distances, or a draw failed and no largest possible distance is stated.
     """
     chosen = options or Mean()
-    beta = 1 - require_probability("confidence", confidence)
-    _require_valid(chosen)
+    beta = 1 - confidence
     draws = _draws_of(sample, require_learned(sample, "mean"), chosen)
     own = beta if chosen.quantile is None else beta / 2
     if chosen.largest_possible is None:
@@ -113,20 +114,8 @@ def certify_mean(sample: Sample, confidence: float = 0.95, options: Mean | None 
     )
 
 
-def _require_valid(options: Mean) -> None:
-    require_count("predictions", options.predictions, 2)
-    if options.quantile is not None:
-        require_probability("quantile", options.quantile)
-    if options.largest_possible is not None and not 0 < options.largest_possible < np.inf:
-        raise CertificateError(f"largest_possible must be a positive number, got {options.largest_possible!r}.")
-
-
 def _draws_of(sample: Sample, learned: LearnedDistance, options: Mean) -> _Draws:
-    """Return the draws with their predictions. A task that cannot be predicted gets the mean of the earlier distances.
-
-    Raises:
-        CertificateError: under the conditions of :func:`certify_mean`.
-    """
+    """Return the draws; a task that cannot be predicted gets the mean of the earlier distances as its prediction."""
     counted, most = countable_draws(sample, "a mean certificate"), options.largest_possible
     _require_usable(sample, counted, most)
     before = min(counted.numbers)

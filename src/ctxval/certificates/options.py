@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from ctxval._util.checked import Probability, checked
 from ctxval._util.representation import record
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.base import CertificateKind
-from ctxval.certificates.bounds import require_number, require_probability
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.posterior import Posterior
-from ctxval.errors import CertificateError, InputError
+from ctxval.errors import InputError
 
 CONFIDENCE = 0.95
 """Default confidence of a verdict."""
@@ -22,6 +22,7 @@ MOST_VOLUME = 0.5
 """Largest acceptable volume of a verdict: above it, a statement leaves out most of the task space."""
 
 
+@checked
 @dataclass(frozen=True)
 class CertificateOptions:
     """The certificate by which trials are judged, and the volume that it may leave out.
@@ -32,19 +33,16 @@ class CertificateOptions:
         volume: the share of the task space that may exceed the threshold; if it is 0, only bounds on d* validate.
 
     Raises:
-        CertificateError: if the confidence is no probability.
-        InputError: if the kind is not one, the confidence is below 0.5, or the volume is negative or above 0.5.
+        InputError: if the confidence is below 0.5, or the volume is above 0.5.
     """
 
     kind: CertificateKind = field(default_factory=Automatic)
-    confidence: float = CONFIDENCE
+    confidence: Probability = CONFIDENCE
     volume: float = 0.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.kind, CertificateKind):
-            raise InputError(f"kind must be a kind of certificate, such as Posterior(), got {self.kind!r}.")
-        require_confidence(require_number("the confidence", self.confidence))
-        require_volume(require_number("the volume", self.volume))
+        require_confidence(self.confidence)
+        require_volume(self.volume)
 
     @classmethod
     def posterior(
@@ -64,8 +62,6 @@ class CertificateOptions:
         """
         if certificate is None:
             return cls(Automatic(stochastic, resolution), confidence)
-        if not isinstance(certificate, CertificateOptions):
-            raise InputError(f"certificate must be a CertificateOptions, got {certificate!r}.")
         if (confidence, stochastic, resolution) != (CONFIDENCE, False, RESOLUTION):
             raise InputError("confidence, stochastic and resolution are options of certificate=; state them there.")
         return certificate
@@ -74,16 +70,9 @@ class CertificateOptions:
         return record(self)
 
 
-def require_confidence(confidence: float) -> float:
-    """Return the confidence of a verdict.
-
-    Raises:
-        CertificateError: if it is no probability.
-        InputError: if it is below 0.5.
-    """
-    require_probability("the confidence", confidence)
-    if 1 - confidence == 1:
-        raise CertificateError(f"the confidence must be strictly between 0 and 1, got {confidence!r}.")
+@checked
+def require_confidence(confidence: Probability) -> float:
+    """Return the confidence of a verdict."""
     if confidence < LEAST_CONFIDENCE:
         raise InputError(
             f"a verdict with confidence {confidence:g} would be wrong more often than right; state at least "
@@ -93,11 +82,7 @@ def require_confidence(confidence: float) -> float:
 
 
 def require_volume(volume: float) -> float:
-    """Return the share of the task space that may exceed a threshold.
-
-    Raises:
-        InputError: if it is negative or above 0.5.
-    """
+    """Return the share of the task space that may exceed a threshold."""
     if not 0 <= volume <= MOST_VOLUME:
         raise InputError(
             f"the volume must be a share of the task space from 0 to {MOST_VOLUME:g}, got {volume!r}: more would leave "

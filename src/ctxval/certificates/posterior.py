@@ -14,16 +14,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ctxval._util.checked import PositiveFloat, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import require_probability, with_error
-from ctxval.certificates.covering import RESOLUTION, require_resolution, resolved_volume
+from ctxval.certificates.bounds import with_error
+from ctxval.certificates.covering import RESOLUTION, farthest_task, resolved_volume
 from ctxval.certificates.forecast import Forecast, forecast
-from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
+from ctxval.certificates.maxima import MOST, Maxima, draw_maxima, representative, settle_maxima
 from ctxval.certificates.posterior_diagnostics import diagnose
 from ctxval.certificates.sample import Sample
 from ctxval.core.space import TaskSpace
-from ctxval.errors import InputError
+from ctxval.errors import CertificateError, InputError
 from ctxval.gp.acquisition import UpperConfidenceBound, maximise
 from ctxval.gp.hyperposterior import Conditioned
 from ctxval.gp.surrogate import fit_surrogate
@@ -41,22 +42,13 @@ class Posterior(CertificateKind):
         stochastic: whether two executions of one task may differ; then the largest expected distance is bounded.
         resolution: largest distance from a task to its nearest trial, in diagonals of the task space; beyond it the
             bound is withdrawn. With 1 the bound is never withdrawn for this reason.
-
-    Raises:
-        CertificateError: if the resolution is not positive.
-        InputError: if an option has another type.
     """
 
     name: ClassVar[str] = "posterior"
     evidence: ClassVar[str] = "by a prior on the distance"
 
     stochastic: bool = False
-    resolution: float = RESOLUTION
-
-    def __post_init__(self) -> None:
-        require_resolution(self.resolution)
-        if not isinstance(self.stochastic, bool):
-            raise InputError(f"stochastic must be True or False, got {self.stochastic!r}.")
+    resolution: PositiveFloat = RESOLUTION
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_posterior` of the trials."""
@@ -72,11 +64,12 @@ class Posterior(CertificateKind):
         self, sample: Sample, threshold: float, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
         """Return the certificate from enough draws for the threshold, and a forecast if its bound is above that."""
+        _require_covered(sample, self.resolution)
         found = settle_maxima(sample, threshold, confidence, stochastic=self.stochastic)
         certificate = self.certify_by(found, sample, confidence)
         if certificate.doubt is not None or certificate.upper_bound <= threshold:
             return certificate, None  # a process that the trials contradict predicts nothing
-        return certificate, forecast(sample, found, threshold, confidence)
+        return certificate, forecast(representative(sample), found, threshold, confidence)
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
@@ -127,12 +120,13 @@ def _share(resolution: dict[str, float]) -> str:
     return f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
 
 
+@checked
 def certify_posterior(
     sample: Sample,
-    confidence: float = 0.95,
+    confidence: Probability = 0.95,
     *,
     stochastic: bool = False,
-    resolution: float = RESOLUTION,
+    resolution: PositiveFloat = RESOLUTION,
     seed: int = 0,
     found: Maxima | None = None,
 ) -> Certificate:
@@ -149,14 +143,19 @@ def certify_posterior(
 
     Raises:
         CertificateError: if an execution failed, the trials do not allow a bound (see :func:`draw_maxima`), the
-            confidence is too high for the number of draws, or the resolution is not positive.
+            confidence is too high for the number of draws, or more trials than are used do not cover the tasks.
     """
-    require_probability("confidence", confidence)
-    require_resolution(resolution)
+    used = representative(sample)
+    _require_covered(sample, resolution)
     drawn = draw_maxima(sample, stochastic=stochastic, seed=seed) if found is None else found
     upper, error = drawn.upper(confidence), drawn.error(confidence)
-    unordered = np.array([origin == "manual" for origin in sample.origins])
-    diagnosis = diagnose(drawn.conditioned, sample.points, sample.numbers, unordered=unordered, resolution=resolution)
+    unordered = np.array([origin == "manual" for origin in used.origins])
+    diagnosis = diagnose(
+        *(drawn.conditioned, used.points, used.numbers),
+        unordered=unordered,
+        resolution=resolution,
+        covered=sample.points,
+    )
     return Certificate(
         kind="posterior",
         statement=_statement(upper, error, confidence, stochastic),
@@ -164,7 +163,7 @@ def certify_posterior(
         confidence=confidence,
         volume=0.0,
         trials=len(sample),
-        assumptions=(*_assumptions(stochastic, resolution), *sample.remarks, ONE_CAMPAIGN),
+        assumptions=(*_assumptions(stochastic, resolution), *_left_out(sample, used), *sample.remarks, ONE_CAMPAIGN),
         details={
             "best": sample.best,
             "gap": upper - sample.best,
@@ -172,7 +171,7 @@ def certify_posterior(
             "draws": len(drawn.draws),
             "stochastic": stochastic,
             "resolution": _resolution(resolution, sample.points.shape[1]),
-            "instantaneous": instantaneous_bound(sample),
+            "instantaneous": instantaneous_bound(used),
             **_summary(drawn.conditioned),
             "diagnosis": diagnosis.to_json(),
             "failures": sample.failures,
@@ -208,6 +207,25 @@ def both_outcomes(sample: Sample, stochastic: bool) -> str | None:
         f"trial {first.trial} failed and trial {first.by} executed the same task with success, for no stated reason: "
         f"{what}, and the bound is withdrawn; if the cause was removed in between, execute the task once more and say "
         f'so: ctxval ask STORE --again {first.trial} --because "what was changed"'
+    )
+
+
+def _require_covered(sample: Sample, resolution: float) -> None:
+    """Refuse many trials that do not cover the tasks before the draws, which take long."""
+    if len(sample) > MOST and (farthest := farthest_task(sample.points)) > resolution:
+        raise CertificateError(
+            f"some task is {farthest:.2g} of the task space's diagonal away from each of {len(sample)} trials, more "
+            f"than the resolution of {resolution:g}, so the bound would be withdrawn and is not computed; an audit "
+            "bounds how many tasks are worse."
+        )
+
+
+def _left_out(sample: Sample, used: Sample) -> tuple[str, ...]:
+    if len(used) == len(sample):
+        return ()
+    return (
+        f"the process is conditioned on {len(used)} of the {len(sample)} trials, the largest distances, the latest and "
+        "well-spread ones, because all would take too long; the others would hardly raise the bound",
     )
 
 

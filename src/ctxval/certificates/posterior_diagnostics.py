@@ -65,6 +65,7 @@ def diagnose(
     unordered: Mask | None = None,
     level: float = LEVEL,
     resolution: float = RESOLUTION,
+    covered: Array | None = None,
 ) -> Diagnosis:
     """Return how well the values agree with the process, and how well the trials cover the tasks.
 
@@ -76,6 +77,7 @@ def diagnose(
         unordered: which trials have an order without meaning, shape ``(n,)``; none by default.
         level: a surprise that is less probable than this withdraws the bound.
         resolution: a task that is farther than this from every trial withdraws the bound, in diagonals.
+        covered: points that cover tasks, if there are more than X.
     """
     exceed, before = _surprises(conditioned, np.zeros(len(X), dtype=bool) if unordered is None else unordered)
     worst = int(np.nanargmin(exceed))
@@ -83,7 +85,8 @@ def diagnose(
     tested = int(np.isfinite(exceed).sum())
     surprise = float(-np.expm1(tested * np.log1p(-min(exceed[worst], 1 - 1e-16))))
     left_out = float(np.sqrt(np.mean([_left_out(one) for one in conditioned])))
-    farthest, doubt = farthest_task(X), None
+    covering_points = X if covered is None else covered
+    farthest, doubt = farthest_task(covering_points), None
     if surprise < level:
         doubt = (
             f"trial {trial} came out {-ndtri(max(exceed[worst], 1e-300)):.1f} standard deviations above what the "
@@ -91,8 +94,8 @@ def diagnose(
             "bound assumes, so the bound is withdrawn"
         )
     elif farthest > resolution:
-        doubt = _uncovered(X, farthest, resolution)
-    elif len(bare := bare_corners(X, resolution)):
+        doubt = _uncovered(covering_points, farthest, resolution)
+    elif len(bare := bare_corners(covering_points, resolution)):
         doubt = _bare(bare, len(X[0]))
     return Diagnosis(surprise, trial, left_out, farthest, doubt)
 

@@ -25,6 +25,8 @@ class Provenance:
         remarks: sentences that a certificate lists among its assumptions, such as what was changed on the system.
         learned: what the experiment's model predicts, for kinds that need it; None if the experiment is not loaded.
         distribution: the distribution of tasks as a text; None if it is uniform.
+        start: the largest offset of the start of an execution, as the distance measures it, and as a text; None if
+            executions were not recorded.
     """
 
     space: TaskSpace | None = None
@@ -32,6 +34,7 @@ class Provenance:
     remarks: tuple[str, ...] = ()
     learned: LearnedDistance | None = None
     distribution: str | None = None
+    start: tuple[float, str] | None = None
 
     @classmethod
     def of(cls, description: Mapping[str, Any], changes: Iterable[Change] = ()) -> Provenance:
@@ -43,6 +46,12 @@ class Provenance:
             remarks=(*_remarks_on_model(description), *remarks_on(changes)),
             distribution=_distribution_of(description),
         )
+
+    def caution(self, threshold: float) -> str:
+        """Return a sentence if an execution started farther from its task than the threshold; empty if none did."""
+        if self.start is None or self.start[0] <= threshold:
+            return ""
+        return f" The start of an execution was off by {self.start[1]}; the threshold is {threshold:.6g}."
 
     def sample(self, trials: Sequence[Trial]) -> Sample:
         """Return trials as a certificate sees them, with what is known here.
@@ -68,6 +77,9 @@ def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
             )
         elif change.what == "remeasured":
             found.append(f"the distances are those measured anew: {change.why!r}")
+        elif change.what == "replaced":
+            numbers = ", ".join(change.content.get("before", {}))
+            found.append(f"the result of trial {numbers} that was told first is wrong, as you state: {change.why!r}")
     return tuple(found)
 
 

@@ -22,9 +22,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import at_most, of_tasks, require_count, require_probability
+from ctxval.certificates.bounds import at_most, of_tasks
 from ctxval.certificates.draws import countable_draws, draws_left_out, how_drawn, not_counted
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.learned import LearnedDistance, require_learned
@@ -58,8 +59,8 @@ class Region(CertificateKind):
     uses_threshold: ClassVar[bool] = True
     needs_model: ClassVar[bool] = True
 
-    discard: int = 0
-    predictions: int = 1000
+    discard: NonNegativeInt = 0
+    predictions: PositiveInt = 1000
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_region` of the trials, without a threshold."""
@@ -70,6 +71,14 @@ class Region(CertificateKind):
     ) -> tuple[Certificate, Forecast | None]:
         """Return :func:`certify_region` of the trials; nothing is forecast."""
         return certify_region(sample, threshold, confidence, self), None
+
+    def require_usable(self, confidence: float, executions: int) -> None:
+        """Require more trials than are discarded.
+
+        Raises:
+            CertificateError: if there are not more.
+        """
+        _require_fewer(self.discard, executions)
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
@@ -139,8 +148,12 @@ class _Map:
         return volume_bound(self.count, self.unpredicted, beta / 2) + volume_bound(known, 0, beta / 2)
 
 
+@checked
 def certify_region(
-    sample: Sample, threshold: float | None = None, confidence: float = 0.95, options: Region | None = None
+    sample: Sample,
+    threshold: PositiveFloat | None = None,
+    confidence: Probability = 0.95,
+    options: Region | None = None,
 ) -> Certificate:
     """Bound the distance by a prediction plus a margin from independent draws, but for a share of the tasks.
 
@@ -159,9 +172,7 @@ def certify_region(
             discarded.
     """
     chosen = options or Region()
-    discard = require_count("discard", chosen.discard, 0)
-    require_count("predictions", chosen.predictions, 1)
-    beta = 1 - require_probability("confidence", confidence)
+    discard, beta = chosen.discard, 1 - confidence
     learned = require_learned(sample, "region")
     margin = _margin_of(sample, learned, discard)
     volume = volume_bound(len(margin.drawn), discard, (1 - _OF_MAP) * beta)
@@ -188,12 +199,13 @@ def certify_region(
     )
 
 
-def _margin_of(sample: Sample, learned: LearnedDistance, discard: int) -> _Margin:
-    """Return the margin of the prediction from the trials before the draws that count.
+def _require_fewer(discard: int, draws: int) -> None:
+    if discard >= draws:
+        raise CertificateError(f"of {draws} draws, from 0 to {draws - 1} can be discarded, not {discard}.")
 
-    Raises:
-        CertificateError: under the conditions of :func:`certify_region`.
-    """
+
+def _margin_of(sample: Sample, learned: LearnedDistance, discard: int) -> _Margin:
+    """Return the margin of the prediction from the trials before the draws that count."""
     drawn = countable_draws(sample, "a region bound")
     before = min(drawn.numbers)
     predicted = learned.expected(drawn.points, before)
@@ -202,8 +214,7 @@ def _margin_of(sample: Sample, learned: LearnedDistance, discard: int) -> _Margi
             f"nothing can be predicted from the trials before trial {before}, the first of these draws: execute tasks "
             "of a search before the audit, or say --kind audit, which needs no prediction."
         )
-    if discard >= len(drawn):
-        raise CertificateError(f"of {len(drawn)} draws, from 0 to {len(drawn) - 1} can be discarded, not {discard}.")
+    _require_fewer(discard, len(drawn))
     excess = np.sort(np.nan_to_num(drawn.distances - predicted, nan=np.inf))
     unpredicted = int((np.isnan(predicted) & ~np.isnan(drawn.distances)).sum())
     if not np.isfinite(excess[-1 - discard]):

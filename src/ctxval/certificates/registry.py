@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from ctxval._util.checked import Probability, checked
 from ctxval._util.registry import Registry
 from ctxval._util.representation import record
 from ctxval.certificates.base import Certificate, CertificateKind
-from ctxval.certificates.convergence import TheoremConstants
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.sample import Sample
 from ctxval.core.trial import Origin
@@ -29,11 +29,7 @@ class KindRegistry(Registry[CertificateKind]):
         self._registered: dict[str, type[CertificateKind]] = {}
 
     def register(self, kind: Kind) -> Kind:
-        """Add a kind; it is used as a decorator of the class.
-
-        Raises:
-            InputError: if the class is no kind of certificate, or another kind has its name.
-        """
+        """Add a kind; it is used as a decorator of the class."""
         name = _required(kind).name
         known = self.find(name) if name in self.built_in else self._registered.get(name, kind)
         again = (known.__module__, known.__qualname__) == (kind.__module__, kind.__qualname__)
@@ -44,12 +40,7 @@ class KindRegistry(Registry[CertificateKind]):
         return kind
 
     def find(self, name: str) -> type[CertificateKind]:
-        """Return the kind of a name.
-
-        Raises:
-            UnknownNameError: if no kind has that name.
-            InputError: if the package that provides it cannot be imported, or if it provides something else.
-        """
+        """Return the kind of a name."""
         if name in self._registered:
             return self._registered[name]
         found = _required(super().find(name))
@@ -97,9 +88,6 @@ class Options:
     Attributes:
         stochastic: for the posterior bound: whether two executions of one task may differ.
         discard: for sampling and discarding: how many of the largest distances are discarded.
-        constant: for the convergence bound: C, in the distance's units.
-        theorem: for the convergence bound: the constants from which C is computed if ``constant`` is not given.
-        search: for the convergence bound: the type of the search that chose the tasks, if it is known.
         resolution: for the posterior bound: largest distance from a task to its nearest trial, in diagonals of the task
             space.
         remarks: sentences that the certificate lists among its assumptions, such as what was changed on the system.
@@ -107,9 +95,6 @@ class Options:
 
     stochastic: bool = False
     discard: int | None = None
-    constant: float | None = None
-    theorem: TheoremConstants | None = None
-    search: str | None = None
     resolution: float = RESOLUTION
     remarks: tuple[str, ...] = ()
 
@@ -117,7 +102,8 @@ class Options:
         return record(self)
 
 
-def certify(sample: Sample, kind: str, confidence: float, options: Options | None = None) -> Certificate:
+@checked
+def certify(sample: Sample, kind: str, confidence: Probability, options: Options | None = None) -> Certificate:
     """Return the certificate of a kind.
 
     Args:
@@ -131,8 +117,7 @@ def certify(sample: Sample, kind: str, confidence: float, options: Options | Non
         CertificateError: if its theory does not allow these trials, or an option that it needs is missing.
     """
     chosen = Options() if options is None else options
-    searched = sample if chosen.search is None else replace(sample, search=chosen.search)
-    return KINDS.find(kind).of(vars(chosen)).certify(searched, confidence).with_remarks(chosen.remarks)
+    return KINDS.find(kind).of(vars(chosen)).certify(sample, confidence).with_remarks(chosen.remarks)
 
 
 def require_use(kind: str, given: Iterable[str]) -> None:

@@ -19,9 +19,10 @@ from typing import ClassVar
 import numpy as np
 from scipy.special import bdtr, betaincinv
 
+from ctxval._util.checked import NonNegativeInt, PositiveInt, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import at_most, drawn_from, of_tasks, require_probability
+from ctxval.certificates.bounds import at_most, drawn_from, of_tasks
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Origin
@@ -51,11 +52,7 @@ class _ByDraws(CertificateKind):
     bounds_maximum: ClassVar[bool] = False
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Refuse trials that are no independent draws.
-
-        Raises:
-            CertificateError: if there is such a trial.
-        """
+        """Refuse trials that are no independent draws."""
         if any(origin != "iid" for origin in origins):
             raise CertificateError(
                 f"a {self.name} bound takes independent draws alone, but there are others; say --kind audit."
@@ -90,7 +87,7 @@ class SamplingDiscarding(_ByDraws):
 
     name: ClassVar[str] = "sampling-discarding"
 
-    discard: int | None = None
+    discard: PositiveInt | None = None
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_scenario` of the trials."""
@@ -105,9 +102,15 @@ class SamplingDiscarding(_ByDraws):
         self._require_discard()
         super().require_audit_helps(origins)
 
+    def require_usable(self, confidence: float, executions: int) -> None:
+        """Require the number to discard, and more trials than that.
+
+        Raises:
+            CertificateError: if the number is missing, or not below that of the trials.
+        """
+        _require_counts(executions, self._require_discard())
+
     def _require_discard(self) -> int:
-        if self.discard is not None and (isinstance(self.discard, bool) or not isinstance(self.discard, int)):
-            raise CertificateError(f"discard must be an integer, got {self.discard!r}.")
         if not self.discard:
             raise CertificateError("sampling and discarding needs to know how many to discard, at least 1.")
         return self.discard
@@ -121,33 +124,35 @@ def rests_on_draws(certificate: Certificate) -> list[str]:
     ]
 
 
-def tail(n: int, discarded: int, volume: float) -> float:
+@checked
+def tail(n: int, discarded: int, volume: Probability) -> float:
     """Return Pr(V > volume) after n draws of which the k largest are discarded.
 
     Raises:
-        CertificateError: if k is negative or not below n, or the volume is no probability.
+        CertificateError: if k is negative or not below n.
     """
     _require_counts(n, discarded)
-    return float(bdtr(discarded, n, require_probability("volume", volume)))
+    return float(bdtr(discarded, n, volume))
 
 
-def volume_bound(n: int, discarded: int, beta: float) -> float:
+@checked
+def volume_bound(n: int, discarded: int, beta: Probability) -> float:
     """Return the least eps with ``Pr(V > eps) <= beta``.
 
     Raises:
-        CertificateError: if k is negative or not below n, or beta is no probability.
+        CertificateError: if k is negative or not below n.
     """
     _require_counts(n, discarded)
-    return float(betaincinv(discarded + 1, n - discarded, 1 - require_probability("beta", beta)))
+    return float(betaincinv(discarded + 1, n - discarded, 1 - beta))
 
 
-def samples_needed(volume: float, beta: float, discarded: int = 0) -> int:
+@checked
+def samples_needed(volume: Probability, beta: Probability, discarded: NonNegativeInt = 0) -> int:
     """Return the least N with ``Pr(V > volume) <= beta``; for k = 0 it is ``log(beta) / log(1 - volume)``, rounded up.
 
     Raises:
-        CertificateError: if volume or beta is no probability, or N would be above 2^40.
+        CertificateError: if N would be above 2^40.
     """
-    require_probability("beta", beta)
     low, high = discarded, discarded + 1
     while tail(high, discarded, volume) > beta:
         low, high = high, 2 * high
@@ -159,7 +164,8 @@ def samples_needed(volume: float, beta: float, discarded: int = 0) -> int:
     return high
 
 
-def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 0) -> Certificate:
+@checked
+def certify_scenario(sample: Sample, confidence: Probability = 0.95, discarded: NonNegativeInt = 0) -> Certificate:
     """Return a bound on the volume of the tasks whose distance exceeds the largest one left after discarding.
 
     A failed execution counts as a violation, larger than any distance, so it must be among the discarded ones.
@@ -174,7 +180,7 @@ def certify_scenario(sample: Sample, confidence: float = 0.95, discarded: int = 
         CertificateError: if a trial is no independent draw, the number of draws depended on their distances, k is
             not below the number of draws, or more executions failed than are discarded.
     """
-    beta = 1 - require_probability("confidence", confidence)
+    beta = 1 - confidence
     foreign = [origin for origin in sample.origins if origin != "iid"]
     if foreign:
         raise CertificateError(
@@ -232,11 +238,7 @@ def when_planned(sample: Sample, drawn: int) -> str:
 
 
 def _require_one_number(sample: Sample, kind: str) -> None:
-    """Refuse draws whose number depended on their distances.
-
-    Raises:
-        CertificateError: if the verdict ended them, or if their number was changed after some of them were known.
-    """
+    """Refuse draws whose number depended on their distances."""
     plans = list(dict.fromkeys(planned for planned in sample.planned if planned is not None))
     if 0 in plans:
         raise CertificateError(

@@ -14,13 +14,14 @@ from typing import cast
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.checked import NonNegativeInt, PositiveFloat, checked
 from ctxval._util.representation import record
 from ctxval.certificates.covering import covering, most_contested
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.posterior import Posterior, certify_posterior, instantaneous_bound
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.verdict import counterexample, require_threshold
+from ctxval.certificates.verdict import counterexample
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
@@ -53,10 +54,8 @@ class Screening:
     draws: int
     margin: float
 
-    def __repr__(self) -> str:
-        return record(self)
 
-
+@checked
 @dataclass(frozen=True)
 class StoppingRule:
     """The rule by which a campaign stops when its verdict on a threshold is reached.
@@ -70,16 +69,15 @@ class StoppingRule:
             low.
 
     Raises:
-        InputError: if the threshold is not a positive number, or the certificate is not the posterior bound.
+        InputError: if the certificate is not the posterior bound.
     """
 
-    threshold: float
+    threshold: PositiveFloat
     options: CertificateOptions = field(default_factory=CertificateOptions.posterior)
     screenings: tuple[Screening, ...] = (Screening(8, 0.3), Screening(32, 0.05))
-    confirmations: int = 2
+    confirmations: NonNegativeInt = 2
 
     def __post_init__(self) -> None:
-        require_threshold(self.threshold)
         if not isinstance(self.options.kind, Posterior):
             raise InputError(f"this rule is for the posterior bound, got {self.options.kind.name!r}.")
 

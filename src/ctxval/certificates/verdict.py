@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ctxval._util.checked import PositiveFloat, checked
 from ctxval._util.representation import call, line, lines, shown
 from ctxval.certificates.base import Certificate
 from ctxval.certificates.bounds import at_most, of_tasks, with_error
@@ -16,8 +17,8 @@ from ctxval.certificates.options import CertificateOptions, require_confidence, 
 from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.registry import KINDS
 from ctxval.core.space import TaskSpace
-from ctxval.core.trial import Trial
-from ctxval.errors import CertificateError, InputError
+from ctxval.core.trial import Trial, designs_sentence
+from ctxval.errors import CertificateError
 
 Answer = Literal["validated", "falsified", "undecided"]
 """The answer of a verdict to the question whether d* <= tau."""
@@ -71,24 +72,10 @@ class Verdict:
         }
 
 
-def require_threshold(threshold: float) -> float:
-    """Return a threshold tau, which must be a positive number.
-
-    Raises:
-        InputError: if it is not a positive number.
-    """
-    if not isinstance(threshold, int | float) or not threshold > 0 or threshold == float("inf"):
-        raise InputError(f"the threshold must be a positive number, got {threshold!r}.")
-    return float(threshold)
-
-
-def counterexample(trials: Sequence[Trial], threshold: float) -> Verdict | None:
-    """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
-
-    Raises:
-        InputError: if the threshold is not a positive number.
-    """
-    tau = require_threshold(threshold)
+@checked
+def counterexample(trials: Sequence[Trial], threshold: PositiveFloat) -> Verdict | None:
+    """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it."""
+    tau = float(threshold)
     above = [trial for trial in trials if trial.distance is not None and trial.distance > tau]
     if not above:
         return None
@@ -107,10 +94,11 @@ def _distinguishable(value: float, tau: float) -> tuple[str, str]:
     return repr(value), repr(tau)
 
 
+@checked
 def judge_by(
     certificate: Certificate,
     trials: Sequence[Trial],
-    threshold: float,
+    threshold: PositiveFloat,
     *,
     volume: float = 0.0,
     space: TaskSpace | None = None,
@@ -125,10 +113,9 @@ def judge_by(
         space: the task space, to state a resolution in its units; None if it is not known.
 
     Raises:
-        InputError: if the threshold is not a positive number, the volume is negative or above 0.5, or the
-            certificate's confidence is below 0.5.
+        InputError: if the volume is negative or above 0.5, or the certificate's confidence is below 0.5.
     """
-    tau = require_threshold(threshold)
+    tau = float(threshold)
     require_confidence(certificate.confidence)
     found = counterexample(trials, tau)
     if found is not None:
@@ -188,9 +175,10 @@ def _rests_on(certificate: Certificate, space: TaskSpace | None) -> str:
     return f"It rests on {'; on '.join([*said, 'this campaign not being chosen among several'])}."
 
 
+@checked
 def judge(
     trials: Sequence[Trial],
-    threshold: float,
+    threshold: PositiveFloat,
     options: CertificateOptions | None = None,
     provenance: Provenance | None = None,
 ) -> Verdict:
@@ -202,11 +190,14 @@ def judge(
         options: the kind of certificate, its confidence and the acceptable volume; ``auto`` by default. If the theory
             of the certificate refuses the trials, the verdict is undecided.
         provenance: the task space, the search and remarks on the campaign, as far as they are known.
-
-    Raises:
-        InputError: if the threshold is not a positive number.
     """
     chosen, known = options or CertificateOptions(), provenance or Provenance()
+    verdict, designs = _judged(trials, threshold, chosen, known), designs_sentence(trials)
+    reason = verdict.reason if designs is None else f"{verdict.reason.removesuffix('.')}; {designs}."
+    return replace(verdict, reason=f"{reason}{known.caution(threshold)}")
+
+
+def _judged(trials: Sequence[Trial], threshold: float, chosen: CertificateOptions, known: Provenance) -> Verdict:
     found = counterexample(trials, threshold)
     if found is not None:
         return found

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 
 from ctxval.aspect1 import Aspect1Report
 from ctxval.certificates.bounds import of_tasks
-from ctxval.config.check import Checked, task_text
+from ctxval.config.check import Checked, convergence, task_text
 from ctxval.core.soundness import SATURATED
 
 
 def aspect1_findings(report: Aspect1Report) -> list[Checked]:
     """Return what simulations of M show of its tasks and controllers, as sentences."""
-    return [_completion(report), *_flips(report), *_saturated(report), *_unconverged(report)]
+    unconverged = convergence(report.not_converged, report.designs)
+    return [_completion(report), *_flips(report), *_saturated(report), unconverged]
 
 
 def _completion(report: Aspect1Report) -> Checked:
@@ -69,15 +70,3 @@ def _saturated(report: Aspect1Report) -> Iterator[Checked]:
         yield Checked("limits of the inputs", "noted", f"at a limit: {', '.join(named)} of the steps on M{how}")
     else:
         yield Checked("limits of the inputs", "ok", "the inputs stay off their limits on M")
-
-
-def _unconverged(report: Aspect1Report) -> Iterator[Checked]:
-    count = len(report.not_converged)
-    if count:
-        examples = "; ".join(task_text(one) for one in report.not_converged[:3])
-        text = f"{count} of {report.designs} designs did not converge, such as {examples}"
-        yield Checked("convergence of the designs", "noted", text)
-    elif report.designs:
-        yield Checked("convergence of the designs", "ok", f"all {report.designs} designs converged")
-    else:
-        yield Checked("convergence of the designs", "skipped", "the controllers do not tell whether they converged")

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from dataclasses import asdict
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
@@ -25,9 +25,11 @@ from ctxval.certificates.bounds import as_text
 from ctxval.certificates.verdict import Verdict
 from ctxval.cli.screen import Commands, Screen, line
 from ctxval.core.experiment import UnitsWarning
+from ctxval.core.preflight import CostWarning, DistanceWarning
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
 from ctxval.storage.disks import StoreWarning
+from ctxval.version import VERSION
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 _BAD = (InputError, StoreError, CertificateError)
@@ -43,6 +45,21 @@ app = typer.Typer(
 )
 out = Screen()
 err = Screen(stderr=True)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        out.say(f"ctxval {VERSION}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Print the version, if that is asked for."""
 
 
 def command(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -133,11 +150,7 @@ def _stdout_to_stderr() -> Iterator[Any]:
 
 @contextmanager
 def worker_options(workers: int | None, dask: str | None, timeout: float | None) -> Iterator[dict[str, Any]]:
-    """Yield the arguments of :meth:`ctxval.Campaign.run` for local processes or for the workers of a Dask scheduler.
-
-    Raises:
-        InputError: if there is no scheduler at this address, or if it has no workers.
-    """
+    """Yield the arguments of :meth:`ctxval.Campaign.run` for local processes or for the workers of a Dask scheduler."""
     if dask is None:
         yield {"workers": workers, "timeout": timeout}
         return
@@ -157,7 +170,7 @@ def worker_options(workers: int | None, dask: str | None, timeout: float | None)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: Any, **_: Any) -> None:
-    if issubclass(category, StoreWarning | UnitsWarning | GoalWarning):
+    if issubclass(category, StoreWarning | UnitsWarning | GoalWarning | DistanceWarning | CostWarning):
         err.say(("warning:", "bold yellow"), f" {message}")
     else:
         err.say(warnings.formatwarning(message, category, *place[:2]).rstrip("\n"))
@@ -221,7 +234,8 @@ def _text(value: Any, units: str) -> str:
         case list():
             return ", ".join(_text(item, units) for item in value) or "none"
         case {"task": dict() as task, "distance": distance, **rest}:
-            at = ", ".join(f"{name} = {_text(item, '')}" for name, item in task.items())
+            # All digits: the task that is typed again must be the one that was executed.
+            at = ", ".join(f"{name} = {item}" for name, item in task.items())
             how = f" ({rest['method']})" if "method" in rest else ""
             return f"{f'{distance:.4g} {units}'.rstrip()} at {at}{how}"
         case dict():

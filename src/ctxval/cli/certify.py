@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.progress import stage
-from ctxval.certificates import KINDS, Assessment, Certificate, Provenance, TheoremConstants, assess
-from ctxval.certificates.verdict import require_threshold
+from ctxval.certificates import KINDS, Assessment, Certificate, Provenance, assess
 from ctxval.cli.base import FALSIFIED, app, command, out, print_other_stores, print_verdict
 from ctxval.cli.options import (
     AsJson,
@@ -53,21 +53,6 @@ Discard = Annotated[
         "it before the distances are known. Only for --kind region and sampling-discarding, which needs it."
     ),
 ]
-Constant = Annotated[
-    float | None,
-    typer.Option(
-        help="Constant C of the convergence bound, in the units of the distance. This bound never validates a model. "
-        "Only for --kind convergence."
-    ),
-]
-Theorem = Annotated[
-    str | None,
-    typer.Option(
-        metavar="SCALE,NOISE,A,B,GAIN",
-        help="Five numbers from which C is computed (see docs/theory.md), in place of --constant. Only for --kind "
-        "convergence.",
-    ),
-]
 KindOptions = Annotated[
     list[str] | None,
     typer.Option(
@@ -89,8 +74,6 @@ def certify_store(
     audit: Draws = None,
     volume: Volume = None,
     discard: Discard = None,
-    constant: Constant = None,
-    theorem: Theorem = None,
     stochastic: Stochastic = None,
     resolution: Resolution = None,
     option: KindOptions = None,
@@ -114,10 +97,8 @@ def certify_store(
             "--trust and --experiment need --audit or a kind that uses the model: otherwise no code is imported or run."
         )
     settings = settings_of(opened, experiment, trust) if loads else planned_settings(opened, kind)
-    constants = None if theorem is None else TheoremConstants.parse(theorem)
-    own = {"discard": discard, "constant": constant, "theorem": constants, "volume": volume}
-    given = named_values(option, **own, stochastic=stochastic, resolution=resolution)
-    limit = settings.threshold if threshold is None else require_threshold(threshold)
+    given = named_values(option, discard=discard, volume=volume, stochastic=stochastic, resolution=resolution)
+    limit = require("threshold", PositiveFloat | None, settings.threshold if threshold is None else threshold)
     _require_together(given, limit)
     options = settings.certificate.options(
         settings.confidence if confidence is None else confidence,
@@ -129,9 +110,10 @@ def certify_store(
     campaign = open_store(opened, store, experiment, trust, accept_change).campaign if loads else None
     if campaign is not None and audit is not None:
         campaign.audit(audit)
-    known = Provenance.of(opened.description(), opened.history()) if campaign is None else campaign.provenance
+    with opened.snapshot():
+        trials, known = opened.trials(), Provenance.of(opened.description(), opened.history())
     with stage("certifying"):
-        found = assess(opened.trials(), options, limit, known)
+        found = assess(trials, options, limit, known if campaign is None else campaign.provenance)
     others = [str(other) for other in other_stores(store)]
     if not as_json:
         _print_assessment(found)
@@ -171,8 +153,6 @@ def _needs_model(store: Store, kind: str | None) -> bool:
 def _require_together(given: dict[str, Any], threshold: float | None) -> None:
     if "volume" in given and threshold is None:
         raise InputError("--volume needs --threshold: it is the share of the task space that may exceed the threshold.")
-    if "constant" in given and "theorem" in given:
-        raise InputError("--constant and --theorem cannot be given together.")
 
 
 def _print_assessment(found: Assessment) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -91,9 +90,4 @@ def _number(text: str) -> Any:
 def _write(path: Path, run: Trajectory, experiment: Experiment) -> None:
     """Write a recording, either completely or not at all."""
     states, inputs = experiment.names(run.states.shape[-1], run.inputs.shape[-1])
-    beside = path.with_suffix(".part")
-    try:
-        run.to_csv(beside, states=labels_of(states), inputs=labels_of(inputs))
-        os.replace(beside, path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+    run.to_csv(path, states=labels_of(states), inputs=labels_of(inputs))

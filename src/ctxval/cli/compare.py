@@ -11,11 +11,12 @@ import typer
 from rich.table import Table
 
 from ctxval import plot
-from ctxval._util.files import make_folder_of
+from ctxval._util.files import write_text
 from ctxval._util.texts import reason_of
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.cli.base import app, command, err, failures_of, out, print_failures
 from ctxval.cli.options import AsJson, Confidence, PartOptions, named_values
+from ctxval.cli.outputs import Force, require_outputs
 from ctxval.cli.screen import line
 from ctxval.comparison.candidates import Candidate, require_comparable
 from ctxval.comparison.compare import BUDGET, race_of, store_name
@@ -23,7 +24,6 @@ from ctxval.comparison.result import WORDS, Comparison
 from ctxval.comparison.tables import CANDIDATES, PAIRS, candidate_rows, markdown, pair_rows
 from ctxval.config.settings import Settings, read_settings
 from ctxval.errors import InputError
-from ctxval.report.twins import write_text
 
 Targets = Annotated[
     list[str],
@@ -87,6 +87,7 @@ def compare(
     largest_possible: LargestPossible = None,
     stochastic: Stochastic = False,
     out_file: Out = None,
+    force: Force = False,
     as_json: AsJson = False,
     option: PartOptions = None,
 ) -> Any:
@@ -95,8 +96,8 @@ def compare(
     The comparison stops when all pairs are decided or the budget is spent. If it is interrupted, run it again: it
     continues from the stores.
     """
-    if out_file is not None:
-        make_folder_of(out_file)  # before executions are paid for
+    picture = None if out_file is None else out_file.with_suffix(".png")
+    require_outputs({"--out .md": out_file, "its picture": picture}, candidates, force=force)
     made = _candidates(_named(candidates), stores, seed, named_values(option))
     race = race_of(
         made,

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval._util.files import make_folder_of
+from ctxval._util.files import write_text
 from ctxval.aspect1 import TASKS
 from ctxval.cli.aspect1_findings import aspect1_findings
 from ctxval.cli.base import BAD_INPUT, FALSIFIED, app, command, out
@@ -120,13 +120,8 @@ def init(
     for path in contents:
         if path.exists():
             raise InputError(f"{path} already exists and was not changed.")
-    make_folder_of(file)
-    try:
-        for path, content in contents.items():
-            with path.open("x", encoding="utf-8") as opened:
-                opened.write(content)
-    except OSError as error:
-        raise InputError(f"{error.filename} cannot be written: {error.strerror}.") from error
+    for path, content in contents.items():
+        write_text(path, content)
     if not as_json:
         quoted = shlex.quote(str(file))
         out.say(" and ".join(map(str, contents)))

@@ -9,10 +9,11 @@ import typer
 from rich.table import Table
 
 from ctxval._util.texts import shortened
-from ctxval.cli.base import CANNOT_GO_ON, app, command, err, out
+from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, app, command, err, out
 from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingFile, States, TimeField, print_breaks
-from ctxval.cli.model_options import Vectorized, print_parameters, require_writable, step_function
+from ctxval.cli.model_options import Vectorized, print_parameters, require_model_file, step_function
 from ctxval.cli.options import AsJson, named_values
+from ctxval.cli.outputs import Force
 from ctxval.cli.replay import numbers, print_titled
 from ctxval.cli.screen import line
 from ctxval.config.named_model import named_model
@@ -89,19 +90,21 @@ def fit_models(
     hold_out: HoldOut = HOLD_OUT,
     steps: Steps = None,
     out_file: Out = None,
+    force: Force = False,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> Any:
     """Learn models from recordings, and compare their errors on recordings that were held out.
 
     The most accurate model is that with the smallest error after the largest number of steps. Its file contains the
-    recorded steps that it was learned from, so that the search `auto` begins with them.
+    recorded steps that it was learned from, so that the search `auto` begins with them. If its error after one step or
+    after the largest number of steps is at least the recorded change, the command ends with status 1.
     """
     kinds: Any = kind.split(",") if kind else (["parameters"] if step is not None else list(KINDS[:3]))
     if (step is None) != (not parameter):
         raise InputError("--step and --parameter must be given together.")
     bounds = named_values(parameter, "--parameter")
-    require_writable(out_file)
+    require_model_file(out_file, [*logs, mapping, given], force=force)
     found = LogOptions(mapping, state, input_, time, dt, delay).read(logs)
     report = fit(
         found,
@@ -117,14 +120,21 @@ def fit_models(
     if not as_json:
         print_breaks(found)
         _print(report)
-    written: list[str] = []
+    written, chosen = list[str](), None
     if report.fitted and out_file is not None:
         chosen = _most_accurate(report, out_file)
         written = write_model_file(out_file, chosen.model, step)
         if not as_json:
             out.say(f"the {chosen.kind} model is in {' and '.join(written)}")
     result = {**report.to_json(), "files": written}
-    return result if report.fitted else (result, CANNOT_GO_ON)
+    if not report.fitted:
+        return result, CANNOT_GO_ON
+    best = next((one for one in report.fitted if one.kind != "given"), report.fitted[0]) if chosen is None else chosen
+    if best.useless is None:
+        return result
+    if not as_json:
+        err.say(("not good: ", "bold red"), f"{best.useless}.", wrap=True)
+    return result, FALSIFIED
 
 
 def _most_accurate(report: FitReport, path: Path) -> FittedModel:

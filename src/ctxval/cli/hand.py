@@ -9,19 +9,26 @@ from typing import Annotated, Any
 
 import typer
 
+from ctxval._util.checked import NonNegativeFloat, require
+from ctxval._util.progress import advance, stage
 from ctxval._util.texts import enumerated
-from ctxval.campaign.by_hand import KnownRun, parameters_from, read_runs, write_files
+from ctxval.campaign.by_hand import TRIAL_FILES, KnownRun, parameters_from, read_runs, write_files
 from ctxval.campaign.campaign import OpenTrial
 from ctxval.campaign.known import KnownExecution
-from ctxval.campaign.telling import ToldResult, parameters_of_trial, require_tolerance, result_sentence, tell_result
+from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
 from ctxval.cli.base import FALSIFIED, app, command, out, print_verdict
 from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, Threshold, named_values
+from ctxval.cli.outputs import Force, require_folder
 from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, open_store, require_limit, require_target
 from ctxval.config.settings import read_settings
-from ctxval.core.trial import Trial
+from ctxval.core.exchange import TASK_FORMAT
+from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import InputError
 from ctxval.storage.other_stores import STORE_SUFFIXES
 from ctxval.storage.store import Store
+
+_LISTED = 10
+"""Largest number of imported runs that are printed."""
 
 _WAIT = 60.0
 """Seconds to wait for other terminals: each of them locks the store while it chooses a task."""
@@ -103,6 +110,7 @@ def ask(
     budget: Budget = None,
     search: SearchName = None,
     seed: Seed = None,
+    force: Force = False,
     experiment: Named = None,
     trust: Trust = False,
     accept_change: AcceptChange = None,
@@ -115,6 +123,8 @@ def ask(
         raise InputError("--threshold and --budget need --until-decided.")
     if because is not None and again is None:
         raise InputError("--because needs --again TRIAL: it states why the task is executed again.")
+    if out_folder is not None:
+        require_folder(out_folder, TRIAL_FILES, TASK_FORMAT, force=force)
     overrides = {"store": store, "search": search, "seed": seed, "options": named_values(option) or None}
     opened = _opened(target, overrides, experiment, trust, accept_change)
     if trial is not None:
@@ -128,7 +138,7 @@ def ask(
     else:
         chosen = _chosen(opened, parameters, again)
         found = opened.campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
-    report = _asked(opened, found, out_folder)
+    report = _asked(opened, found, out_folder, force)
     if not as_json:
         _print_asked(report, found)
     return report
@@ -148,9 +158,11 @@ def _chosen(opened: Opened, parameters: list[str] | None, again: int | None) -> 
     return None if again is None else parameters_of_trial(opened.campaign, again)
 
 
-def _asked(opened: Opened, found: OpenTrial, out_folder: Path | None) -> dict[str, Any]:
+def _asked(opened: Opened, found: OpenTrial, out_folder: Path | None, force: bool) -> dict[str, Any]:
     """Write the files of a trial, and return what is said of it."""
     folder = opened.path.with_suffix(".trials") / str(found.number) if out_folder is None else out_folder
+    if out_folder is None:
+        require_folder(folder, TRIAL_FILES, TASK_FORMAT, force=force)
     return {
         "trial": found.number,
         "task": found.trial.parameters,
@@ -182,6 +194,14 @@ def tell(
     ] = None,
     resample: Resample = False,
     start_tolerance: StartTolerance = None,
+    replace: Annotated[
+        str | None,
+        typer.Option(
+            metavar="REASON",
+            help='Replace the result that was told before, for a reason such as "wrong file". The store keeps the '
+            "earlier result in its history.",
+        ),
+    ] = None,
     experiment: Named = None,
     trust: Trust = False,
     accept_change: AcceptChange = None,
@@ -195,14 +215,14 @@ def tell(
         raise InputError('--failed needs a reason, such as "the motor cut out".')
     if trajectory is None and npz is None and (resample or start_tolerance is not None):
         raise InputError("--resample and --start-tolerance need a recording: give --trajectory or --npz.")
-    require_tolerance(start_tolerance, "--start-tolerance")
+    require("--start-tolerance", NonNegativeFloat | None, start_tolerance)
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
     mapping = opened.settings.log_mapping
-    told = ToldResult(trajectory or npz, distance, failed, npz is not None, resample, start_tolerance, mapping)
+    told = ToldResult(trajectory or npz, distance, failed, npz is not None, resample, start_tolerance, mapping, replace)
     ended = tell_result(opened.campaign, opened.experiment, trial, told)
-    report = _ended(ended, opened)
+    report = _ended(ended, opened, opened.campaign.executions)
     if not as_json:
-        out.say(result_sentence(ended, opened.experiment.units))
+        out.say(result_sentence(ended, opened.experiment.units, opened.campaign.start_offset(ended)))
     return report
 
 
@@ -230,21 +250,28 @@ def import_runs(
 
     Each one counts in the budget. A run that is already in the store is not imported again.
     """
-    require_tolerance(start_tolerance, "--start-tolerance")
+    require("--start-tolerance", NonNegativeFloat | None, start_tolerance)
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
     space = opened.experiment.validation.space
     runs = read_runs(files, parameters_from(parameters, space) if parameters else None, space)
-    checked = [_checked(run, opened, resample, start_tolerance) for run in runs]  # all of them before any is stored
-    ended = [opened.campaign.add_known(execution, _WAIT) for execution in checked]
+    checked = list[KnownExecution]()
+    with stage("checking", len(runs), "runs"):
+        for run in runs:  # all of them before any is stored
+            checked.append(_checked(run, opened, resample, start_tolerance))
+            advance(1)
+    ended = opened.campaign.add_known(checked, _WAIT)
     new = [trial for trial in ended if trial is not None]
+    executions = opened.campaign.executions
     report = {
-        "imported": [_ended(trial, opened) for trial in new],
+        "imported": [_ended(trial, opened, executions) for trial in new],
         "known": len(ended) - len(new),
         "store": str(store),
     }
     if not as_json:
-        for trial in new:
-            out.say(result_sentence(trial, opened.experiment.units))
+        for trial in new[:_LISTED]:
+            out.say(result_sentence(trial, opened.experiment.units, opened.campaign.start_offset(trial)))
+        if len(new) > _LISTED:
+            out.say(f"... and {len(new) - _LISTED} other trials; --json lists them.")
         out.say(f"{len(new)} runs imported, {len(ended) - len(new)} already in the store.")
     return report
 
@@ -302,14 +329,14 @@ def _decided(opened: Opened, limit: float, as_json: bool) -> tuple[dict[str, Any
     return report, FALSIFIED if verdict.answer == "falsified" else 0
 
 
-def _ended(trial: Trial, opened: Opened) -> dict[str, Any]:
+def _ended(trial: Trial, opened: Opened, executions: int) -> dict[str, Any]:
     return {
         "trial": trial.number,
         "task": trial.parameters,
         "state": trial.state,
         "distance": trial.distance,
         "failure": trial.failure,
-        "executions": opened.campaign.executions,
+        "executions": executions,
         "store": str(opened.path),
     }
 
@@ -320,6 +347,8 @@ def _print_asked(report: dict[str, Any], opened: OpenTrial) -> None:
     out.say(f"{', '.join(report['files'])} in {report['folder']}")
     if "controller.json" not in report["files"]:
         out.say("the controller cannot be written to a file: this is possible only for affine feedback (LQR and iLQR).")
+    if (opened.trial.note or {}).get(CONVERGED) is False:
+        out.say("the design of the controller did not converge: nearly the same task may have another controller.")
     if report["open"]:
         count = len(report["open"])
         out.say(f"{count} other {'trial is' if count == 1 else 'trials are'} open: {enumerated(report['open'], 10)}.")

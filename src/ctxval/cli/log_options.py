@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -43,12 +43,16 @@ Inputs = Annotated[
     typer.Option("--input", metavar="NAME=FIELD", help="Field of an input. Repeat --input in the model's order."),
 ]
 TimeField = Annotated[
-    str | None, typer.Option("--time", help="Column of the times (default: t, time, times or timestamp).")
+    str | None,
+    typer.Option(
+        "--time",
+        help="Column of the times, which may state a unit, such as clock_ms (default: t, time, times or timestamp).",
+    ),
 ]
 Dt = Annotated[
     float | None,
     typer.Option(
-        help="Time step in seconds to which the logs are resampled; it must be that of the model (default: the median "
+        help="Time step in seconds to which the logs are resampled; it must be that of the model (default: the mean "
         "period of the first state)."
     ),
 ]
@@ -79,24 +83,17 @@ class LogOptions:
     def read(
         self, logs: Sequence[Path], settings: Settings | None = None, experiment: Experiment | None = None
     ) -> Recordings:
-        """Return the recordings in logs.
-
-        Args:
-            logs: the files and folders.
-            settings: settings whose mapping is used if the command line states none.
-            experiment: an experiment that names the states and inputs, if the logs do not.
-
-        Raises:
-            InputError: if the options contradict each other, or the logs cannot be read.
-        """
+        """Return the recordings in logs."""
         changes = {"time": self.time, "dt": self.dt, "delay": self.delay}
         given = {name: value for name, value in changes.items() if value is not None}
-        found = read_recordings(logs, self._mapping(settings), **given)
-        named = experiment is not None and (experiment.states or experiment.inputs)
-        if not named or experiment is None or any((found.states | found.inputs).values()):
+        states, inputs = ({}, {}) if experiment is None else _names(experiment)
+        found = read_recordings(logs, self._mapping(settings), states=states, inputs=inputs, **given)
+        own = [*found.states.values(), *found.inputs.values()]
+        named = [*states.values(), *inputs.values()]
+        same = (len(states), len(inputs)) == (len(found.states), len(found.inputs))
+        if not same or set(states) & set(inputs) or any(a not in ("", b) for a, b in zip(own, named, strict=True)):
             return found
-        states, inputs = experiment.names(len(found.states), len(found.inputs))
-        return found if set(states) & set(inputs) else replace(found, states=states, inputs=inputs)
+        return replace(found, states=states, inputs=inputs)
 
     def _mapping(self, settings: Settings | None) -> LogMapping | None:
         """Return the mapping that is given; None for that of usual names."""
@@ -109,6 +106,15 @@ class LogOptions:
         if self.mapping is not None:
             return LogMapping.from_toml(self.mapping)
         return None if settings is None else settings.log_mapping
+
+
+def _names(experiment: Experiment) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the names and units of the states and inputs of an experiment, as far as they are known."""
+    system = experiment.validation.system
+    states, inputs = (getattr(experiment, kind) or getattr(system, kind, ()) for kind in ("states", "inputs"))
+    if not all(isinstance(one, Mapping | list | tuple) for one in (states, inputs)) or not states:
+        return {}, {}
+    return experiment.names(len(states), len(inputs))
 
 
 def _fields(given: Sequence[str]) -> dict[str, Field]:

@@ -65,16 +65,7 @@ PartOptions = Annotated[
 
 
 def named_values(given: Sequence[str] | None, flag: str = "--option", /, **named: Any) -> dict[str, Any]:
-    """Return the options that a command line states, by name.
-
-    Args:
-        given: texts ``name=value``; a value is a number, a Boolean, a list or a quoted text of TOML, or plain text.
-        flag: the command line option, for messages.
-        named: options that have a command line option of their own; None if it was not given.
-
-    Raises:
-        InputError: if a text is not ``name=value``, or if an option is given twice.
-    """
+    """Return the options that a command line states, by name."""
     found = {name: value for name, value in named.items() if value is not None}
     for text in given or ():
         name, equals, value = text.partition("=")

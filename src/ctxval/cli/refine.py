@@ -12,7 +12,7 @@ from rich.table import Table
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions
 from ctxval.cli.base import FALSIFIED, app, command, out
-from ctxval.cli.model_options import Vectorized, print_parameters, require_writable, step_function
+from ctxval.cli.model_options import Vectorized, print_parameters, require_model_file, step_function
 from ctxval.cli.options import (
     TARGET,
     AsJson,
@@ -24,6 +24,7 @@ from ctxval.cli.options import (
     Workers,
     named_values,
 )
+from ctxval.cli.outputs import Force
 from ctxval.cli.screen import line
 from ctxval.cli.trust import Named, Trust, open_store, require_limit, require_target
 from ctxval.config.references import reference, require_function
@@ -120,6 +121,7 @@ def refine_model(
     parameter: Bounds = None,
     vectorized: Vectorized = False,
     out_file: Out = None,
+    force: Force = False,
     confidence: Confidence = None,
     stochastic: Stochastic = None,
     seed: Seed = None,
@@ -137,7 +139,7 @@ def refine_model(
     was designed, and for no other one; what was recorded goes on teaching.
     """
     chosen = _method(method, fit, step, parameter, vectorized)
-    require_writable(out_file)
+    require_model_file(out_file, [target, experiment], force=force)
     opened = _opened(target, seed, option, experiment, trust).certified_as(confidence, stochastic)
     settings = opened.settings
     limit = require_limit(opened.experiment, settings, threshold, "a refinement")

@@ -12,6 +12,7 @@ from rich.table import Table
 from ctxval.cli.base import app, command, out
 from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingFile, States, TimeField, print_breaks
 from ctxval.cli.options import AsJson, named_values
+from ctxval.cli.outputs import Force, require_outputs
 from ctxval.cli.screen import line
 from ctxval.config.named_model import named_model
 from ctxval.config.settings import read_settings
@@ -75,6 +76,7 @@ def replay(
     executions: Executions = 10,
     seed: Seed = 0,
     html: Html = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> Any:
     """Compare a model with recordings of its system. Nothing is executed, and no experiment file is needed.
@@ -83,6 +85,7 @@ def replay(
     how much of them a better model could explain, and mistakes of timing. With --experiment it also predicts the worst
     tasks, and proposes the executions that would tell most.
     """
+    require_outputs({"--html .html": html}, [*logs, model, experiment, mapping], force=force)
     settings = None if experiment is None else read_settings(experiment, {})
     made = None if settings is None else settings.load()
     if model is None and made is None:
@@ -120,11 +123,7 @@ def _name(model: str | None, experiment: Experiment | None) -> str:
 
 
 def numbers(text: str) -> list[int]:
-    """Return the numbers of steps in a text with commas between them.
-
-    Raises:
-        InputError: if a part is no positive integer.
-    """
+    """Return the numbers of steps in a text with commas between them."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and int(part) > 0 for part in parts):
         raise InputError(f"--steps must be positive integers with commas between them, such as 1,10,50, got {text!r}.")

@@ -9,18 +9,19 @@ from typing import Annotated, Any
 import typer
 
 from ctxval import report as reports
+from ctxval._util.checked import PositiveFloat, require
+from ctxval._util.files import write_text
 from ctxval.certificates import KINDS, CertificateOptions
-from ctxval.certificates.verdict import require_threshold
 from ctxval.cli.base import FALSIFIED, app, command, out
 from ctxval.cli.certify import KindOptions, Volume
 from ctxval.cli.options import AsJson, Confidence, StoreArgument, Threshold, named_values
+from ctxval.cli.outputs import Force, require_outputs
 from ctxval.cli.trust import Named, Trust, open_store
 from ctxval.config.settings import Settings
 from ctxval.config.stored_settings import planned_settings
 from ctxval.core.labels import Labels, labels_of
 from ctxval.errors import CtxvalError
 from ctxval.report.context import ReportContext, context_of_campaign, context_of_store
-from ctxval.report.twins import write_text
 from ctxval.storage.store import Store
 
 Page = Annotated[
@@ -57,7 +58,8 @@ class _Asked:
 
     def limit(self, *planned: float | None) -> float | None:
         """Return the threshold of the command line, or else the first one that is planned; None if there is none."""
-        return next((require_threshold(one) for one in (self.threshold, *planned) if one is not None), None)
+        given = next((one for one in (self.threshold, *planned) if one is not None), None)
+        return require("threshold", PositiveFloat | None, given)  # type: ignore[no-any-return]
 
     def options(self, settings: Settings) -> CertificateOptions:
         """Return the certificate, with the settings of the campaign for what is not asked."""
@@ -77,6 +79,7 @@ def write_report(
     option: KindOptions = None,
     junit: JUnit = None,
     markdown: Markdown = None,
+    force: Force = False,
     experiment: Named = None,
     trust: Trust = False,
     as_json: AsJson = False,
@@ -89,9 +92,12 @@ def write_report(
     Options that are not given have the values that the campaign was run with.
     """
     opened = Store.existing(store)
+    target = page_path(store) if page is None else page
+    require_outputs(
+        {"--out .html": target, "--junit .xml": junit, "--markdown .md": markdown}, [store, experiment], force=force
+    )
     asked = _Asked(threshold, confidence, kind, named_values(option, volume=volume))
     context = _context(opened, store, asked, experiment, trust)
-    target = page_path(store) if page is None else page
     written = {"report": str(reports.write_page(context, target))}
     if junit is not None:
         written["junit"] = str(write_text(junit, reports.junit(context)))

@@ -21,6 +21,7 @@ from ctxval.cli.base import (
     command,
     err,
     failures_of,
+    out,
     print_failures,
     print_other_stores,
     print_table,
@@ -47,6 +48,7 @@ from ctxval.cli.report import page_path
 from ctxval.cli.trust import AcceptChange, limit_of, require_limit
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment
+from ctxval.core.trial import designs_sentence
 from ctxval.core.truth import Truth
 from ctxval.errors import InputError
 from ctxval.report.context import context_of_campaign
@@ -141,19 +143,22 @@ def run(
     """
     options = named_values(option, variant=variant, model=model, dim=dim)
     given = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence, "seed": seed}
-    settings = read_settings(target, {**given, "store": store, "options": options})
+    loop = {"until_decided": until_decided or None, "audited": audited or None}
+    settings = read_settings(target, {**given, **loop, "store": store, "options": options})
     settings = settings.certified_as({"stochastic": stochastic, "resolution": resolution})
     experiment = settings.load()
-    if audited and not until_decided:
+    if settings.audited and not settings.until_decided:
         raise InputError("--audited needs --until-decided.")
-    certificate = settings.certificate_options  # it is checked before executions are paid for
+    certificate = settings.certificate_options
     if truth:
         _require_truth(experiment)  # before executions are paid for
     limit = limit_of(experiment, settings)
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
     total = experiment.budget if settings.budget is None else settings.budget
-    execute = _until_decided(campaign, experiment, settings, audited) if until_decided else campaign.run
+    if limit is not None:
+        certificate.kind.require_usable(certificate.confidence, total)  # before executions are paid for
+    execute = _until_decided(campaign, experiment, settings) if settings.until_decided else campaign.run
     with worker_options(workers, dask, timeout) as execution:
         execute(budget=total, **execution)
     known = experiment.truth() if truth and experiment.truth is not None else None
@@ -175,12 +180,10 @@ def _status(campaign: Campaign, verdict: Verdict | None) -> int:
     return FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
 
-def _until_decided(
-    campaign: Campaign, experiment: Experiment, settings: Settings, audited: bool
-) -> Callable[..., Campaign]:
+def _until_decided(campaign: Campaign, experiment: Experiment, settings: Settings) -> Callable[..., Campaign]:
     limit = require_limit(experiment, settings, None, "--until-decided")
     return functools.partial(
-        campaign.run_until_decided, limit, certificate=settings.certificate_options, audited=audited
+        campaign.run_until_decided, limit, certificate=settings.certificate_options, audited=settings.audited
     )
 
 
@@ -210,6 +213,7 @@ def _report(
         "executions": campaign.executions,
         "failed": len(campaign.failed),
         "failures": failures_of(campaign.failed),
+        "controllers": designs_sentence(campaign.trials),
         "worst": worst_of(campaign.worst),
         "estimate": campaign.estimate,
         "units": experiment.units,
@@ -274,6 +278,7 @@ def _true_curve(experiment: Experiment) -> plot.Curve | None:
 
 def _print_report(report: dict[str, Any], verdict: Verdict | None) -> None:
     apart = (
+        "controllers",
         "failures",
         "verdict",
         "reason",
@@ -286,6 +291,8 @@ def _print_report(report: dict[str, Any], verdict: Verdict | None) -> None:
     )
     shown = {key: value for key, value in report.items() if key not in apart}
     print_table(shown, units=report["units"])
+    if verdict is None and report["controllers"]:  # a verdict says it
+        out.say(f"{report['controllers']}.", wrap=True)
     print_failures(report["failures"])
     if verdict is not None:
         print_verdict(verdict)

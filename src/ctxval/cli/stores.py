@@ -8,8 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
+from ctxval._util.files import MADE_BY
 from ctxval.cli.base import app, command, failures_of, out, print_failures, print_table, worst_of
 from ctxval.cli.options import AsJson, StoreArgument
+from ctxval.cli.outputs import Force, require_folder
 from ctxval.errors import StoreAccessError
 from ctxval.storage.recovery import export, recover
 from ctxval.storage.store import Store
@@ -23,7 +25,8 @@ _SENTENCES = 20
 def status(store: StoreArgument, as_json: AsJson = False) -> Any:
     """Summarise the trials in a store. Nothing is executed."""
     opened = Store.existing(store)
-    description, trials = opened.description(), opened.trials()
+    with opened.snapshot():
+        description, trials, changes = opened.description(), opened.trials(), opened.history()
     search = description.get("search")
     report: dict[str, Any] = {
         "case": description.get("name"),
@@ -37,7 +40,7 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
         "worst": worst_of(
             max((t for t in trials if t.distance is not None), key=lambda t: t.distance or 0, default=None)
         ),
-        "changes": [asdict(change) for change in opened.history()],
+        "changes": [asdict(change) for change in changes],
         "store": str(store),
     }
     if not as_json:
@@ -57,6 +60,7 @@ def export_store(
     folder: Annotated[
         Path | None, typer.Option("--out", help="Output folder (default: a folder next to the store).")
     ] = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> Any:
     """Write the trials of a store as CSV and JSON.
@@ -67,6 +71,7 @@ def export_store(
     if found.damaged and not found.trials and not found.trajectories:
         raise StoreAccessError(f"nothing can be read from {store}: it is not a store, or it is damaged completely.")
     target = store.with_suffix(".export") if folder is None else folder
+    require_folder(target, ("trials.json", "trials.csv", "trajectories"), MADE_BY, force=force)
     export(found, target)
     report = {
         "trials": len(found.trials),

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
+from ctxval._util.checked import PositiveFloat, require
 from ctxval.campaign.campaign import Campaign
-from ctxval.certificates.verdict import require_threshold
 from ctxval.cli.base import err
 from ctxval.cli.options import TARGET
 from ctxval.config.settings import Settings, not_an_experiment
@@ -59,26 +59,17 @@ class Opened:
 def limit_of(experiment: Experiment, settings: Settings, given: float | None = None) -> float | None:
     """Return the threshold of the verdict: the given one, or else that of the settings, or else of the experiment."""
     known = (one for one in (given, settings.threshold, experiment.threshold) if one is not None)
-    threshold = next(known, None)
-    return None if threshold is None else require_threshold(threshold)
+    return require("threshold", PositiveFloat | None, next(known, None))  # type: ignore[no-any-return]
 
 
 def require_target(target: str) -> None:
-    """Check that an argument that names no store may name an experiment.
-
-    Raises:
-        InputError: if it is a file of another kind.
-    """
+    """Check that an argument that names no store may name an experiment."""
     if Path(target).suffix not in ("", ".toml") and ":" not in target:
         raise InputError(not_an_experiment(target, f"a store ({', '.join(STORE_SUFFIXES)})"))
 
 
 def require_limit(experiment: Experiment, settings: Settings, given: float | None, what: str) -> float:
-    """Return the threshold of the verdict.
-
-    Raises:
-        InputError: if there is none; the message says what needs one.
-    """
+    """Return the threshold of the verdict."""
     limit = limit_of(experiment, settings, given)
     if limit is None:
         raise InputError(f"{what} needs a threshold: give --threshold.")
@@ -86,11 +77,7 @@ def require_limit(experiment: Experiment, settings: Settings, given: float | Non
 
 
 def settings_of(store: Store, experiment: str | None, trust: bool) -> Settings:
-    """Return the settings that the experiment of a store is built from.
-
-    Raises:
-        InputError: if the settings name code that the user has not allowed to run.
-    """
+    """Return the settings that the experiment of a store is built from."""
     if experiment is not None and trust:
         raise InputError("--trust and --experiment cannot be given together.")
     return trusted_settings(store, experiment=experiment, trust=trust)
@@ -105,20 +92,7 @@ def open_store(
     *,
     remeasure: bool = False,
 ) -> Opened:
-    """Build the experiment of a store, and its campaign.
-
-    Args:
-        store: the store.
-        path: the path of its file, as the user typed it.
-        experiment: the experiment that the user names; None to use the one that the store names.
-        trust: whether the user trusts the code that the store names.
-        accept_change: the reason why the experiment may differ from the stored one; None if it may not.
-        remeasure: whether the distance may differ from the stored one.
-
-    Raises:
-        InputError: if the store names code that the user has not allowed to run.
-        StoreError: if another experiment made the store.
-    """
+    """Build the experiment of a store, and its campaign."""
     settings = settings_of(store, experiment, trust)
     asked = (trust or experiment is not None) and not verifies(store.settings())
     made = _load(settings)

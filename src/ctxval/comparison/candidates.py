@@ -9,8 +9,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.describe import differences
-from ctxval._util.representation import call
+from ctxval._util.describe import describe, differences
 from ctxval.campaign import Campaign
 from ctxval.campaign.history import executed_trials
 from ctxval.campaign.trials import TrialRecorder
@@ -71,9 +70,6 @@ class TrialNote:
             tuple(note.get("decided") or ()),
         )
 
-    def __repr__(self) -> str:
-        return call(self, self.step, question=self.question, draw=self.draw, shared=self.shared)
-
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -130,9 +126,6 @@ class Candidate:
             if number in self._trajectories:
                 yield trial, self._trajectories[number]
 
-    def __repr__(self) -> str:
-        return call(self, self.name, executions=len(self.executed), shared=len(self.shared), largest=self.largest)
-
 
 def is_shared(trial: Trial) -> bool:
     """Return whether the execution of a trial is that of another candidate."""
@@ -141,23 +134,15 @@ def is_shared(trial: Trial) -> bool:
 
 
 def require_comparable(candidates: Mapping[str, Validation]) -> None:
-    """Check that the candidates have the same system, the same tasks and distances of the same unit.
-
-    Args:
-        candidates: the candidates by name.
-
-    Raises:
-        InputError: if there are fewer than two, people execute the system, or they cannot be compared; the message
-            names what differs.
-    """
+    """Check that the candidates have the same system, the same tasks and distances of the same unit."""
     if len(candidates) < 2:
         raise InputError(f"a comparison needs at least two candidates, got {len(candidates)}.")
     if any(getattr(one.system, "manual", False) for one in candidates.values()):
         raise InputError("candidates cannot be compared on a system that people execute.")
     (first, expected), *others = candidates.items()
-    described = expected.describe()
+    described = _comparable(expected)
     for other, validation in others:
-        found = validation.describe()
+        found = _comparable(validation)
         for part, what in (("space", "task spaces"), ("tasks", "tasks"), ("system", "systems")):
             unequal = next(differences(described[part], found[part], part), None)
             if unequal is not None:
@@ -170,3 +155,11 @@ def require_comparable(candidates: Mapping[str, Validation]) -> None:
                 f"the distances of {first} and {other} must have the same unit, got "
                 f"{expected.labels.units or 'none'!r} and {validation.labels.units or 'none'!r}."
             )
+
+
+def _comparable(validation: Validation) -> dict[str, Any]:
+    """Return the description of a validation, and three of its tasks."""
+    space = validation.space
+    probes = (space.low, 0.5 * (space.low + space.high), space.high)
+    tasks = [describe(validation.task(space.parameters(point))) for point in probes]
+    return {**validation.describe(), "tasks": tasks}

@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
-from ctxval._util.arrays import count_from_zero, positive_count
+from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked, require
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import Campaign
 from ctxval.certificates.options import CONFIDENCE, require_confidence
@@ -27,15 +25,19 @@ BUDGET = 100
 Compared = Validation | Experiment | Campaign
 
 
+Asked = Literal["worst", "mean", "both"]
+
+
+@checked
 def compare(
     candidates: Mapping[str, Compared],
     *,
-    question: Literal["worst", "mean", "both"] = "both",
-    budget: int = BUDGET,
+    question: Asked = "both",
+    budget: PositiveInt = BUDGET,
     confidence: float = CONFIDENCE,
-    seed: int = 0,
+    seed: NonNegativeInt = 0,
     stores: str | Path | None = None,
-    largest_possible: float | None = None,
+    largest_possible: PositiveFloat | None = None,
     stochastic: bool = False,
     on_trial: OnTrial | None = None,
     progress: bool | None = None,
@@ -70,8 +72,6 @@ def compare(
         StoreError: if a store cannot be used, or another experiment made it.
         ModelError, DesignError, DistanceError: as in :meth:`ctxval.Campaign.run`; what was executed is stored.
     """
-    if not isinstance(candidates, Mapping):
-        raise InputError(f"candidates must be a mapping of names to validations, got {type(candidates).__name__}.")
     made = [Candidate(str(name), _campaign(str(name), one, stores, seed)) for name, one in candidates.items()]
     race = race_of(
         made,
@@ -87,29 +87,21 @@ def compare(
         return race.run()
 
 
+@checked
 def race_of(
     candidates: list[Candidate],
     question: str,
     *,
-    budget: int,
-    confidence: float,
-    seed: int,
-    largest_possible: float | None = None,
+    budget: PositiveInt,
+    confidence: Probability,
+    seed: NonNegativeInt,
+    largest_possible: PositiveFloat | None = None,
     stochastic: bool = False,
     on_trial: OnTrial | None = None,
 ) -> Race:
-    """Return the comparison of campaigns; the arguments are those of :func:`compare`.
-
-    Raises:
-        InputError: if a value cannot be used.
-    """
+    """Return the comparison of campaigns; the arguments are those of :func:`compare`."""
+    require("question", Asked, question)
     known: dict[str, tuple[Question, ...]] = {"worst": ("worst",), "mean": ("mean",), "both": ("worst", "mean")}
-    if question not in known:
-        raise InputError(f"question must be worst, mean or both, got {question!r}.")
-    total = positive_count("budget must be a positive integer", budget)
-    from_seed = count_from_zero("seed", seed)
-    if largest_possible is not None and not 0 < largest_possible < np.inf:
-        raise InputError(f"largest_possible must be a positive number, got {largest_possible!r}.")
     if stochastic and question != "mean":
         raise InputError(
             f"question must be mean for a stochastic system, got {question!r}: an execution may have a larger distance "
@@ -119,9 +111,9 @@ def race_of(
     return Race(
         candidates,
         known[question],
-        budget=total,
+        budget=budget,
         confidence=float(confidence),
-        seed=from_seed,
+        seed=seed,
         largest_possible=largest_possible,
         stochastic=stochastic,
         on_trial=on_trial,

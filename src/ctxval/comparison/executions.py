@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.comparison.candidates import Candidate, TrialNote, is_shared
@@ -78,17 +77,7 @@ class Executions:
         return [(trial, trajectory) for _, _, trial, trajectory in ordered]
 
     def execute(self, candidate: Candidate, choice: Choice, note: TrialNote, *, predicts: bool) -> None:
-        """Execute one task, and record the execution for the others.
-
-        Args:
-            candidate: the candidate whose controller is used.
-            choice: the task.
-            note: what is stored with the trial.
-            predicts: whether the execution is predicted, and the prediction stored, before it is made.
-
-        Raises:
-            ModelError, DesignError, DistanceError: as in :meth:`ctxval.Campaign.run`.
-        """
+        """Execute one task, and record the execution for the others."""
         stored = replace(note, decided=self.kept()).to_note()
         whole = replace(choice, note={**(choice.note or {}), **stored}, planned_draws=0)
         self._run(candidate, whole, predicts)
@@ -134,7 +123,7 @@ class Executions:
         if known is not None and (known.state != "open" or known.attempts):
             return
         try:
-            plan = other.recorder.validation.plan(other.recorder.validation.space.from_unit(trial.unit_point))
+            plan = other.recorder.plan(trial)
         except CtxvalError:  # this candidate has no controller for the task
             return
         if not agrees(plan, trajectory):
@@ -144,7 +133,9 @@ class Executions:
                 own = replace(
                     self.note_for(other, trial, note), shared=(candidate.name, trial.number), decided=self.kept()
                 )
-                choice = Choice(trial.unit_point, trial.origin, planned_draws=0, note=own.to_note())
+                choice = Choice(
+                    trial.unit_point, trial.origin, planned_draws=0, note=own.to_note(), parameters=trial.parameters
+                )
                 with other.recorder.predicting(note.question == "worst"):
                     known = other.recorder.open(choice).trial
             try:
@@ -174,9 +165,6 @@ class Executions:
             and (other.name, trial.number) not in own
             and (self._hidden is None or not np.array_equal(trial.unit_point, self._hidden))
         ]
-
-    def __repr__(self) -> str:
-        return call(self, executions=self.count, candidates=[one.name for one in self.candidates])
 
 
 @dataclass(frozen=True, eq=False)

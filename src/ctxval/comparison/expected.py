@@ -9,7 +9,6 @@ from itertools import combinations
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call
 from ctxval.campaign.choices import Choice
 from ctxval.certificates.difference import MeanDifference, PairedDifferences, mean_difference
 from ctxval.comparison.candidates import Candidate, TrialNote
@@ -58,9 +57,10 @@ class MeanQuestion:
 
         It depends on all models, so that a model that is learned again with the draws is not judged by them.
         """
-        models = [number for one in self.candidates for number in one.recorder.draws.of_model(one.trials)]
+        models = [one.recorder.draws.of_model() for one in self.candidates]
         rng = np.random.default_rng([self.seed, draw, _DRAWS, *models])
-        return np.asarray(self.candidates[0].campaign.validation.space.unit_draws(1, rng)[0])
+        space = self.candidates[0].campaign.validation.space
+        return np.asarray(space.rounded(space.unit_draws(1, rng)[0]))
 
     def draws_of(self, candidate: Candidate) -> dict[int, tuple[Trial, TrialNote]]:
         """Return the trials of the draws that have ended, by the number of the draw."""
@@ -112,12 +112,7 @@ class MeanQuestion:
         ]  # fmt: skip
 
     def step(self, left: int) -> bool:
-        """Execute the next draw with one candidate; return False if there is nothing to execute.
-
-        Args:
-            left: the number of executions that are left. A draw is begun only if they are likely to suffice for all
-                candidates.
-        """
+        """Execute the next draw with one candidate; return False if there is nothing to execute."""
         active = [one for one in self.candidates if any(one in pair for pair in self.undecided)]
         if not active:
             return False
@@ -155,6 +150,3 @@ class MeanQuestion:
         found = self.predictions[candidate.name].of_draw(known, point, note.draw or 0, self.most)
         value, centre = (None, None) if found is None else found
         return TrialNote(note.step, "mean", note.draw, value, centre)
-
-    def __repr__(self) -> str:
-        return call(self, confidence=self.confidence, most=self.most)

@@ -8,7 +8,6 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
-from ctxval._util.representation import call
 from ctxval.comparison.candidates import Candidate
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning import DistancePredictor
@@ -97,6 +96,3 @@ class Predictions:
                 found = None
             self._last = key, found
         return self._last[1]
-
-    def __repr__(self) -> str:
-        return call(self, self.candidate)

@@ -69,13 +69,7 @@ class Race:
         return replace(note, predicted=None)
 
     def run(self) -> Comparison:
-        """Execute tasks until all pairs are decided or the budget is spent.
-
-        Raises:
-            StoreAccessError: if another process is running a store.
-            ModelError, DesignError, DistanceError: as in :meth:`ctxval.Campaign.run`.
-            InputError: if people execute the system, or an executed distance exceeds the largest possible one.
-        """
+        """Execute tasks until all pairs are decided or the budget is spent."""
         with ExitStack() as stack:
             for candidate in self.candidates:
                 stack.enter_context(candidate.campaign.store.sole_writer())

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ctxval._util.files import MADE_BY
 from ctxval._util.texts import markdown_text
 from ctxval.certificates.bounds import at_most
 from ctxval.comparison.result import WORDS, CandidateResult, Comparison, PairResult
@@ -76,6 +77,7 @@ def markdown(comparison: Comparison) -> str:
         _reasons(comparison),
         "It assumes that",
         "\n".join(f"- {markdown_text(assumption)};" for assumption in comparison.assumptions),
+        f"<!-- {MADE_BY} -->",
     ]
     return "\n\n".join(parts) + "\n"
 

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call, record
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.until_decided import UntilDecided
@@ -70,9 +69,6 @@ class WorstDecision:
             )
         except (KeyError, TypeError, ValueError):
             return None
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 @dataclass(eq=False)
@@ -209,9 +205,6 @@ class WorstQuestion:
     def kept(self) -> tuple[dict[str, Any], ...]:
         """Return all decisions as the note of the next trial keeps them."""
         return tuple(dict(vars(one)) for one in self._decided.values())
-
-    def __repr__(self) -> str:
-        return call(self, decided=len(self.decisions), undecided=len(self.undecided) // 2)
 
 
 def _trusted(candidate: Candidate) -> bool:

@@ -28,7 +28,6 @@ class CertificateTable(BaseModel):
         volume: the share of the task space that may exceed the threshold.
         resolution: the largest distance between a task and its nearest trial, in diagonals of the task space.
         discard: the number of largest distances to discard, for ``sampling-discarding``.
-        constant: the constant C, for ``convergence``.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -38,7 +37,6 @@ class CertificateTable(BaseModel):
     volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
     resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
     discard: int | None = Field(default=None, ge=0)
-    constant: float | None = None
 
     @model_validator(mode="after")
     def _used(self) -> CertificateTable:
@@ -67,19 +65,7 @@ class CertificateTable(BaseModel):
     def options(
         self, confidence: float, *, kind: str | None = None, stated: Mapping[str, Any] | None = None
     ) -> CertificateOptions:
-        """Return the kind, the options and the confidence of the certificate for the verdict.
-
-        Args:
-            confidence: the confidence level of the certificate.
-            kind: if it is another kind than that of the table, it replaces it, and the options of the table's own kind
-                are not used.
-            stated: options that override those of the table; no value is None.
-
-        Raises:
-            UnknownNameError: if there is no such kind or no such option.
-            CertificateError: if an option is for other kinds, or has a value that the kind does not allow.
-            InputError: if an option has the wrong type, or if the confidence or the volume is out of range.
-        """
+        """Return the kind, the options and the confidence of the certificate for the verdict."""
         given, chosen = dict(stated or {}), KINDS.find(kind or self.kind)
         planned_kind = kind is None or kind == self.kind
         if planned_kind and self.kind not in KINDS.imported:
@@ -91,9 +77,5 @@ class CertificateTable(BaseModel):
 
 
 def typed(kind: type[CertificateKind], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a kind, with lists converted to tuples if the kind takes tuples.
-
-    Raises:
-        InputError: if an option does not have the type that the kind declares.
-    """
+    """Return the options of a kind, with lists converted to tuples if the kind takes tuples."""
     return require_types(f"certificate {kind.name!r}", kind, options)

@@ -12,6 +12,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.costs import ThinkingCosts
+from ctxval.core.controller import converged_of
 from ctxval.core.experiment import Experiment, mixed_units_sentence
 from ctxval.core.labels import labels_of
 from ctxval.core.plan import Plan
@@ -30,6 +31,9 @@ _EXECUTED = 3
 
 _LONG = 30.0
 """Seconds for a suggestion that the user should know of."""
+
+_ROUNDING = 1e-12
+"""Largest difference of a task in a batch, relative to the largest value of the task alone."""
 
 _SAME_START = 1e-6
 """Largest error of the initial state of an execution, in each state."""
@@ -54,13 +58,7 @@ class Checked:
 
 
 def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int = 0) -> list[Checked]:
-    """Check that the parts of an experiment fit together.
-
-    Args:
-        experiment: the experiment.
-        execute: whether to execute the middle task twice. If not, the system is not executed.
-        seed: the seed of the random tasks that are planned.
-    """
+    """Check that the parts of an experiment fit together."""
     validation = experiment.validation
     findings = [_space(validation)]
     plans: list[Plan] = []
@@ -121,6 +119,21 @@ def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Che
         f"{len(made)} tasks planned: {n} states, {m} inputs, {task.horizon} steps of {task.dt:g} s",
     )
     yield from _goals(validation, made)
+    told = [(plan, converged) for plan in made if (converged := converged_of(plan.controller)) is not None]
+    if told:
+        failed = [space.describe_point(plan.parameters.points) for plan, converged in told if not converged]
+        yield convergence(failed, len(told))
+
+
+def convergence(failed: Sequence[dict[str, Any]], designs: int) -> Checked:
+    """Return how many designs converged."""
+    name = "convergence of the designs"
+    if not designs:
+        return Checked(name, "skipped", "the controllers do not tell whether they converged")
+    if not failed:
+        return Checked(name, "ok", f"all {designs} designs converged")
+    examples = "; ".join(map(task_text, failed[:3]))
+    return Checked(name, "noted", f"{len(failed)} of {designs} designs did not converge, such as {examples}")
 
 
 def _goals(validation: Validation, made: Sequence[Plan]) -> Iterator[Checked]:
@@ -227,9 +240,7 @@ def _batches(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked]
         return
     for index, plan in enumerate(plans):
         one = batch[index]
-        if not np.array_equal(one.reference, plan.task.reference) or not np.array_equal(
-            one.initial_state, plan.task.initial_state
-        ):
+        if _differ(one.reference, plan.task.reference) or _differ(one.initial_state, plan.task.initial_state):
             yield Checked(
                 "batches",
                 "failed",
@@ -238,6 +249,13 @@ def _batches(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked]
             return
     check_synthesizer(validation.synthesizer, _first(batch, 4), validation.model)
     yield Checked("batches", "ok", "task function and synthesizer give the same results in a batch as alone")
+
+
+def _differ(one: Array, other: Array) -> bool:
+    """Return whether two arrays differ by more than rounding: algebra of a batch sums in another order."""
+    return one.shape != other.shape or not np.allclose(
+        one, other, rtol=0, atol=_ROUNDING * np.abs(other).max(initial=0)
+    )
 
 
 def _first(batch: Task, count: int) -> Task:

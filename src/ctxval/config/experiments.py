@@ -16,18 +16,7 @@ from ctxval.errors import CtxvalError, InputError
 
 
 def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path | None = None) -> Experiment:
-    """Return the experiment that the name of a case or a reference gives; a reference runs the code of its module.
-
-    Args:
-        text: the name of a case, or ``module:attr`` of an experiment or of a function that makes one.
-        seed: the seed of the data, and therefore of the model.
-        options: plain values that are passed on to the case or the function.
-        folder: the folder in which the module is searched; the current folder by default.
-
-    Raises:
-        UnknownNameError: if there is no such case or the case has no such option; the message has the nearest name.
-        InputError: if the experiment cannot be loaded or made.
-    """
+    """Return the experiment that the name of a case or a reference gives; a reference runs the code of its module."""
     if ":" in text:
         return _from_reference(text, seed, options, folder)
     if options:
@@ -39,10 +28,6 @@ def plain_options(case: str) -> dict[str, Any]:
     """Return the options of a case that a file or a command line can set, with their defaults.
 
     The default of an option that must be given is None.
-
-    Raises:
-        UnknownNameError: if there is no such case.
-        InputError: if the case belongs to an installed package and cannot be loaded.
     """
     try:
         hints = get_type_hints(cases.REGISTRY.find(case))

@@ -15,19 +15,7 @@ from ctxval.models.mujoco import is_sysid_result
 
 
 def named_model(text: str, options: Mapping[str, Any], dt: float | None = None) -> Model:
-    """Return a model.
-
-    Args:
-        text: an ONNX file; an MJCF file (.xml) or a folder with a result of ``mujoco.sysid``; an NPZ file that
-            ``ctxval fit`` wrote, or one with the matrices ``A`` and ``B`` of a linear model; an experiment file, whose
-            model is meant; ``module:attr`` of a model, or of a class or function that makes one, whose code is run; or
-            a name of the registry, such as ``Linear``.
-        options: the arguments of the model.
-        dt: the time step of the recordings, seconds, for a model of MuJoCo whose options state none.
-
-    Raises:
-        InputError: if there is no such model, or it cannot be made.
-    """
+    """Return a model."""
     path = Path(text)
     if path.suffix == ".toml":
         _require_no(options, f"the model of {text}")

@@ -24,9 +24,10 @@ from ctxval.core.model import Model
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.task import Task
 from ctxval.core.task_distribution import Normal
-from ctxval.core.trajectory import Trajectory, Transitions
-from ctxval.data import LogMapping, is_log, read_recordings
+from ctxval.core.trajectory import Transitions
+from ctxval.data import LogMapping, read_recordings
 from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
+from ctxval.models.saved import stored_transitions
 
 REGISTRIES: dict[str, Registry[Any]] = {
     registry.kind: registry
@@ -36,19 +37,7 @@ REGISTRIES: dict[str, Registry[Any]] = {
 
 
 def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) -> Any:
-    """Return a system, model, synthesizer or distance.
-
-    Args:
-        kind: ``system``, ``model``, ``synthesizer`` or ``distance``.
-        given: ``module:attr``; or a table with ``type``, a name of the registry or ``module:attr``, and its arguments.
-            An argument ``{ref = "module:attr"}`` stands for the object of this name. If a model has the argument
-            ``data``, it is learned from these files of trajectories.
-        folder: the folder of files and modules; the current folder by default.
-
-    Raises:
-        UnknownNameError: if there is no such part, or it takes no such argument.
-        InputError: if the part cannot be made; the message gives the reason.
-    """
+    """Return a system, model, synthesizer or distance."""
     registry = REGISTRIES[kind]
     table = {"type": given} if isinstance(given, str) else dict(given)
     name = table.pop("type", None)
@@ -112,11 +101,7 @@ def _with_paths(declared: Declaration, table: Mapping[str, Any], folder: Path | 
 
 
 def argument(value: Any, folder: Path | None = None) -> Any:
-    """Return an argument unchanged, or the object that ``{ref = "module:attr"}`` names.
-
-    Raises:
-        InputError: if the object cannot be loaded, or is a builtin function, a method or a module.
-    """
+    """Return an argument unchanged, or the object that ``{ref = "module:attr"}`` names."""
     if isinstance(value, Mapping):
         if set(value) == {"ref"}:
             return _referred(str(value["ref"]), folder)
@@ -132,16 +117,7 @@ def _referred(text: str, folder: Path | None) -> Any:
 
 
 def recorded(files: Any, folder: Path | None = None) -> Transitions:
-    """Return the transitions in recorded trajectories, in logs, or in an NPZ file with x, u and x_next.
-
-    Args:
-        files: one path or a list of paths; or a mapping of logs (see :class:`ctxval.data.LogMapping`) with such paths
-            as ``logs``.
-        folder: the folder of the files; the current folder by default.
-
-    Raises:
-        InputError: if a file cannot be read.
-    """
+    """Return the transitions in recorded trajectories, in logs, or in an NPZ file with x, u and x_next."""
     mapping = None
     if isinstance(files, Mapping):
         mapping = LogMapping.from_table({key: value for key, value in files.items() if key != "logs"})
@@ -150,25 +126,25 @@ def recorded(files: Any, folder: Path | None = None) -> Transitions:
     if not isinstance(paths, list) or not paths or not all(isinstance(path, str) for path in paths):
         raise InputError(f"data must be a file of recorded trajectories or a list of files, got {files!r}.")
     found = [Path(folder or "", path) for path in paths]
-    if mapping is not None:
-        return read_recordings(found, mapping).transitions()[0]
-    return Transitions.joined([_transitions(path) for path in found])
+    steps = [None if mapping is not None else _transitions(path) for path in found]
+    parts = [one for one in steps if one is not None]
+    logs = [path for path, one in zip(found, steps, strict=True) if one is None]
+    kinds = dict.fromkeys("" if mapping is not None else path.suffix for path in logs)
+    for suffix in kinds:  # arrays in NPZ files have other names than columns
+        parts.append(read_recordings([one for one in logs if suffix in ("", one.suffix)], mapping).transitions()[0])
+    return Transitions.joined(parts)
 
 
-def _transitions(path: Path) -> Transitions:
-    if is_log(path):
-        return read_recordings([path]).transitions()[0]
+def _transitions(path: Path) -> Transitions | None:
+    """Return the transitions in an NPZ file with x, u and x_next; None if the file is another one."""
     if path.suffix != ".npz":
-        return Trajectory.from_csv(path).transitions()
+        return None
     try:
-        arrays = Archive(read_bytes(path))
-        if "x_next" in arrays:
-            return Transitions(*(arrays.numbers(name) for name in ("x", "u", "x_next")))
+        return stored_transitions(Archive(read_bytes(path)))
     except ShapeError:
         raise
     except InputError as error:
         raise InputError(f"{path} cannot be read as recorded data: {error}.") from error
-    return Trajectory.from_npz(path).transitions()
 
 
 # Tasks
@@ -211,11 +187,7 @@ _TASK_KEYS = ("initial_state", "goal", "horizon", "dt")
 
 
 def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any, folder: Path | None = None) -> Any:
-    """Return the map p -> task of an experiment file, from ``module:attr`` or from a table.
-
-    Raises:
-        InputError: if an entry of the table is missing, or if a name is not that of a task parameter.
-    """
+    """Return the map p -> task of an experiment file, from ``module:attr`` or from a table."""
     if isinstance(given, str):
         return require_function(f"the task {given}", reference(given, folder), "p -> Task")
     for key in given:
@@ -252,11 +224,7 @@ def _components(name: str, entries: Any) -> tuple[float | str, ...]:
 
 
 def require_types(what: str, function: Any, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options, with lists converted to tuples.
-
-    Raises:
-        InputError: if an option does not have the type of the function's annotation.
-    """
+    """Return the options, with lists converted to tuples."""
     target = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
     try:
         hints = get_type_hints(target)
@@ -284,11 +252,7 @@ def _typed(what: str, hint: Any, value: Any) -> Any:
 
 
 def space_of(bounds: Mapping[str, Sequence[Any]]) -> TaskSpace:
-    """Return a task space from ``name = [low, high, "unit"]``.
-
-    Raises:
-        InputError: if bounds are not valid.
-    """
+    """Return a task space from ``name = [low, high, "unit"]``."""
     return TaskSpace(**{name: tuple(bound) for name, bound in bounds.items()})
 
 
@@ -303,10 +267,6 @@ def with_distribution(
             ``{ref = "module:attr"}`` of a frozen distribution of scipy.stats; or only ``sampler``, the reference of a
             function ``(rng, n) -> tasks (n, d)``.
         folder: the folder of the modules; the current folder by default.
-
-    Raises:
-        UnknownNameError: if there is no such parameter, no such distribution, or it takes no such argument.
-        InputError: if an argument is missing or cannot be used.
     """
     if set(tables) == {"sampler"} and set(tables["sampler"]) == {"ref"} and "sampler" not in space.names:
         return space.sampled(argument(tables["sampler"], folder))

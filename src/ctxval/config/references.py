@@ -22,17 +22,7 @@ _added: set[str] = set()
 
 
 def reference(text: str, folder: Path | None = None) -> Any:
-    """Import ``module:attr``; this runs the module's code.
-
-    Args:
-        text: the reference.
-        folder: the folder that is searched first, before the installed modules; the current folder by default. A module
-            in the current folder is not found if another folder is given.
-
-    Raises:
-        InputError: if the text is not a reference, if the object cannot be loaded or is in Python's standard library,
-            or if another module of this name is already in use.
-    """
+    """Import ``module:attr``; this runs the module's code."""
     module, colon, attribute = text.partition(":")
     if not (colon and attribute and all(name.isidentifier() for name in module.split("."))):
         raise InputError(f"a reference must be module:attr, such as 'my_rig:experiment', got {text!r}.")
@@ -80,11 +70,7 @@ def _here() -> str:
 
 
 def _require_place(text: str, module: str, home: str) -> None:
-    """Check that a top-level module is found, and that no other module of this name is already loaded.
-
-    Raises:
-        InputError: if it is not found, or if another one is loaded.
-    """
+    """Check that a top-level module is found, and that no other module of this name is already loaded."""
     importlib.invalidate_caches()
     found = _found(module)
     own = found is not None and os.path.dirname(found) in (home, os.path.join(home, module))
@@ -105,11 +91,7 @@ def _require_place(text: str, module: str, home: str) -> None:
 
 
 def _require_apart(text: str, home: str) -> None:
-    """Check that no loaded module of another experiment's folder has the name of a module in this folder.
-
-    Raises:
-        InputError: if a module of the same name from another folder is in use.
-    """
+    """Check that no loaded module of another experiment's folder has the name of a module in this folder."""
     others = _added - {home}
     for name, loaded in list(sys.modules.items()):
         used = getattr(loaded, "__file__", None)
@@ -148,14 +130,6 @@ def require_part(registry: Registry[Any], what: str, found: Any) -> Any:
     """Return an object or a class if it can be a part of the kind.
 
     It must have the method of the kind; a model or a distance may also be a function.
-
-    Args:
-        registry: the registry of the kind.
-        what: the name of the object in the message.
-        found: the object or the class, which is not called here.
-
-    Raises:
-        InputError: if it does not have the method, or is not a function with the right arguments.
     """
     kind, method = registry.kind, str(registry.method)
     if isinstance(found, type):
@@ -179,9 +153,6 @@ def require_function(what: str, found: Any, form: str) -> Any:
         what: the name of the function in the message.
         found: the function.
         form: the arguments and the result, such as ``(x, u) -> x_next`` or ``p -> Task``.
-
-    Raises:
-        InputError: if it is not a function written in Python, or takes other arguments.
     """
     count = form.partition("->")[0].count(",") + 1
     if not is_function(found):

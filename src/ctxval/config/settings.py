@@ -22,7 +22,7 @@ from ctxval.config.experiments import named_experiment
 from ctxval.config.parts import argument, part, require_types, space_of, task_function, with_distribution
 from ctxval.config.signatures import code_named, signed
 from ctxval.core.experiment import Experiment
-from ctxval.core.labels import labels_of
+from ctxval.core.labels import Labels, labels_of
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping
 from ctxval.errors import InputError, UnknownNameError
@@ -47,15 +47,7 @@ class SearchTable(BaseModel):
     repeats: int = Field(default=1, ge=1)
 
     def build(self, folder: Path | None = None) -> Search:
-        """Return the search.
-
-        Args:
-            folder: the folder of the modules that the options name; the current folder by default.
-
-        Raises:
-            UnknownNameError: if there is no such search.
-            InputError: if the search does not take these options.
-        """
+        """Return the search."""
         options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
         options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
         return by_name(self.name, repeats=self.repeats, **options)
@@ -87,6 +79,7 @@ class Settings(BaseModel):
         budget, threshold, store: the budget, the threshold and the store of the campaign; None for those of the
             experiment.
         seed: the seed of the data, the model and the search.
+        until_decided, audited: as the options of ``ctxval run``, so that a store knows the command that made it.
         confidence: the confidence level of the certificate.
         certificate: the certificate for the verdict.
         search: the search, and its options.
@@ -115,6 +108,8 @@ class Settings(BaseModel):
     units: str | None = None
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
+    until_decided: bool = False
+    audited: bool = False
     confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
     certificate: CertificateTable = Field(default_factory=CertificateTable)
     seed: int = Field(default=0, ge=0)
@@ -126,11 +121,7 @@ class Settings(BaseModel):
     folder: Path | None = None
 
     def load(self) -> Experiment:
-        """Return the experiment.
-
-        Raises:
-            InputError: if it cannot be found or made.
-        """
+        """Return the experiment."""
         made = self._made()
         if self.refined is not None:
             made = replace(made, validation=_with_refined(made.validation, self._path(self.refined)), truth=None)
@@ -174,14 +165,9 @@ class Settings(BaseModel):
             model=part("model", self.model or {}, self.folder),
             synthesizer=part("synthesizer", self.synthesizer or {}, self.folder),
             distance=part("distance", self.distance or "FinalState", self.folder),
+            labels=Labels(labels_of(self.states), labels_of(self.inputs), self.units or ""),
         )
-        return Experiment(
-            self.name or "experiment",
-            validation,
-            units=self.units or "",
-            states=labels_of(self.states),
-            inputs=labels_of(self.inputs),
-        )
+        return Experiment(self.name or "experiment", validation)
 
     def campaign(
         self,
@@ -194,15 +180,6 @@ class Settings(BaseModel):
         """Return a campaign, and write these settings into its store, signed by this user.
 
         The signature lets later commands run the code that the settings name without asking.
-
-        Args:
-            experiment: the experiment that :meth:`load` returned.
-            store: the store, or its path.
-            accept_change, remeasure: as in :class:`ctxval.Campaign`.
-
-        Raises:
-            StoreError: if the store cannot be used, or another experiment made it.
-            InputError: if there is no such search, or the key of this user is damaged.
         """
         search = self.search.build(self.folder)
         campaign = Campaign(
@@ -221,14 +198,7 @@ class Settings(BaseModel):
         return campaign
 
     def certified_as(self, stated: dict[str, Any]) -> Settings:
-        """Return these settings with options of the certificate from the command line, which override the file.
-
-        Args:
-            stated: options of the certificate; None if an option was not given.
-
-        Raises:
-            InputError: if a value is not allowed.
-        """
+        """Return these settings with options of the certificate from the command line, which override the file."""
         given = {name: value for name, value in stated.items() if value is not None}
         try:
             table = CertificateTable.model_validate({**self.certificate.model_dump(), **given})
@@ -242,15 +212,7 @@ class Settings(BaseModel):
         return self.certificate.options(self.confidence)
 
     def aspect1_of(self, experiment: Experiment, tasks: int | None, threshold: float | None) -> Aspect1Report:
-        """Return whether the model of an experiment completes its tasks; S is never executed.
-
-        Args:
-            experiment: the experiment that :meth:`load` returned.
-            tasks, threshold: the number of simulated tasks and the threshold; None for those of the file.
-
-        Raises:
-            InputError: if the tasks have no goal and no distance is given, or a value cannot be used.
-        """
+        """Return whether the model of an experiment completes its tasks; S is never executed."""
         table = self.aspect1
         return check_aspect1(
             experiment.validation,
@@ -262,19 +224,11 @@ class Settings(BaseModel):
 
     @property
     def log_mapping(self) -> LogMapping | None:
-        """The mapping of logs; None if there is none.
-
-        Raises:
-            InputError: if it cannot be used.
-        """
+        """The mapping of logs; None if there is none."""
         return None if self.recordings is None else LogMapping.from_table(self.recordings)
 
     def store_path(self, name: str) -> Path:
-        """Return the path of the store: the given one, or a file in ``runs/`` with the names of experiment and search.
-
-        Args:
-            name: the name of the experiment.
-        """
+        """Return the path of the store: the given one, or a file in ``runs/`` named after experiment and search."""
         if self.store is not None:
             return self.store
         options = [f"{key}-{value}" for key, value in self.options.items()]
@@ -292,15 +246,7 @@ def _with_refined(validation: Validation, path: Path) -> Validation:
 
 
 def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
-    """Return the settings of a case, an experiment file or ``module:attr``.
-
-    Args:
-        target: ``pendulum``, ``experiment.toml`` or ``my_module:my_experiment``.
-        overrides: options of the command line, which override the file; None if an option was not given.
-
-    Raises:
-        InputError: if the file cannot be read, or a value is not allowed; the message names it.
-    """
+    """Return the settings of a case, an experiment file or ``module:attr``."""
     is_file = target.endswith(".toml")
     if not is_file and ":" not in target and Path(target).suffix:
         raise InputError(not_an_experiment(target))

@@ -11,6 +11,7 @@ import hmac
 import json
 import os
 import secrets
+import stat
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -34,11 +35,7 @@ _SHOWN = 160
 
 
 def key_path() -> Path:
-    """Return the path of this user's secret key: ``$XDG_STATE_HOME/ctxval/key``, or in %LOCALAPPDATA% on Windows.
-
-    Raises:
-        OSError: if this user has no home folder.
-    """
+    """Return the path of this user's secret key: ``$XDG_STATE_HOME/ctxval/key``, or in %LOCALAPPDATA% on Windows."""
     base = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_STATE_HOME", "")
     if os.path.isabs(base):
         return Path(base) / "ctxval" / "key"
@@ -49,15 +46,7 @@ def key_path() -> Path:
 
 
 def signed(settings: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings with a signature of this user; without one if the user's key cannot be made.
-
-    Args:
-        settings: plain values, as they are stored.
-        before: the settings that are stored now. If only the signatures differ, those of other users are kept.
-
-    Raises:
-        InputError: if the key is damaged.
-    """
+    """Return settings with a signature of this user; without one if the user's key cannot be made."""
     plain = _plain(settings)
     others = _signatures(before) if _plain(before) == plain else []
     try:
@@ -70,11 +59,7 @@ def signed(settings: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, 
 
 
 def verifies(settings: Mapping[str, Any]) -> bool:
-    """Return whether settings carry a valid signature of this user.
-
-    Raises:
-        InputError: if the user's key is damaged.
-    """
+    """Return whether settings carry a valid signature of this user."""
     signatures = _signatures(settings)
     try:
         key = _read_key(key_path()) if signatures else None
@@ -89,11 +74,7 @@ def unsigned(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def why_no_key() -> str | None:
-    """Return why this user cannot sign; None if there is a key or one can be made.
-
-    Raises:
-        InputError: if the key is damaged.
-    """
+    """Return why this user cannot sign; None if there is a key or one can be made."""
     try:
         _made_key()
     except OSError as error:
@@ -151,7 +132,14 @@ def _publish(name: str, path: Path) -> None:
 
 def _read_key(path: Path) -> bytes:
     with path.open("rb") as file:
+        mode = os.fstat(file.fileno()).st_mode
         key = file.read(_BYTES + 1)
+    if os.name == "posix" and mode & 0o077:
+        raise InputError(
+            f"the key {path} can be read or written by other users (mode {stat.filemode(mode)}), who may have signed "
+            "stores with it. Delete it: a new key is made, and for stores that carry the old signature the question is "
+            "asked again."
+        )
     if len(key) != _BYTES:
         raise InputError(
             f"the key {path} is damaged: it must have {_BYTES} bytes, got {len(key) if len(key) < _BYTES else 'more'}. "

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
+from ctxval._util.registry import declaration_of
 from ctxval.certificates import KINDS
+from ctxval.config.parts import REGISTRIES
 from ctxval.config.settings import Settings, read_settings, sentence_of
 from ctxval.config.signatures import code_named, unsigned, verifies
 from ctxval.errors import InputError
-from ctxval.searches.auto import present_options
 from ctxval.storage.store import Store
 
 
@@ -19,23 +22,12 @@ def stored_settings(store: Store) -> Settings:
     """Return the settings in a store, whoever wrote them.
 
     Do not build anything from them: :func:`trusted_settings` returns those that may be used.
-
-    Raises:
-        InputError: if the store has no settings, or they are not valid.
     """
     return _of_store(store.settings())
 
 
 def planned_settings(store: Store, kind: str | None = None) -> Settings:
-    """Return the settings in a store, as :func:`stored_settings` does; the defaults if no command made the store.
-
-    Args:
-        store: the store of the trials.
-        kind: the kind of certificate that the user asks for; None to use the kind in the store's settings.
-
-    Raises:
-        InputError: if the settings are not valid, or their certificate would run code that the user did not choose.
-    """
+    """Return the settings in a store, as :func:`stored_settings` does; the defaults if no command made the store."""
     kept = store.settings()
     if not kept:
         return Settings()
@@ -55,40 +47,35 @@ def _of_store(kept: dict[str, Any]) -> Settings:
             "the store does not name its experiment, because it was not made by a command: name the experiment with "
             "--experiment FILE.toml."
         )
-    plain, search = unsigned(kept), kept.get("search")
-    if isinstance(search, dict) and search.get("name") == "auto":
-        plain = {**plain, "search": present_options(search)}
     try:
-        return Settings.model_validate(plain)
+        return Settings.model_validate(unsigned(kept))
     except ValidationError as error:
         raise InputError(sentence_of("the store's settings", error)) from error
 
 
 def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool = False) -> Settings:
-    """Return the settings from which a store's experiment may be built.
-
-    Args:
-        store: the store. If its settings name code, this user must have signed them.
-        experiment: a case, a file or ``module:attr`` that the user names instead. The seed of the store is used all the
-            same, and its search if the search names no code.
-        trust: accept the settings of the store, whoever wrote them.
-
-    Raises:
-        InputError: if the settings name code that the user has not allowed to run; the message shows the code.
-    """
+    """Return the settings from which a store's experiment may be built."""
     kept = store.settings()
     if experiment is not None:
         return _named_again(kept, experiment)
     settings, code = _of_store(kept), code_named(kept)
-    if not code or (settings.folder is not None and verifies(kept)):
-        return settings
     folder = settings.folder or Path().resolve()
+    outside = [] if store.path is None else _files_outside(kept, folder, store.path.resolve().parent)
+    signed = (settings.folder is not None or not code) and verifies(kept)
+    if not (code or outside) or signed:
+        return settings
     if trust:
         return settings.model_copy(update={"folder": folder})
+    if not code:
+        raise InputError(
+            f"{store.path} names files outside its folder: {'; '.join(outside[:_SHOWN])}. You did not make the store "
+            "on this computer, or it was changed since. If you know its experiment, name it with --experiment "
+            "FILE.toml (or module:attr). If you trust the store, give --trust."
+        )
     more = f" and {len(code) - _SHOWN} more" if len(code) > _SHOWN else ""
     raise InputError(
         f"{store.path} would import or run code: {'; '.join(code[:_SHOWN])}{more}, from the folder "
-        f"{ascii(str(folder))[:200]}. You did not make the store on this computer, or it was changed since, or an "
+        f"{ascii(str(folder))[:_LONGEST]}. You did not make the store on this computer, or it was changed since, or an "
         "older version made it. If you know its experiment, name it with --experiment FILE.toml (or module:attr). If "
         "you trust the code that the store names, give --trust. The store then carries your signature, and the "
         "question will not be asked again."
@@ -96,7 +83,44 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
 
 
 _SHOWN = 8
-"""Largest number of pieces of code that the message shows."""
+"""Largest number of pieces of code, or of files, that a message shows."""
+
+_LONGEST = 200
+"""Largest number of characters of a file's name, or of a folder's, that a message shows."""
+
+_FILE_KEYS = {"refined", "data", "logs"}.union(
+    *(
+        declared.files
+        for one in REGISTRIES.values()
+        for name in one.built_in
+        if (declared := declaration_of(one.find(name)))
+    )
+)
+"""The keys of settings whose texts are paths."""
+
+
+def _files_outside(kept: dict[str, Any], folder: Path, home: Path) -> list[str]:
+    """Return the files that settings name outside a folder, each as a text to show."""
+    parts = {key: value for key, value in kept.items() if key in (*REGISTRIES, "refined")}
+    named = [name for text in _texts(parts, False) for name in (_IN_XML.findall(text) if "<" in text else [text])]
+    return [
+        ascii(name)[:_LONGEST] for name in named if "\0" in name or not (folder / name).resolve().is_relative_to(home)
+    ]
+
+
+def _texts(value: Any, path: bool) -> Iterator[str]:
+    """Yield the texts in settings that are paths, or a MuJoCo model as its text."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _texts(item, path or key in _FILE_KEYS)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _texts(item, path)
+    elif path and isinstance(value, str):
+        yield value
+
+
+_IN_XML = re.compile(r"""(?:file|dir)\s*=\s*["']([^"']+)""")
 
 
 def _named_again(kept: dict[str, Any], experiment: str) -> Settings:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.controllers.riccati import linear_gains
 from ctxval.core.controller import Limits
@@ -41,9 +40,6 @@ class Change:
         """Return the expected changes of steps of these lengths, shape ``(N,)``."""
         return length * self.slope + 0.5 * length**2 * self.curvature
 
-    def __repr__(self) -> str:
-        return call(self, tasks=len(self.slope))
-
 
 @dataclass(frozen=True, eq=False)
 class Policy:
@@ -58,9 +54,6 @@ class Policy:
     K: Array
     k: Array
     change: Change
-
-    def __repr__(self) -> str:
-        return call(self, gains=self.K, feedforward=self.k)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +76,6 @@ class Expansion:
     def linear(self) -> bool:
         """Whether the model is linear."""
         return self.A.ndim == 2 and self.B.ndim == 2
-
-    def __repr__(self) -> str:
-        return call(self, deviations=self.deviations, inputs=self.inputs)
 
 
 def minimise(cost: QuadraticCost, around: Expansion, limits: Limits | None, damping: Array) -> Policy:

@@ -33,11 +33,7 @@ class QuadraticCost:
             raise ShapeError(f"Q_final must have the shape of Q, {self.Q.shape}, got {self.Q_final.shape}.")
 
     def require_task(self, task: Task) -> None:
-        """Check that the task has as many states as Q.
-
-        Raises:
-            ShapeError: if the number of states differs.
-        """
+        """Check that the task has as many states as Q."""
         n = task.initial_state.shape[-1]
         if len(self.Q) != n:
             raise ShapeError(f"Q must weigh the task's {n} states, got shape {self.Q.shape}.")

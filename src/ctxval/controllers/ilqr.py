@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
+from ctxval._util.checked import PositiveFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval._util.representation import call, record
 from ctxval.controllers.backward_pass import Expansion, Policy, minimise
@@ -15,7 +16,7 @@ from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike, fed_back
 from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task
-from ctxval.errors import DesignError, InputError
+from ctxval.errors import DesignError, ModelError
 
 _STEP_LENGTHS: Array = np.asarray(0.5 ** np.arange(12), dtype=np.float64)
 """Step lengths of the line search, the longest first."""
@@ -45,7 +46,7 @@ class ILQRSolution:
         cost: the cost of the optimised trajectory, shape ``(...)``.
         iterations: the number of accepted steps, integers of shape ``(...)``.
         converged: whether the iteration converged, shape ``(...)``; it did not if the limit of iterations was reached
-            or no step improved the cost.
+            or no step improved the cost. The gains are those of an undamped step at the solution in any case.
     """
 
     controller: AffineFeedback
@@ -77,8 +78,8 @@ class ILQR:
             rows ``[low, high]``, one for each input.
 
     Raises:
-        InputError: if a weight is not positive semidefinite, R is not positive definite, iterations or tolerance are
-            not positive, or the limits are ambiguous or not low < high.
+        InputError: if a weight is not positive semidefinite, R is not positive definite, or the limits are ambiguous
+            or not low < high.
     """
 
     batched = True
@@ -89,15 +90,13 @@ class ILQR:
         R: ArrayLike,
         Q_final: ArrayLike | None = None,
         *,
-        iterations: int = 100,
-        tolerance: float = 1e-8,
+        iterations: PositiveInt = 100,
+        tolerance: PositiveFloat = 1e-8,
         limits: LimitsLike | None = None,
     ) -> None:
         self.cost = QuadraticCost(Q, R, Q_final)
         self.iterations = iterations
         self.tolerance = tolerance
-        if iterations < 1 or not tolerance > 0:
-            raise InputError(f"iterations and tolerance must be positive, got {iterations!r} and {tolerance!r}.")
         self.limits = None if limits is None else Limits.of(limits, len(self.cost.R))
 
     def describe(self) -> dict[str, Any]:
@@ -124,6 +123,7 @@ class ILQR:
             descent = _Descent(self, task, model)
             while len(rows := descent.active_rows()):
                 descent.advance(rows)
+            descent.undamp(np.flatnonzero(~descent.converged))
         return descent.solution(task.batch_shape)
 
     def __repr__(self) -> str:
@@ -165,15 +165,12 @@ class _Descent:
 
     def advance(self, rows: Rows) -> None:
         """Take one step for these tasks, or mark them as converged."""
-        X, U = self.X[:, rows], self.U[:, rows]
-        A, B = self._linearised(rows, X, U)
-        around = Expansion(X - self.reference[:, rows], U, A, B)
-        policy = minimise(self.cost, around, self.limits, self.damping[rows])
-        self.K[:, rows] = policy.K if policy.K.ndim == 4 else policy.K[:, None]
+        around, policy = self._step(rows)
         gain = -policy.change.at(1.0)
         arrived = gain <= self.settings.tolerance * (np.abs(self.J[rows]) + self.settings.tolerance)
         # A damped step is always small, so only an undamped step may mark a task as converged.
         self.converged[rows] = arrived & (self.damping[rows] == 0)
+        self._keep(policy, np.flatnonzero(self.converged[rows]), rows)
         # If the line search has already refused the undamped step, no step improves the cost.
         self.damping[rows[arrived]] = np.where(self.refused[rows[arrived]], np.inf, 0.0)
         before = self.J[rows]
@@ -182,6 +179,34 @@ class _Descent:
             # The model is linear, so the step was the exact minimiser, and its gains hold everywhere. If the cost was
             # far larger before, as on an unstable model, rounding errors call for another step.
             self.converged[rows[moved]] = (before <= _ROUNDING * self.J[rows])[moved]
+
+    def undamp(self, rows: Rows) -> None:
+        """Give tasks that did not converge the gains of an undamped step at their last iterates.
+
+        The gains of a damped step would be too small, and would depend on how often the damping grew. If the undamped
+        step is not possible, the gains of the last accepted step remain.
+        """
+        if not len(rows):
+            return
+        self.damping[rows] = 0.0
+        try:
+            policy = self._step(rows)[1]
+        except ModelError:
+            for half in np.array_split(rows, 2) if len(rows) > 1 else ():
+                self.undamp(half)
+            return
+        finite = np.isfinite(policy.K).all(axis=(0, -2, -1)) & np.ones(len(rows), dtype=bool)
+        self._keep(policy, np.flatnonzero(finite), rows)
+
+    def _step(self, rows: Rows) -> tuple[Expansion, Policy]:
+        """Return the expansion at the iterates of these tasks, and the step that minimises it."""
+        X, U = self.X[:, rows], self.U[:, rows]
+        around = Expansion(X - self.reference[:, rows], U, *self._linearised(rows, X, U))
+        return around, minimise(self.cost, around, self.limits, self.damping[rows])
+
+    def _keep(self, policy: Policy, chosen: Rows, rows: Rows) -> None:
+        """Keep the gains of some of the tasks of a step."""
+        self.K[:, rows[chosen]] = policy.K[:, chosen] if policy.K.ndim == 4 else policy.K[:, None]
 
     def _linearised(self, rows: Rows, X: Array, U: Array) -> tuple[Array, Array]:
         """Return the derivatives along the iterates of these tasks; those of unchanged iterates are kept."""
@@ -219,6 +244,7 @@ class _Descent:
         moved, first = np.unique(of[good], return_index=True)
         chosen, to = good[first], rows[waiting[moved]]
         self.X[:, to], self.U[:, to], self.J[to] = X[:, chosen], U[:, chosen], J[chosen]
+        self._keep(policy, waiting[moved], rows)
         self.iterations[to] += 1
         self.refused[to] = False
         self.shortened[to] = index[chosen] > 0
@@ -231,14 +257,7 @@ class _Descent:
         self.refused[rows] = self.shortened[rows] = True
 
     def _forward(self, rows: Rows, policy: Policy, tasks: Rows, lengths: Array) -> tuple[Array, Array, Array]:
-        """Run the model under ``u = u_old + length * k + K (x - x_old)``; return states, inputs and costs.
-
-        Args:
-            rows: the task of each loop, shape ``(L,)``.
-            policy: the step of the active tasks.
-            tasks: the place of each loop's task among the active tasks, shape ``(L,)``.
-            lengths: shape ``(L,)``.
-        """
+        """Run the model under ``u = u_old + length * k + K (x - x_old)``; return states, inputs and costs."""
         X_old = self.X[:, rows]
         U = self.U[:, rows] + lengths[:, None] * policy.k[:, tasks]
         K = policy.K[:, tasks] if policy.K.ndim == 4 else policy.K

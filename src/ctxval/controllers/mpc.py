@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
+from ctxval._util.checked import PositiveFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval._util.representation import call, record
 from ctxval.controllers.cost import QuadraticCost
@@ -59,22 +60,18 @@ class MPC:
         R: ArrayLike,
         Q_final: ArrayLike | None = None,
         *,
-        steps: int,
+        steps: PositiveInt,
         limits: LimitsLike | None = None,
         state_limits: LimitsLike | None = None,
-        violation_cost: float | None = None,
-        iterations: int = 20,
+        violation_cost: PositiveFloat | None = None,
+        iterations: PositiveInt = 20,
     ) -> None:
         self.cost = QuadraticCost(Q, R, Q_final)
         n, m = len(self.cost.Q), len(self.cost.R)
         self.steps, self.iterations = steps, iterations
-        if any(not isinstance(k, int | np.integer) or isinstance(k, bool) or k < 1 for k in (steps, iterations)):
-            raise InputError(f"steps and iterations must be positive integers, got {steps!r} and {iterations!r}.")
         self.limits = Limits.of(np.inf if limits is None else limits, m)
         self.state_limits = Limits.of(np.inf if state_limits is None else state_limits, n)
         self.violation_cost = violation_cost
-        if violation_cost is not None and not (np.isfinite(violation_cost) and violation_cost > 0):
-            raise InputError(f"violation_cost must be a positive number or None, got {violation_cost!r}.")
         _casadi()
 
     def design(self, task: Task, model: Model) -> RecedingHorizon:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import record
 from ctxval.controllers.cost import QuadraticCost
 
 _KEPT = 16
@@ -33,9 +32,6 @@ class LinearGains:
     inverses: Array
     closed: Array
     curvatures: Array
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 def linear_gains(cost: QuadraticCost, A: Array, B: Array, horizon: int) -> LinearGains:

@@ -46,9 +46,6 @@ def converged_of(controller: object, batch_shape: tuple[int, ...] = ()) -> Mask 
     Args:
         controller: a controller of one task or of a batch, with or without the attribute ``converged``.
         batch_shape: the shape of the batch of tasks; ``()`` for one task.
-
-    Raises:
-        ShapeError: if the attribute is neither a boolean nor booleans of this shape.
     """
     told = getattr(controller, "converged", None)
     if told is None:
@@ -174,11 +171,7 @@ def _table(low: Any, high: Any) -> str:
 
 
 def given_limits(limits: LimitsLike | None) -> float | Limits | None:
-    """Check limits while the number of inputs is not known yet; return them, with a single number as a number.
-
-    Raises:
-        InputError: if the limits cannot be used.
-    """
+    """Check limits while the number of inputs is not known yet; return them, with a single number as a number."""
     if limits is None:
         return None
     found = Limits.of(limits)

@@ -116,10 +116,6 @@ def write_task(path: str | Path, task: Task, *, states: Names | None = None) -> 
         path: the file; it ends in ``.json``.
         task: one task.
         states: names and units of the states; ``x0, x1, ...`` by default.
-
-    Raises:
-        ShapeError: if the task is a batch, or the number of names differs from the number of states.
-        InputError: if the file cannot be written.
     """
     if task.batch_shape:
         raise ShapeError(f"the file of a task must hold one task, got a batch of shape {task.batch_shape}.")
@@ -134,11 +130,7 @@ def write_task(path: str | Path, task: Task, *, states: Names | None = None) -> 
 
 
 def read_task(path: str | Path) -> Task:
-    """Read one task from a JSON file.
-
-    Raises:
-        InputError: if the file is not a task file or is damaged; the message says what is wrong.
-    """
+    """Read one task from a JSON file."""
     return _read(Path(path), TASK_FORMAT, _task)
 
 

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from ctxval._util.checked import PositiveFloat, PositiveInt, checked
 from ctxval._util.representation import call, lines
 from ctxval._util.texts import parted
 from ctxval.core.labels import Labels
@@ -17,6 +18,7 @@ class UnitsWarning(UserWarning):
     """A distance adds states of different units without weights or scales."""
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """A validation with its defaults, as ``ctxval run`` runs it.
@@ -38,8 +40,8 @@ class Experiment:
 
     name: str
     validation: Validation
-    budget: int = 25
-    threshold: float | None = None
+    budget: PositiveInt = 25
+    threshold: PositiveFloat | None = None
     truth: Callable[[], Truth] | None = None
     units: str = ""
     states: tuple[str, ...] = ()

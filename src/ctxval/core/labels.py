@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from ctxval._util.checked import checked
 from ctxval._util.representation import record
-from ctxval._util.texts import parted
+from ctxval._util.texts import parted, shortened
+from ctxval.errors import InputError
 
 
+@checked
 @dataclass(frozen=True)
 class Labels:
     """Names and units, which change nothing that is computed.
@@ -16,11 +19,17 @@ class Labels:
     Attributes:
         states, inputs: one label ``name [unit]`` for each state and each input; empty if they have no names.
         units: the units of the distance.
+
+    Raises:
+        InputError: if a recording with columns of these names cannot be read.
     """
 
     states: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     units: str = ""
+
+    def __post_init__(self) -> None:
+        require_names(self.states, self.inputs)
 
     def names(self, system: object, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
         """Return the names of n states and m inputs with their units.
@@ -36,8 +45,29 @@ class Labels:
             _named(self.inputs, getattr(system, "inputs", None), "u", inputs),
         )
 
+    def state_names(self, system: object) -> tuple[str, ...]:
+        """Return the names of the states by these labels, else by the system; empty if neither names them."""
+        return tuple(parted(str(label))[0] for label in self.states or getattr(system, "states", None) or ())
+
     def __repr__(self) -> str:
         return record(self)
+
+
+def require_names(states: Iterable[str], inputs: Iterable[str]) -> None:
+    """Refuse labels of states and inputs that make a recording unreadable."""
+    labels = [*states, *inputs]
+    names = [parted(label)[0] for label in labels]
+    for label, name in zip(labels, names, strict=True):
+        plain = bool(name) and label == label.strip() and label.isprintable()
+        if not plain or name in TIMES or names.count(name) > 1:
+            raise InputError(
+                "each state and input needs a name of its own, not t or time, without blanks around it or control "
+                f"characters, because recordings have columns of these names; got {shortened(repr(label), 60)}."
+            )
+
+
+TIMES = ("t", "time")
+"""Names of the column of times in a recording."""
 
 
 def labels_of(named: Mapping[str, str]) -> tuple[str, ...]:

@@ -14,6 +14,11 @@ from ctxval.errors import InputError, ModelError
 
 Step = Callable[[Array, Array], Array]
 
+_PROBED = 3
+"""Number of points at which the precision of a model is found out."""
+_FINE, _COARSE = 2.0**-27, 2.0**-17
+"""A change that single precision hardly resolves, and one that it does, as shares of a state or of 1."""
+
 _BLOCK = 4096
 """Number of points at which a model is evaluated in one call for differences: larger arrays do not fit into the cache.
 """
@@ -38,14 +43,9 @@ class Function:
     Args:
         step: a function of one state ``(n,)`` and one input ``(m,)``.
         vectorized: True if ``step`` takes whole batches ``(..., n)`` and ``(..., m)``.
-
-    Raises:
-        InputError: if ``step`` is not a function.
     """
 
     def __init__(self, step: Step, *, vectorized: bool = False) -> None:
-        if not callable(step):
-            raise InputError(f"a model must have a step method or be a function (x, u) -> x_next, got {step!r}.")
         self.function = step
         self.vectorized = vectorized
 
@@ -64,12 +64,23 @@ class Function:
 
 
 def as_model(model: Model | Step) -> Model:
-    """Return a model unchanged, and a plain function as a model.
-
-    Raises:
-        InputError: if the value is neither a model nor a function.
-    """
+    """Return a model unchanged, and a plain function as a model."""
     return model if isinstance(model, Model) else Function(model)
+
+
+def require_time_step(model: object, dt: float, whose: str) -> None:
+    """Refuse a model that states, or was learned from, steps of another length.
+
+    Args:
+        model: the model; its attribute ``dt``, or that of its ``data``, is the length of a step in seconds.
+        dt: the length that it is used with, seconds.
+        whose: what has this length, for the message.
+    """
+    own = getattr(model, "dt", None) or getattr(getattr(model, "data", None), "dt", None)
+    if isinstance(own, int | float) and not np.isclose(own, dt, rtol=1e-3, atol=0):
+        raise InputError(
+            f"the model has steps of {own:g} s and {whose} has steps of {dt:g} s: use a model of these steps."
+        )
 
 
 def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
@@ -88,22 +99,48 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
     return A, B
 
 
-def central_differences(step: Step, x: Array, u: Array) -> tuple[Array, Array]:
+def central_differences(step: Step, x: Array, u: Array, precision: float | None = None) -> tuple[Array, Array]:
     """Return A ``(..., n, n)`` and B ``(..., n, m)`` at states ``(..., n)`` and inputs ``(..., m)`` by differences.
+
+    The steps suit the precision of the model: 6e-6 in double precision, and 5e-3 in single precision, in which smaller
+    steps would be lost in its rounding.
 
     All differences are taken in one batch, in blocks that fit into the processor's cache. Complex steps would halve the
     evaluations, but NumPy's complex functions take two to three times as long, and the result is silently wrong
     wherever a model uses ``abs``, ``maximum`` or a branch.
+
+    Args:
+        step: the model's step, which takes batches.
+        x, u: states and inputs.
+        precision: the relative rounding of the model's numbers; None to find it out.
     """
     n, width, batch = x.shape[-1], x.shape[-1] + u.shape[-1], x.shape[:-1]
     z = np.concatenate([x, u], axis=-1).reshape(-1, width)
-    # The cube root of the machine precision balances truncation against rounding.
-    h = np.cbrt(np.finfo(np.float64).eps) * np.maximum(1.0, np.abs(z))
+    # The cube root of the precision balances truncation against rounding.
+    h = np.cbrt(_precision(step, z, n) if precision is None else precision) * np.maximum(1.0, np.abs(z))
     size = max(1, _BLOCK // (2 * width))
     blocks = [slice(first, first + size) for first in range(0, max(1, len(z)), size)]
     transposed = np.concatenate([_differences(step, z[rows], h[rows], n) for rows in blocks])
     whole = np.swapaxes(transposed, -1, -2).reshape(*batch, n, width)
     return whole[..., :n], whole[..., n:]
+
+
+def _precision(step: Step, z: Array, n: int) -> float:
+    """Return the relative rounding of a model's numbers: that of single precision if it loses a change of 1e-8.
+
+    A change that is a thousand times as large shows how much the model should change. The answer of most points counts,
+    because a few may be next to a kink. What a model converts to double precision afterwards does not matter.
+    """
+    some = z[:: max(1, len(z) // _PROBED)][:_PROBED]
+    size = np.maximum(1.0, np.abs(some))
+    moved = np.concatenate([some, some + _FINE * size, some - _COARSE * size, some + _COARSE * size])
+    still, fine, down, up = np.asarray(step(moved[:, :n], moved[:, n:])).reshape(4, -1, n)
+    with np.errstate(all="ignore"):  # a model that is not finite is refused later
+        expected = (up - down) * (0.5 * _FINE / _COARSE)
+        margin = 1e-3 * np.abs(expected) + 1e-5 * _FINE * np.abs(still).max(initial=0.0)
+        lost = np.abs(fine - still - expected) > margin
+    single = lost.any(axis=1).sum() > len(some) / 2
+    return float(np.finfo(np.float32 if single else np.float64).eps)
 
 
 def _differences(step: Step, z: Array, h: Array, n: int) -> Array:

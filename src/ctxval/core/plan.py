@@ -91,9 +91,6 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
         trajectory: the trajectory.
         start_tolerance: the largest difference between the first state and the initial state of the task, as a fraction
             of the range of each state in the trajectory of the model, or of its initial value if that is larger.
-
-    Raises:
-        InputError: if its dimensions, its times or its first state differ.
     """
     expected = plan.model_trajectory
     require_times(trajectory, plan.task.times)

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval._util.representation import record
 from ctxval.core.controller import Limits, Synthesizer
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
@@ -49,9 +48,6 @@ class Flips:
     flipped: int
     largest: float
     example: tuple[int, int]
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 def flips(points: Array, inputs: Sequence[Array]) -> Flips | None:
@@ -95,9 +91,6 @@ class Saturation:
 
     shares: Array
     known: bool
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> Saturation | None:
@@ -157,9 +150,6 @@ class GoalMisses:
         """The task and the index in ``states`` with the largest share."""
         row, column = np.unravel_index(int(self.shares.argmax()), self.shares.shape)
         return int(row), int(column)
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 def goal_misses(validation: Validation, on_model: Sequence[Trajectory], goals: Sequence[Array]) -> GoalMisses | None:

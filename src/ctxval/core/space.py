@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats, require_shape
+from ctxval._util.checked import Must, NonNegativeInt, checked
 from ctxval._util.representation import call, named
+from ctxval._util.texts import shortened
 from ctxval.core.task_distribution import ByParameter, BySampler, Continuous, Sampler, TaskDistribution
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 
 Point = float | list[float]
+
+AxisPoints = Annotated[int, Must("an integer of at least 2", lambda value: value >= 2)]
 
 DISTRIBUTION = "_distribution"
 """Key of the distribution of tasks in the description of a space; no parameter can have this name."""
@@ -90,7 +94,11 @@ class TaskSpace:
         self.names: tuple[str, ...] = tuple(names)
         self.low: Array = np.concatenate(lows)
         self.high: Array = np.concatenate(highs)
-        self._decimals = _decimals(self.low, self.high)
+        # Digits after the point of tasks that are chosen, 1e-9 of the range, and of those that are recognised.
+        magnitude = _digits(np.maximum(np.abs(self.low), np.abs(self.high)))
+        chosen = np.minimum(9 - _digits(self.high - self.low), 15 - magnitude)
+        self._chosen = _power(chosen)
+        self._decimals = _power(np.maximum(chosen, 12 - magnitude))
         self._distribution: TaskDistribution | None = None
 
     @property
@@ -106,8 +114,11 @@ class TaskSpace:
     @property
     def labels(self) -> tuple[str, ...]:
         """An axis label for each scalar parameter: its name and its unit."""
-        units = [self._units[name.partition("[")[0]] for name in self.names]
+        units = self._scalar_units()
         return tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, units, strict=True))
+
+    def _scalar_units(self) -> list[str]:
+        return [shortened(self._units[name]) for name, at in self._columns.items() for _ in np.atleast_1d(self.low[at])]
 
     def __repr__(self) -> str:
         bounds = {name: (self.low[at], self.high[at]) for name, at in self._columns.items()}
@@ -119,11 +130,10 @@ class TaskSpace:
 
         A distribution of tasks is part of it only if there is one.
         """
-        units = (self._units[name.partition("[")[0]] for name in self.names)
         set_one = {} if self._distribution is None else {DISTRIBUTION: self._distribution.describe()}
         return set_one | {
             name: [float(low), float(high), *([unit] if unit else [])]
-            for name, low, high, unit in zip(self.names, self.low, self.high, units, strict=True)
+            for name, low, high, unit in zip(self.names, self.low, self.high, self._scalar_units(), strict=True)
         }
 
     def columns(self, name: str) -> int | slice:
@@ -151,9 +161,19 @@ class TaskSpace:
         """
         rows = require_shape("points", as_floats("points", unit), (self.dimension,))
         points = np.clip(self.low + rows * (self.high - self.low), self.low, self.high)
+        points = np.where(rows == 1, self.high, points)
         # A number that a user gave as 0.2 comes back as 0.2, not as 0.19999999999999996.
         short = np.clip(np.rint(points * self._decimals) / self._decimals + 0.0, self.low, self.high)
         return np.where((short - self.low) / (self.high - self.low) == rows, short, points)
+
+    def rounded(self, unit: ArrayLike) -> Array:
+        """Return points ``(..., d)`` of the unit cube next to those given, whose parameters are short enough to type.
+
+        The parameters are rounded to about 1e-9 of their ranges; bounds stay. ``from_unit`` returns them exactly.
+        """
+        rows, points = as_floats("points", unit), self.from_unit(unit)
+        short = np.clip(np.rint(points * self._chosen) / self._chosen + 0.0, self.low, self.high)
+        return np.where((rows == 0) | (rows == 1), rows, self.to_unit(short))
 
     def parameters(self, points: ArrayLike) -> Parameters:
         """Return points ``(..., d)`` of the space as named parameters.
@@ -258,25 +278,22 @@ class TaskSpace:
 
     # Sets of points
 
-    def iid(self, n: int, rng: np.random.Generator) -> Array:
+    @checked
+    def iid(self, n: NonNegativeInt, rng: np.random.Generator) -> Array:
         """Return n points drawn independently from the distribution of tasks, shape ``(n, d)``."""
         return self.from_unit(self.unit_draws(n, rng))
 
-    def sobol(self, n: int, seed: int) -> Array:
+    @checked
+    def sobol(self, n: NonNegativeInt, seed: NonNegativeInt) -> Array:
         """Return n points of a scrambled Sobol sequence, shape ``(n, d)``."""
         from scipy.stats import qmc  # imported here, because it is slow to load and seldom needed
 
         sampler = qmc.Sobol(self.dimension, rng=np.random.default_rng(seed))
         return self.from_unit(sampler.random_base2(max(0, int(np.ceil(np.log2(max(n, 1))))))[:n])
 
-    def grid(self, per_axis: int) -> Array:
-        """Return a full grid that includes both bounds of each axis, shape ``(per_axis ** d, d)``.
-
-        Raises:
-            InputError: if there are fewer than 2 points on each axis.
-        """
-        if per_axis < 2:
-            raise InputError(f"a grid must have at least 2 points on each axis, got {per_axis}.")
+    @checked
+    def grid(self, per_axis: AxisPoints) -> Array:
+        """Return a full grid that includes both bounds of each axis, shape ``(per_axis ** d, d)``."""
         return np.stack(list(self._grid_axes(per_axis)), axis=-1).reshape(-1, self.dimension)
 
     def _grid_axes(self, per_axis: int) -> Iterator[Array]:
@@ -284,10 +301,14 @@ class TaskSpace:
         return iter(np.meshgrid(*axes, indexing="ij"))
 
 
-def _decimals(low: Array, high: Array) -> Array:
-    """Return, for each column, the power of ten that scales its values to twelve digits; it is exact as a float."""
-    digits = np.ceil(np.log10(np.maximum(np.abs(low), np.abs(high))))
-    return np.asarray(10.0 ** np.clip(12 - digits, 0, 22))
+def _digits(size: Array) -> Array:
+    """Return the number of digits before the point, negative for zeros behind it."""
+    return np.asarray(np.ceil(np.log10(np.maximum(size, 1e-300))))
+
+
+def _power(decimals: Array) -> Array:
+    """Return powers of ten that are exact as floats."""
+    return np.asarray(10.0 ** np.clip(decimals, 0, 22))
 
 
 def _bounds(name: str, bound: Any) -> tuple[Array, Array, str]:

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, as_floats
+from ctxval._util.checked import PositiveInt, Seconds, checked
 from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
 
 
+@checked
 class Task:
     """One control task, or a batch of them.
 
@@ -23,15 +25,13 @@ class Task:
         reference: the states to follow, array ``(..., H + 1, n)``; give this or ``goal``, not both.
 
     Raises:
-        InputError: if H is not a positive integer, dt is not a positive number, or a value is not finite.
+        InputError: if a value cannot be used.
         ShapeError: if the shape of the goal or the reference does not match that of the initial state.
     """
 
-    def __init__(self, initial_state: Any, *, horizon: int, dt: float, goal: Any = None, reference: Any = None) -> None:
-        if not isinstance(horizon, int | np.integer) or isinstance(horizon, bool) or horizon < 1:
-            raise InputError(f"horizon must be a positive integer, got {horizon!r}.")
-        if not isinstance(dt, int | float | np.number) or isinstance(dt, bool) or not (np.isfinite(dt) and dt > 0):
-            raise InputError(f"dt must be a positive number of seconds, got {dt!r}.")
+    def __init__(
+        self, initial_state: Any, *, horizon: PositiveInt, dt: Seconds, goal: Any = None, reference: Any = None
+    ) -> None:
         if goal is not None and reference is not None:
             raise InputError("a task must have a goal or a reference, not both.")
         self.horizon = int(horizon)

@@ -158,9 +158,6 @@ class ByParameter:
         """Return the distribution of each parameter that has one, by name."""
         return {name: _described(one) for name, one in self.distributions.items()}
 
-    def __repr__(self) -> str:
-        return record(self)
-
 
 @dataclass(frozen=True, eq=False)
 class BySampler:
@@ -176,11 +173,7 @@ class BySampler:
     sampler: Sampler
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
-        """Return n independent tasks, rows ``(n, d)`` in the units of the task space.
-
-        Raises:
-            InputError: if the sampler returns something else.
-        """
+        """Return n independent tasks, rows ``(n, d)`` in the units of the task space."""
         points = as_finite("what the sampler of tasks returns", self.sampler(rng, n))
         if points.shape != (n, len(self.low)):
             raise InputError(f"the sampler of tasks must return the shape ({n}, {len(self.low)}), got {points.shape}.")
@@ -191,9 +184,6 @@ class BySampler:
     def describe(self) -> dict[str, Any]:
         """Return the description of the sampler's code."""
         return {"sampler": describe(self.sampler)}
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 def distribution_text(described: object) -> str:

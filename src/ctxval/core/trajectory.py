@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, as_floats, rows_of
+from ctxval._util.arrays import Array, Mask, as_floats, held_means, rows_of
+from ctxval._util.columns import FAR, unit_advice
 from ctxval._util.files import MOST_BYTES, read_bytes
 from ctxval._util.npz import Archive
 from ctxval._util.representation import Shown, call, counted, number
@@ -27,6 +28,7 @@ class Transitions:
         x: the states, shape ``(N, n)``.
         u: the inputs, shape ``(N, m)``.
         x_next: the next states, shape ``(N, n)``.
+        dt: length of a step in seconds, if it is known.
 
     Raises:
         ShapeError: if the shapes of the three arrays do not match.
@@ -35,6 +37,7 @@ class Transitions:
     x: Array
     u: Array
     x_next: Array
+    dt: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("x", "u", "x_next"):
@@ -55,15 +58,20 @@ class Transitions:
 
         Raises:
             ShapeError: if they have different numbers of states or inputs.
+            InputError: if their steps have different lengths.
         """
         sizes = sorted({(part.x.shape[1], part.u.shape[1]) for part in parts})
         if len(sizes) > 1:
             said = " and ".join(f"{n} states and {m} inputs" for n, m in sizes)
             raise ShapeError(f"recorded steps must have the same numbers of states and inputs, got {said}.")
+        steps = [part.dt for part in parts if part.dt is not None]
+        if steps and not np.allclose(steps, steps[0], rtol=1e-3, atol=0):
+            raise InputError(f"recorded steps must have one length, got {min(steps):g} s and {max(steps):g} s.")
         return Transitions(
             np.concatenate([part.x for part in parts]),
             np.concatenate([part.u for part in parts]),
             np.concatenate([part.x_next for part in parts]),
+            steps[0] if steps else None,
         )
 
     def __repr__(self) -> str:
@@ -199,8 +207,9 @@ class Trajectory:
     ) -> Trajectory:
         """Read one trajectory from CSV with the columns ``t, x0.., u0..``, or with named columns.
 
-        Units in brackets, as in ``angle [rad]``, may be left out. If a name and its column both have a unit, the units
-        must agree. Other columns are ignored, and so are the inputs in the last row.
+        A column may state its unit, as in ``angle [deg]`` or ``angle_deg``, and is converted to that of its name; one
+        without a unit has that of its name, and times are in seconds. Other columns are ignored, and so are the inputs
+        in the last row. Columns are separated by commas, or by semicolons or tabs, with which decimal commas are read.
 
         Args:
             path: the file.
@@ -210,30 +219,38 @@ class Trajectory:
                 number up to the largest size of a file.
 
         Raises:
-            InputError: if the file cannot be read, is not a regular file or is too large, if a column is missing or has
-                another unit, or if a cell is not a number.
+            InputError: if the file cannot be read, is not a regular file or is too large, if a row has more or fewer
+                cells than the header, if a column is missing, is there twice or has a unit that cannot be converted, or
+                if a cell is not a number.
         """
         return Trajectory(*read_columns(path, states, inputs, most_rows))
 
     def resampled(self, times: Array) -> Trajectory:
-        """Return one recorded trajectory at other times: states interpolated linearly, inputs held.
+        """Return one recorded trajectory at other times: states interpolated linearly, inputs averaged over the steps.
+
+        An input holds until the next sample.
 
         Args:
             times: seconds after the first time of the recording, from 0, shape ``(H + 1,)``.
 
         Raises:
-            InputError: if the trajectory is a batch, its times do not increase, or it ends before the last new time.
+            InputError: if the trajectory is a batch, its times do not increase, its steps are much longer than the new
+                ones, or it ends before the last new time.
         """
         own, wanted = self.times - self.times[0], as_floats("times", times)
         if self.batch_shape or not (np.diff(own) > 0).all():
             raise InputError("only a single trajectory with increasing times can be resampled.")
-        if not own[-1] >= wanted[-1] - _TIMES * (wanted[1] - wanted[0]):
-            raise InputError(f"the recording ends after {own[-1]:g} s, and {wanted[-1]:g} s are needed.")
+        dt, period = float(wanted[1] - wanted[0]), float(np.median(np.diff(own)))
+        if period > FAR * dt:
+            raise InputError(f"the recording has steps of {period:g} s instead of {dt:g} s{_advice(period, dt)}.")
+        if not own[-1] >= wanted[-1] - _TIMES * dt:
+            raise InputError(
+                f"the recording ends after {own[-1]:g} s, and {wanted[-1]:g} s are needed{_advice(period, dt)}."
+            )
         states = np.stack([np.interp(wanted, own, column) for column in self.states.T], axis=-1)
         # A sample that belongs to a time may have been recorded just after it.
-        slack = 1e-6 * (wanted[1] - wanted[0])
-        held = np.clip(np.searchsorted(own, wanted[:-1] + slack, side="right") - 1, 0, self.horizon - 1)
-        return Trajectory(wanted, states, self.inputs[held], self.ended)
+        inputs = held_means(own[:-1], self.inputs, wanted, 1e-6 * dt)
+        return Trajectory(wanted, states, inputs, self.ended)
 
     def __repr__(self) -> str:
         length = Shown(f"{counted(self.horizon, 'step')} in {number(self.times[-1] - self.times[0])} s")
@@ -245,25 +262,27 @@ _TIMES = 0.01
 
 
 def require_times(trajectory: Trajectory, times: Array) -> None:
-    """Check that a trajectory has these times ``(H + 1,)``, counted from its first time.
-
-    Raises:
-        InputError: if the number of times or the time step differs; the message gives the first difference.
-    """
-    dt = times[1] - times[0]
-    if len(trajectory.times) != len(times):
+    """Check that a trajectory has these times ``(H + 1,)``, counted from its first time."""
+    dt, own = times[1] - times[0], trajectory.times - trajectory.times[0]
+    period = float(np.median(np.diff(own)))
+    advice = _advice(period, dt) or "; --resample interpolates a recording to these times"
+    if len(own) != len(times):
         raise InputError(
-            f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, "
-            f"got {len(trajectory.times)}."
+            f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, got {len(own)} with "
+            f"steps of {period:g} s{advice}."
         )
-    own = trajectory.times - trajectory.times[0]
     misses = np.abs(own - times)
     if not (misses <= _TIMES * dt).all():
         k = int(np.argmax(~(misses <= _TIMES * dt)))
         raise InputError(
             f"the trajectory must have steps of {dt:g} s: time {k} must be {times[k]:g} s after the first, "
-            f"got {own[k]:g} s."
+            f"got {own[k]:g} s. The largest difference is {np.max(misses):.3g} s{advice}."
         )
+
+
+def _advice(period: float, dt: float) -> str:
+    advice = unit_advice(period, dt)
+    return f"; {advice}" if advice else ""
 
 
 _ARRAYS = ("times", "states", "inputs")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call, line, lines, record, table
+from ctxval._util.representation import call, counted, line, lines, record, table
 from ctxval.core.space import Point
 
 Origin = Literal["iid", "initial", "acquisition", "covering", "manual"]
@@ -15,6 +16,15 @@ Origin = Literal["iid", "initial", "acquisition", "covering", "manual"]
 State = Literal["open", "completed", "failed", "unmeasured"]
 """The state of a trial. Unmeasured: S was executed and its trajectory is stored, but d has no usable value."""
 
+
+REDEFINED = "the distance has changed"
+"""The reason in the history of a store whose distances were measured again by another definition."""
+
+CONVERGED = "converged"
+"""Key in the note of a trial: whether the design of its controller converged, if the controller tells."""
+
+UNSTEADY = "unsteady"
+"""Key in the note of a trial: the number of tasks that were not executed because their controllers jump."""
 
 TOLD_ALONE = "its distance was told without a trajectory, and the distance has changed since: execute the task again."
 """The failure of a trial that was reported without a trajectory, so that a new distance cannot be computed."""
@@ -73,6 +83,27 @@ class Trial:
                 *self.parameters.items(),
             ],
         )
+
+
+def designs_sentence(trials: Sequence[Trial]) -> str | None:
+    """Return which controllers of executed tasks did not converge or jump; None if nothing of the kind is recorded."""
+    executed = [trial for trial in trials if trial.executed]
+    told = [trial.note[CONVERGED] for trial in executed if trial.note is not None and CONVERGED in trial.note]
+    worst = max(executed, key=lambda trial: -1.0 if trial.distance is None else trial.distance, default=None)
+    among = worst is not None and (worst.note or {}).get(CONVERGED) is False
+    parts = []
+    if told.count(False):
+        which = ", among them the worst one" if among else ""
+        parts.append(
+            f"the design of the controller did not converge at {told.count(False)} of {len(told)} executed tasks{which}"
+        )
+    rejected = sum(count for trial in trials if isinstance(count := (trial.note or {}).get(UNSTEADY), int))
+    if rejected:
+        parts.append(
+            f"{counted(rejected, 'task')} {'was' if rejected == 1 else 'were'} not executed, because the controller "
+            "jumps if the task changes by 1e-9 of its range"
+        )
+    return "; ".join(parts) or None
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,12 @@ from scipy.optimize import Bounds, differential_evolution
 
 from ctxval._util.arrays import Array
 from ctxval._util.boxes import climb
-from ctxval._util.describe import describe, rounded
+from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, checked
+from ctxval._util.describe import describe, without_numbers
 from ctxval._util.files import written_whole
 from ctxval._util.progress import stage
 from ctxval._util.representation import call, line, lines
-from ctxval.core.space import Parameters
+from ctxval.core.space import AxisPoints, Parameters
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 
@@ -52,7 +53,8 @@ class Truth:
         )
 
 
-def grid_truth(validation: Validation, per_axis: int = 2001, refinements: int = 6) -> Truth:
+@checked
+def grid_truth(validation: Validation, per_axis: AxisPoints = 2001, refinements: NonNegativeInt = 6) -> Truth:
     """Return the maximum on a dense grid, refined around its best points. S is executed for each grid point.
 
     Args:
@@ -95,15 +97,16 @@ def _around(centres: Array, cell: Array, low: Array, high: Array) -> Array:
     return np.clip(points.reshape(-1, len(cell)), low, high)
 
 
+@checked
 def search_truth(
     validation: Validation,
     *,
-    seed: int = 0,
-    agreement: float = 1e-3,
-    repeats: int = 6,
-    population: int = 20,
-    generations: int = 150,
-    climbs: int = 60,
+    seed: NonNegativeInt = 0,
+    agreement: PositiveFloat = 1e-3,
+    repeats: PositiveInt = 6,
+    population: PositiveInt = 20,
+    generations: PositiveInt = 150,
+    climbs: NonNegativeInt = 60,
 ) -> Truth:
     """Return the largest distance that a large search finds, for spaces with too many dimensions for a grid.
 
@@ -216,13 +219,15 @@ def _gap(found: list[tuple[float, Array]]) -> float:
 # Stored truths
 
 
+@checked
 def cached_truth(
     validation: Validation, compute: Callable[[Validation], Truth], folder: str | Path = "runs/truth"
 ) -> Truth:
     """Return a truth from its file in a folder, or find it and write that file.
 
-    The name of the file is a hash of the identity of the validation and of the method. A stored truth is used only if a
-    new execution of S on its task gives the stored distance again.
+    The name of the file is a digest of sources and settings: those of the validation and of the method. The file keeps
+    the truths of systems that differ in numbers alone. A truth is used only if new executions of S on its task and on
+    some others give the stored distances again.
 
     Args:
         validation: the map p -> d(p).
@@ -231,37 +236,56 @@ def cached_truth(
         folder: the folder of the files; it is created if it does not exist.
     """
     path = Path(folder) / f"{_fingerprint(validation, compute)}.json"
-    stored = _read_truth(path, validation)
-    if stored is not None:
-        return stored
+    stored = _read_truths(path)
+    for content in stored:
+        truth = _truth_of(content, validation)
+        if truth is not None:
+            return truth
     truth = compute(validation)
     # If the folder cannot be written, this call still returns the truth; the next call must find it again.
     with suppress(OSError, InputError):
-        _write_truth(path, truth, validation)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with written_whole(path) as file:
+            file.write(json.dumps([*stored, _content_of(truth, validation)], indent=1).encode())
     return truth
+
+
+_PROBES = 16
+"""Number of tasks whose distances show that a stored truth belongs to a system."""
 
 
 def _fingerprint(validation: Validation, compute: Callable[[Validation], Truth]) -> str:
     # The signature adds the default values, which the description of a function leaves out.
-    known = [validation.describe(), describe(compute), str(inspect.signature(compute))]
-    return hashlib.sha256(json.dumps(rounded(known, 9), sort_keys=True).encode()).hexdigest()[:32]
+    how = [describe(compute), str(inspect.signature(compute))]
+    known = [validation.space.describe(), without_numbers(validation.describe()), *how]
+    return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def _read_truth(path: Path, validation: Validation) -> Truth | None:
+def _read_truths(path: Path) -> list[Any]:
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
-        distance, method = float(stored["distance"]), str(stored["method"])
-        point = validation.space.point(dict(stored["parameters"]))
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    if not math.isclose(validation.distances(point[None])[0], distance, rel_tol=1e-6, abs_tol=1e-12):
-        return None
-    return Truth(distance, validation.space.parameters(point), method)
+    except (OSError, ValueError):
+        return []
+    return stored if isinstance(stored, list) else []
 
 
-def _write_truth(path: Path, truth: Truth, validation: Validation) -> None:
+def _truth_of(content: Any, validation: Validation) -> Truth | None:
+    try:
+        distance, method = float(content["distance"]), str(content["method"])
+        point = validation.space.point(dict(content["parameters"]))
+        known = np.array([distance, *map(float, content["probes"])])
+        present = validation.distances(np.vstack([point, _probes(validation)]))
+        same = np.allclose(present, known, rtol=1e-6, atol=1e-12, equal_nan=True)
+    except (ValueError, KeyError, TypeError):
+        return None
+    return Truth(distance, validation.space.parameters(point), method) if same else None
+
+
+def _content_of(truth: Truth, validation: Validation) -> dict[str, Any]:
     parameters = validation.space.describe_point(truth.parameters.points)
-    content = {"distance": truth.distance, "parameters": parameters, "method": truth.method}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(path) as file:
-        file.write(json.dumps(content, indent=1).encode())
+    probes = [str(value) for value in validation.distances(_probes(validation))]
+    return {"distance": truth.distance, "parameters": parameters, "method": truth.method, "probes": probes}
+
+
+def _probes(validation: Validation) -> Array:
+    return validation.space.iid(_PROBES, np.random.default_rng(0))

@@ -9,7 +9,8 @@ from typing import Any, NoReturn
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_floats, require_shape
-from ctxval._util.describe import describe
+from ctxval._util.checked import NonNegativeFloat, PositiveInt, checked
+from ctxval._util.describe import describe, without_numbers
 from ctxval._util.interrupts import raised_by_signal
 from ctxval._util.progress import advance
 from ctxval._util.representation import call, lines, shown
@@ -17,9 +18,9 @@ from ctxval._util.texts import reason_of, text_of
 from ctxval.core.controller import Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels
-from ctxval.core.model import Model, Step, as_model
-from ctxval.core.parts import require_part, require_parts
+from ctxval.core.model import Model, Step, as_model, require_time_step
 from ctxval.core.plan import Measurement, Outcome, Plan, executed_in, require_execution
+from ctxval.core.preflight import LONGEST, require_affordable
 from ctxval.core.rollout import rollout
 from ctxval.core.simulated import Simulated
 from ctxval.core.space import Parameters, TaskSpace
@@ -45,6 +46,7 @@ _PLANNED = 256
 """Number of tasks that are planned in one call if S executes one at a time: more would hardly be faster."""
 
 
+@checked
 class Validation:
     """The map p -> d(p), made of a task space, a system, its model, a synthesizer and a distance.
 
@@ -58,10 +60,9 @@ class Validation:
         start_tolerance: the largest permitted difference between the first state of an execution and the initial state
             of its task. It is a fraction of the range of each state in the trajectory of the model, or of its initial
             value if that is larger.
-        labels: the names and units of states, inputs and distance for files, pictures and reports.
-
-    Raises:
-        InputError: if one of them has the wrong type; the message names it and what is missing.
+        labels: the names and units of states, inputs and distance for files, pictures and reports; a distance may name
+            states by them.
+        longest: the largest horizon that is planned.
     """
 
     def __init__(
@@ -73,41 +74,33 @@ class Validation:
         model: Model | Step,
         synthesizer: Synthesizer,
         distance: Distance,
-        start_tolerance: float = START,
+        start_tolerance: NonNegativeFloat = START,
         labels: Labels | None = None,
+        longest: PositiveInt = LONGEST,
     ) -> None:
-        require_parts(space, task, system, synthesizer, distance, start_tolerance, labels)
         self.space = space
         self.task = task
         self.system = system
         self.model = as_model(model)
         self.synthesizer = synthesizer
-        self.distance = distance
-        self.start_tolerance = float(start_tolerance)
         self.labels = Labels() if labels is None else labels
+        named = getattr(distance, "with_states", None)
+        self.distance: Distance = named(self.labels.state_names(system)) if callable(named) else distance
+        self.start_tolerance = float(start_tolerance)
+        self.longest = int(longest)
 
     def describe(self) -> dict[str, Any]:
         """Return the description that identifies this validation in a store."""
-        parts = ("space", "task", "system", "model", "synthesizer", "distance")
-        # Three tasks show the constants in the task function, which its name does not show.
-        probes = np.stack([self.space.low, 0.5 * (self.space.low + self.space.high), self.space.high])
-        tasks = [describe(self._task(self.space.parameters(point))) for point in probes]
-        return {**{part: describe(getattr(self, part)) for part in parts}, "tasks": tasks}
+        parts = {part: describe(getattr(self, part)) for part in ("space", "task", "system", "synthesizer", "distance")}
+        # The numbers of M are learned: its closed loops show whether it is the same.
+        return {**parts, "model": without_numbers(describe(self.model))}
 
     def with_distance(self, distance: Distance) -> Validation:
-        """Return this validation with another distance.
-
-        Raises:
-            InputError: if it is not a function.
-        """
+        """Return this validation with another distance."""
         return self._with(distance=distance)
 
     def with_model(self, model: Model | Step) -> Validation:
-        """Return this validation with another model.
-
-        Raises:
-            InputError: if it is neither a model nor a function.
-        """
+        """Return this validation with another model."""
         return self._with(model=model)
 
     def on_model(self, distance: Distance, *, units: str | None = None) -> Validation:
@@ -117,27 +110,21 @@ class Validation:
             distance: how far the trajectory of M is from completing its task, such as
                 :class:`ctxval.distances.GoalError`.
             units: the units of this distance; None if they are those of the present distance.
-
-        Raises:
-            InputError: if the distance is not a function.
         """
         labels = self.labels if units is None else replace(self.labels, units=units)
         return self._with(system=Simulated(self.model), distance=distance, labels=labels, start_tolerance=START)
 
-    def with_space(self, space: TaskSpace) -> Validation:
-        """Return this validation with another task space of the same parameters, for example with a distribution.
+    @property
+    def is_on_model(self) -> bool:
+        """Whether M itself is in the place of S."""
+        return isinstance(self.system, Simulated) and self.system.model is self.model
 
-        Raises:
-            InputError: if it is not a task space.
-        """
+    def with_space(self, space: TaskSpace) -> Validation:
+        """Return this validation with another task space of the same parameters, for example with a distribution."""
         return self._with(space=space)
 
     def with_labels(self, labels: Labels) -> Validation:
-        """Return this validation with other names and units.
-
-        Raises:
-            InputError: if they are not labels.
-        """
+        """Return this validation with other names and units."""
         return self._with(labels=labels)
 
     def _with(self, **changed: Any) -> Validation:
@@ -239,7 +226,7 @@ class Validation:
             DistanceError: as in :meth:`measure`.
         """
         parameters = self.space.parameters(point)
-        return self._measured(parameters, self._task(parameters), model_trajectory, system_trajectory)
+        return self._measured(parameters, self.task_at(parameters), model_trajectory, system_trajectory)
 
     def _measured(self, parameters: Parameters, task: Task, model: Trajectory, system: Trajectory) -> float:
         value = self._distance(task, model, system)
@@ -351,7 +338,10 @@ class Validation:
     # Used for one task and for many
 
     def _plan(self, parameters: Parameters) -> Plan:
-        task = self._task(parameters)
+        return self.plan_of(parameters, self.task_at(parameters))
+
+    def plan_of(self, parameters: Parameters, task: Task) -> Plan:
+        """Return the plan of a task, or of a batch, that is made already; :meth:`plan` checks more."""
         try:
             controller = self.synthesizer.design(task, self.model)
         except CtxvalError:
@@ -366,14 +356,18 @@ class Validation:
             raise ModelError(f"the closed loop on the model failed: {reason_of(error)}.") from error
         return Plan(parameters, task, controller, trajectory)
 
-    def _task(self, parameters: Parameters) -> Task:
+    def task_at(self, parameters: Parameters) -> Task:
+        """Return the task that the task function makes, or a batch of them, after a check of what it returns."""
         try:
             task = self.task(parameters)
         except CtxvalError:
             raise
         except (Exception, SystemExit) as error:
             raise InputError(f"the task function failed: {reason_of(error)}.") from error
-        require_part("the task function's result", task, isinstance(task, Task), "a Task")
+        if not isinstance(task, Task):
+            raise InputError(f"the task function's result must be a Task, got {task!r}.")
+        require_time_step(self.model, task.dt, "the task")
+        require_affordable(self, parameters, task)
         return task
 
     def _distance(self, task: Task, model: Trajectory, system: Trajectory) -> Array:

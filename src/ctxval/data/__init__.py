@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from ctxval.data.log import Clock, Log, MemoryTable, Message, Signal, Table, TopicLog
+from ctxval.data.log import Clock, Log, MemoryTable, Signal, Table
 from ctxval.data.mapping import Field, LogMapping
 from ctxval.data.readers import READERS, is_log, read_logs
 from ctxval.data.recordings import Recording, Recordings, read_recordings, recordings_of
 from ctxval.data.sampling import Break, Channel
+from ctxval.data.topics import Message, TopicLog
 
 __all__ = [
     "READERS",

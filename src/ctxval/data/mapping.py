@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from ctxval._util.columns import column_of
 from ctxval._util.files import read_bytes
 from ctxval._util.representation import record
 from ctxval._util.texts import enumerated
+from ctxval._util.units import conversion, named_unit
 from ctxval.data.log import LISTED, Clock, Log
-from ctxval.data.units import conversion
 from ctxval.errors import InputError, UnknownNameError
 
-Stamp = Literal["log", "publish", "header"]
+Stamp = Literal["auto", "log", "publish", "header"]
+
+_VALID = re.compile(r"\s*(\S.*?)\s*(==|!=)\s*([+-]?\d+(?:\.\d*)?)\s*")
 
 _STATES = ("states", "x", "observation.state")
 _INPUTS = ("inputs", "u", "action")
@@ -31,7 +35,8 @@ class Field:
         path: the name of a column, such as ``angle`` or ``observation.state[2]``, or a field of a message, such as
             ``/joint_states.position[0]``. A vector stands for all its components.
         unit: the unit in which the model takes the value.
-        recorded: the unit in the log, if it is another one. Known units are converted.
+        recorded: the unit in the log, if it is another one and the name of the column does not state it. Known units
+            are converted.
         factor: the factor, if the units are not known; None for that of the units.
         offset: added to the value, in the unit of the model.
         angle: whether it is an angle in radians that the log may keep between -pi and pi: it is continued over turns.
@@ -60,15 +65,24 @@ class Field:
             value = getattr(self, name)
             if value is not None and not _is_number(value):
                 raise InputError(f"{name} of the field {self.path} must be a finite number, got {value!r}.")
-        _ = self.scale
+        _ = self.scale("")
 
-    @property
-    def scale(self) -> float:
-        """The factor of the recorded value."""
+    def scale(self, stated: str) -> float:
+        """Return the factor of the recorded value.
+
+        Args:
+            stated: the unit that the log itself states; empty if it states none.
+
+        Raises:
+            InputError: if the log states another unit than the mapping, or the units cannot be converted.
+        """
         if self.factor is not None:
             return float(self.factor)
         try:
-            return conversion(self.recorded, self.unit) if self.recorded else 1.0
+            if stated and self.recorded and conversion(stated, self.recorded) != 1:
+                raise InputError(f"it is recorded in {stated}, and the mapping states {self.recorded}.")
+            recorded = stated or self.recorded
+            return conversion(recorded, self.unit) if recorded and (self.unit or not stated) else 1.0
         except InputError as error:
             raise InputError(f"the field {self.path}: {error}") from error
 
@@ -80,14 +94,15 @@ class LogMapping:
     Attributes:
         states, inputs: the fields of the states and inputs by name, in the order of the model.
         time: the column of the times of a table; None to look for ``t``, ``time``, ``times`` or ``timestamp``.
-        time_unit: the unit of this column: s, ms, us or ns.
-        stamp: the time of a message: ``log``, when it was recorded; ``publish``, when it was sent; or ``header``, the
-            ``header.stamp`` in it.
+        time_unit: the unit of this column, s, ms, us, ns, min or h, if its name does not state it; seconds by default.
+        stamp: the time of a message: ``log``, when it was recorded; ``publish``, when it was sent; ``header``, the
+            ``header.stamp`` in it; or ``auto``, ``header`` if all messages have plausible ones, else ``log``.
         dt: length of a step in seconds; None for the median period of the first state. A table without times has one
             row for each step.
         delay: seconds between the time at which an input is logged and the time from which it acts on the states.
         longest_gap: longest time in seconds between two samples of one field over which it is interpolated or held;
             None for 1.5 median periods of the field. A recording is split at longer gaps and at missing values.
+        valid: which rows count, such as ``status == 0``: a field, ``==`` or ``!=``, and a number; None for all rows.
 
     Raises:
         InputError: if there is no state, or a number is not allowed.
@@ -97,11 +112,12 @@ class LogMapping:
     states: Mapping[str, Field]
     inputs: Mapping[str, Field] = field(default_factory=dict)
     time: str | None = None
-    time_unit: str = "s"
-    stamp: Stamp = "log"
+    time_unit: str = ""
+    stamp: Stamp = "auto"
     dt: float | None = None
     delay: float = 0.0
     longest_gap: float | None = None
+    valid: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("states", "inputs"):
@@ -110,7 +126,9 @@ class LogMapping:
             raise InputError("a mapping of a log needs at least one state.")
         if both := [name for name in self.states if name in self.inputs]:
             raise InputError(f"{both[0]} is a state and an input: give them different names.")
-        conversion(self.time_unit, "s")
+        conversion(self.time_unit or "s", "s")
+        if self.valid is not None and _VALID.fullmatch(str(self.valid)) is None:
+            raise InputError(f"valid must be a field and a number, such as 'status == 0', got {self.valid!r}.")
         if self.stamp not in get_args(Stamp):
             raise UnknownNameError.among("stamp", str(self.stamp), get_args(Stamp))
         for name in ("dt", "longest_gap"):
@@ -129,6 +147,16 @@ class LogMapping:
     def clock(self) -> Clock:
         """Where the times come from."""
         return Clock(self.time, self.time_unit, None, self.stamp)
+
+    @property
+    def condition(self) -> tuple[str, bool, float] | None:
+        """The field of ``valid``, whether it must equal the number, and the number."""
+        matched = None if self.valid is None else _VALID.fullmatch(self.valid)
+        return None if matched is None else (matched[1], matched[2] == "==", float(matched[3]))
+
+    def in_units(self, states: Mapping[str, str], inputs: Mapping[str, str]) -> LogMapping:
+        """Return this mapping with the units of an experiment, for fields that state none; by name, else by place."""
+        return replace(self, states=_in_units(self.states, states), inputs=_in_units(self.inputs, inputs))
 
     @staticmethod
     def from_table(table: Mapping[str, Any]) -> LogMapping:
@@ -169,26 +197,43 @@ class LogMapping:
             raise InputError(f"{path}: {error}") from error
 
     @staticmethod
-    def usual(log: Log) -> LogMapping:
+    def usual(log: Log, states: Mapping[str, str] | None = None, inputs: Mapping[str, str] | None = None) -> LogMapping:
         """Return the mapping of a log whose fields have usual names.
 
         The states are ``states``, ``x`` or ``observation.state``, or the columns ``x0``, ``x1``, ...; the inputs are
         ``inputs``, ``u`` or ``action``, or the columns ``u0``, ``u1``, ...
 
+        Args:
+            log: the log.
+            states, inputs: names with their units that are looked for before these.
+
         Raises:
             InputError: if the log has none of them; the message lists its fields.
         """
         known = log.fields()
-        states, inputs = _usual(known, _STATES, "x"), _usual(known, _INPUTS, "u")
-        if not states:
+        wanted = {**(states or {}), **(inputs or {})}
+        if wanted and all(column_of(log.source, known, name) for name in wanted):
+            named = {name: Field(name, unit) for name, unit in wanted.items()}
+            outputs = {name: one for name, one in named.items() if name not in (inputs or {})}
+            return LogMapping(outputs, {name: named[name] for name in inputs or {}}, dt=log.period)
+        found = _usual(known, _STATES, "x"), _usual(known, _INPUTS, "u")
+        if not found[0]:
             raise InputError(
                 f"{log.source} has no states under a usual name ({', '.join(_STATES)}, x0): name the states and inputs "
                 f"with --state and --input or in a mapping; the fields are {enumerated(known, LISTED)}."
             )
-        return LogMapping(states, inputs, dt=log.period)
+        return LogMapping(*found, dt=log.period)
 
     def __repr__(self) -> str:
         return record(self)
+
+
+def _in_units(own: Mapping[str, Field], units: Mapping[str, str]) -> dict[str, Field]:
+    by_place = units.values() if len(units) == len(own) else [""] * len(own)
+    return {
+        name: replace(one, unit=one.unit or units.get(name, unit)) if one.factor is None else one
+        for (name, one), unit in zip(own.items(), by_place, strict=True)
+    }
 
 
 def _usual(known: Sequence[str], vectors: Sequence[str], letter: str) -> dict[str, Field]:
@@ -196,7 +241,8 @@ def _usual(known: Sequence[str], vectors: Sequence[str], letter: str) -> dict[st
         if name in known:
             return {letter: Field(name)}
     found: dict[str, Field] = {}
-    while f"{letter}{len(found)}" in known:
+    plain = {named_unit(name)[0] for name in known}
+    while f"{letter}{len(found)}" in plain:
         found[f"{letter}{len(found)}"] = Field(f"{letter}{len(found)}")
     return found
 

@@ -1,4 +1,4 @@
-"""Logs in MATLAB files, up to version 7.3. Needs pymatreader (extra ``logs``), which reads 7.3 with h5py."""
+"""Logs in MATLAB files. Those of version 7.3 are HDF5 and need h5py (extra ``logs``); scipy reads earlier ones."""
 
 from __future__ import annotations
 
@@ -12,37 +12,47 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.extras import require_extra
-from ctxval._util.files import MOST_BYTES, require_regular_file
+from ctxval._util.files import MOST_BYTES, open_regular
+from ctxval._util.texts import quoted, reason_of
 from ctxval.data.log import Log, MemoryTable
 from ctxval.errors import InputError
 
 _DEPTH = 6
 """Largest depth of structures in structures."""
 
+_MOST_OBJECTS = 10_000
+"""Largest number of variables and fields in a file of version 7.3."""
+
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_FILTERS = ("FILTER_DEFLATE", "FILTER_SHUFFLE", "FILTER_FLETCHER32")
+"""The filters of HDF5 that MATLAB uses; others may be code in a library that a path in the environment names."""
+
 
 def read_mat(path: Path) -> list[Log]:
     """Return the log in a MATLAB file: its numeric arrays; ``name.part`` is a field of a structure.
 
-    Raises:
-        InputError: if the file cannot be read, or has no numeric array.
+    References, which cells and arrays of structures consist of, are never followed.
     """
-    reader = require_extra("pymatreader", "logs", "MATLAB files")
     try:
-        require_regular_file(path)
-        size = sum(8 * math.prod(shape) for _, shape, _ in reader.whosmat(str(path)))
-        if size > MOST_BYTES:
-            raise InputError(f"its arrays have {size} bytes, and at most {MOST_BYTES} are read")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of objects of MATLAB's classes, which are not data
-            content = reader.read_mat(str(path))
+        with open_regular(path) as file:
+            is_hdf5 = any(file.seek(start) == start and file.read(8) == _SIGNATURE for start in (0, 512))
+        columns = _version_7_3(path) if is_hdf5 else _version_5(path)
     except InputError as error:
         raise InputError(f"{path} cannot be read as a MATLAB file: {error}.") from error
     except Exception as error:  # damaged files raise many kinds of exceptions
-        raise InputError(f"{path} cannot be read as a MATLAB file ({type(error).__name__}: {error}).") from error
-    columns = dict(_numeric("", content, _DEPTH))
+        raise InputError(f"{path} cannot be read as a MATLAB file ({quoted(reason_of(error))}).") from error
     if not columns:
         raise InputError(f"{path} has no numeric array.")
     return [MemoryTable(str(path), columns)]
+
+
+def _version_5(path: Path) -> dict[str, Array]:
+    from scipy.io import loadmat, whosmat  # imported here: loading it takes longer than a command
+
+    _require_size(sum(8 * math.prod(shape) for _, shape, _ in whosmat(str(path))))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of objects of MATLAB's classes, which are not data
+        return dict(_numeric("", loadmat(str(path), simplify_cells=True), _DEPTH))
 
 
 def _numeric(before: str, content: Mapping[str, Any], depth: int) -> Iterator[tuple[str, Array]]:
@@ -55,6 +65,92 @@ def _numeric(before: str, content: Mapping[str, Any], depth: int) -> Iterator[tu
             if depth:
                 yield from _numeric(path, value, depth - 1)
             continue
-        array = np.asarray(value) if isinstance(value, np.ndarray | list | int | float) else np.array("")
+        array = np.asarray(value) if isinstance(value, np.ndarray | int | float) else np.array("")
         if array.dtype.kind in "biuf" and array.ndim <= 2 and array.size:
             yield path, array.astype(np.float64)
+
+
+def _version_7_3(path: Path) -> dict[str, Array]:
+    """Return the numeric arrays of an HDF5 file, after everything in it is checked.
+
+    HDF5 lets a file name others: by links, as the storage of a data set, and as the source of a virtual one. A
+    stranger's file would name any file of the user. MATLAB writes none of these.
+    """
+    h5py = require_extra("h5py", "logs", "MATLAB files of version 7.3")
+    with h5py.File(path, "r") as file:
+        checked = _Checked(h5py)
+        checked.group("", file.id, _DEPTH)
+        return {name: _array(h5py.Dataset(found)) for name, found in checked.arrays.items()}
+
+
+def _array(dataset: Any) -> Array:
+    values = np.squeeze(np.asarray(dataset[()], dtype=np.float64)).T  # MATLAB counts the first index fastest
+    return np.asarray(values)
+
+
+class _Checked:
+    """The numeric arrays of an HDF5 file by their paths, before anything of them is read.
+
+    Args:
+        h5py: the library.
+
+    Raises:
+        InputError: if the file leads to another one, or declares more than may be read.
+    """
+
+    def __init__(self, h5py: Any) -> None:
+        self.h5py, self.size, self.objects = h5py, 0, 0
+        self.arrays: dict[str, Any] = {}
+
+    def group(self, before: str, group: Any, depth: int) -> None:
+        for name in group:  # the names of the links, none of which is followed here
+            self.objects += 1
+            if self.objects > _MOST_OBJECTS:
+                raise InputError(f"it has more than {_MOST_OBJECTS} variables and fields")
+            if group.links.get_info(name).type != self.h5py.h5l.TYPE_HARD:
+                raise InputError(f"{quoted(name.decode(errors='replace'))} is a link, which could lead to any file")
+            path = f"{before}.{name.decode(errors='replace')}".removeprefix(".")
+            found = self.h5py.h5o.open(group, name)
+            if isinstance(found, self.h5py.h5d.DatasetID):
+                self.dataset(path, found)
+            elif isinstance(found, self.h5py.h5g.GroupID) and depth and not self._has(found, b"MATLAB_sparse"):
+                self.group(path, found, depth - 1)
+
+    def dataset(self, path: str, found: Any) -> None:
+        h5d, h5z = self.h5py.h5d, self.h5py.h5z
+        plan = found.get_create_plist()
+        if plan.get_layout() == h5d.VIRTUAL or plan.get_external_count():
+            raise InputError(f"the values of {quoted(path)} are in another file")
+        shape = found.shape  # only now: the shape of a virtual data set may depend on other files
+        kind = self.h5py.h5t
+        numeric = found.get_type().get_class() in (kind.INTEGER, kind.FLOAT, kind.ENUM)
+        if not numeric or math.prod(shape) == 0 or self._has(found, b"MATLAB_empty") or self._is_text(found):
+            return
+        if sum(extent > 1 for extent in shape) > 2:
+            return
+        chunk = math.prod(plan.get_chunk()) if plan.get_layout() == h5d.CHUNKED else 0
+        self.size += 8 * max(math.prod(shape), chunk)
+        _require_size(self.size)
+        filters = {plan.get_filter(i)[0] for i in range(plan.get_nfilters())}
+        if not filters <= {getattr(h5z, name) for name in _FILTERS}:
+            raise InputError(f"{quoted(path)} is compressed in a way that MATLAB does not use")
+        self.arrays[path] = found
+
+    def _has(self, found: Any, attribute: bytes) -> bool:
+        return bool(self.h5py.h5a.exists(found, attribute))
+
+    def _is_text(self, found: Any) -> bool:
+        if not self._has(found, b"MATLAB_class"):
+            return False
+        attribute = self.h5py.h5a.open(found, b"MATLAB_class")
+        kind = attribute.get_type()
+        if kind.get_class() != self.h5py.h5t.STRING or kind.is_variable_str() or attribute.shape not in ((), (1,)):
+            raise InputError("its classes must be texts")
+        value = np.zeros(attribute.shape, dtype=attribute.dtype)
+        attribute.read(value)
+        return bool(value.item() == b"char")
+
+
+def _require_size(size: int) -> None:
+    if size > MOST_BYTES:
+        raise InputError(f"its arrays have {size} bytes, and at most {MOST_BYTES} are read")

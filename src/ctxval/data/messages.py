@@ -7,21 +7,32 @@ in a file, whereas that of rosbags compiles Python code from them. Those of ROS 
 
 from __future__ import annotations
 
+import bz2
+import io
 import json
+import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ctxval._util.extras import require_extra
 from ctxval._util.files import open_regular
-from ctxval.data.log import Log, Message, TopicLog
+from ctxval._util.texts import quoted, reason_of
+from ctxval.data.log import Log
 from ctxval.data.protobuf import protobuf_decoder
 from ctxval.data.ros1 import ros1_decoder
+from ctxval.data.topics import Message, TopicLog
 from ctxval.errors import InputError
 
 _MOST_FILE = 64 * 2**30
 """Largest size of a file in bytes. It is read message by message."""
+
+_MOST_CHUNK = 128 * 2**20
+"""Largest size of a record, and of a chunk of records after it is decompressed, in bytes."""
+
+_MOST_TOPICS = 10_000
 
 _PURPOSE = "logs of messages"
 
@@ -39,23 +50,40 @@ class McapLog(TopicLog):
     def __init__(self, path: Path) -> None:
         self.source, self._path = str(path), path
         self._decoders: dict[int, Callable[[bytes], Any]] = {}
-        with self._reader() as reader, _damage(path, "an MCAP file"):
-            summary = reader.get_summary()
-            self._topics = {} if summary is None else {one.topic: one for one in summary.channels.values()}
-            if summary is None:
-                self._topics = {channel.topic: channel for _, channel, _ in reader.iter_messages()}
+        with self._opened() as file, _damage(path, "an MCAP file"):
+            file.seek(-_MCAP_END, io.SEEK_END)
+            summary = next(self._records(file)).summary_start  # 0 if there is none
+            file.seek(summary)
+            self._topics = dict[str, None]()
+            for record in self._records(file):
+                if type(record).__name__ == "Channel":
+                    self._topics[record.topic] = None
+                if len(self._topics) > _MOST_TOPICS:
+                    raise InputError(f"{path} has more than {_MOST_TOPICS} topics.")
 
     @contextmanager
-    def _reader(self) -> Iterator[Any]:
-        library = require_extra("mcap.reader", "logs", _PURPOSE)
+    def _opened(self) -> Iterator[Any]:
         try:
             file = open_regular(self._path, _MOST_FILE)
         except InputError as error:
             raise InputError(f"{self._path} cannot be read: {error}.") from error
         with file:
-            with _damage(self._path, "an MCAP file"):
-                reader = library.make_reader(file)
-            yield reader
+            yield file
+
+    def _records(self, file: Any) -> Iterator[Any]:
+        """Yield the records from a place in the file on, and those within chunks, whose sizes are limited."""
+        library = require_extra("mcap.stream_reader", "logs", _PURPOSE)
+        ended = require_extra("mcap.exceptions", "logs", _PURPOSE).EndOfFile
+        inside = {"skip_magic": file.tell() > 0, "emit_chunks": True, "record_size_limit": _MOST_CHUNK}
+        for record in library.StreamReader(file, **inside).records:
+            if type(record).__name__ != "Chunk":
+                yield record
+                continue
+            chunk = io.BytesIO(_decompressed(record.compression, record.data))
+            if record.uncompressed_crc not in (0, zlib.crc32(chunk.getbuffer())):
+                raise ValueError("a chunk has another checksum")
+            with suppress(ended):  # a chunk has no record that says where it ends
+                yield from library.StreamReader(chunk, **{**inside, "skip_magic": True}).records
 
     def topics(self) -> tuple[str, ...]:
         """Return the names of the topics."""
@@ -63,15 +91,23 @@ class McapLog(TopicLog):
 
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
         """Yield decoded messages; see :meth:`TopicLog.messages`."""
-        with self._reader() as reader:
-            found = reader.iter_messages(topics=list(topics))
+        wanted = set(topics)
+        schemas, channels = dict[int, Any](), dict[int, Any]()
+        with self._opened() as file:
+            records = self._records(file)
             while True:
                 with _damage(self._path, "an MCAP file"):
-                    one = next(found, None)
-                if one is None:
-                    return
-                schema, channel, raw = one
-                yield Message(channel.topic, raw.log_time, raw.publish_time, self._decoded(schema, channel, raw))
+                    record: Any = next(records, None)
+                match type(record).__name__:
+                    case "Schema":
+                        schemas[record.id] = record
+                    case "Channel":
+                        channels[record.id] = record
+                    case "Message" if (channel := channels.get(record.channel_id)) and channel.topic in wanted:
+                        content = self._decoded(schemas.get(channel.schema_id), channel, record)
+                        yield Message(channel.topic, record.log_time, record.publish_time, content)
+                    case "NoneType":
+                        return
 
     def _decoded(self, schema: Any, channel: Any, raw: Any) -> Any:
         decoder = self._decoders.get(channel.id)
@@ -82,12 +118,12 @@ class McapLog(TopicLog):
         except Exception as error:  # decoders raise many kinds
             raise InputError(
                 f"{self.source}, message {raw.sequence} of {channel.topic}: it cannot be decoded "
-                f"({type(error).__name__}: {str(error)[:100]})."
+                f"({quoted(reason_of(error))})."
             ) from error
 
     def _decoder(self, schema: Any, channel: Any) -> Callable[[bytes], Any]:
         if channel.message_encoding == "json":
-            return json.loads
+            return lambda data: json.loads(data, object_pairs_hook=_distinct)
         if channel.message_encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
             return ros2_decoder(self.source, channel.topic, schema.name, schema.data.decode("utf-8", "replace"))
         if channel.message_encoding == "ros1" and schema is not None and schema.encoding == "ros1msg":
@@ -125,6 +161,9 @@ class BagLog(TopicLog):
         with _damage(self._path, self._kind):
             reader = library.Reader(self._path)
             reader.open()
+            for place, chunk in getattr(reader, "chunks", {}).items():  # of a bag of ROS 1
+                kind = next((name for name in ("bz2", "lz4") if name in chunk.decompressor.__module__), "")
+                reader.chunks[place] = chunk._replace(decompressor=partial(_decompressed, kind))
         try:
             yield reader
         finally:
@@ -158,7 +197,7 @@ class BagLog(TopicLog):
         except Exception as error:
             raise InputError(
                 f"{self.source}, message {number}, of {connection.topic}: it cannot be decoded "
-                f"({type(error).__name__}: {str(error)[:100]})."
+                f"({quoted(reason_of(error))})."
             ) from error
 
     def _decoder(self, connection: Any) -> Callable[[bytes], Any]:
@@ -180,17 +219,21 @@ class BagLog(TopicLog):
         return ros2_decoder(self.source, connection.topic, connection.msgtype, text)
 
 
-def ros2_decoder(source: str, topic: str, name: str, definition: str) -> Callable[[bytes], Any]:
-    """Return the decoder of ROS 2 messages with a definition.
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) != len(pairs):
+        raise ValueError("a name is there twice")
+    return content
 
-    Raises:
-        InputError: if the definition cannot be read.
-    """
+
+def ros2_decoder(source: str, topic: str, name: str, definition: str) -> Callable[[bytes], Any]:
+    """Return the decoder of ROS 2 messages with a definition."""
     decoding = require_extra("mcap_ros2.decoder", "logs", _PURPOSE)
     records = require_extra("mcap.records", "logs", _PURPOSE)
     schema = records.Schema(id=1, name=name, encoding="ros2msg", data=definition.encode())
     try:
-        decoder: Callable[[bytes], Any] | None = decoding.DecoderFactory().decoder_for("cdr", schema)
+        with redirect_stderr(io.StringIO()):  # the parser prints the text of the file
+            decoder: Callable[[bytes], Any] | None = decoding.DecoderFactory().decoder_for("cdr", schema)
         if decoder is None:
             raise ValueError(name)
         return decoder
@@ -208,6 +251,33 @@ def read_bag(path: Path) -> list[Log]:
     return [BagLog(path)]
 
 
+_MCAP_END = 8 + 29
+"""Size of the footer and the magic bytes at the end of an MCAP file, https://mcap.dev/spec."""
+
+
+def _decompressed(kind: str, data: bytes) -> bytes:
+    """Return the content of a chunk, of which no more is decompressed than may be read.
+
+    The sizes that a file declares may be wrong, and libraries believe them or those in the compressed data.
+    """
+    match kind:
+        case "zstd":
+            zstandard = require_extra("zstandard", "logs", _PURPOSE)
+            content = zstandard.ZstdDecompressor().stream_reader(data).read(_MOST_CHUNK + 1)
+        case "lz4":
+            frame = require_extra("lz4.frame", "logs", _PURPOSE)
+            content = frame.LZ4FrameDecompressor().decompress(data, max_length=_MOST_CHUNK + 1)
+        case "bz2":
+            content = bz2.BZ2Decompressor().decompress(data, max_length=_MOST_CHUNK + 1)
+        case "":
+            content = data
+        case _:
+            raise ValueError(f"the compression {kind}")
+    if len(content) > _MOST_CHUNK:
+        raise ValueError(f"a chunk has more than {_MOST_CHUNK} bytes")
+    return bytes(content)
+
+
 @contextmanager
 def _damage(path: Path, kind: str) -> Iterator[None]:
     """Turn the many exceptions for damaged files into one."""
@@ -216,6 +286,4 @@ def _damage(path: Path, kind: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        raise InputError(
-            f"{path} cannot be read as {kind} ({type(error).__name__}: {str(error)[:100].partition(chr(10))[0]})."
-        ) from error
+        raise InputError(f"{path} cannot be read as {kind} ({quoted(reason_of(error))}).") from error

@@ -10,11 +10,7 @@ from ctxval.errors import InputError
 
 
 def protobuf_decoder(source: str, topic: str, schema: Any) -> Callable[[bytes], dict[str, Any]]:
-    """Return the decoder of messages in protobuf; its messages are plain dictionaries.
-
-    Raises:
-        InputError: if the schema cannot be read.
-    """
+    """Return the decoder of messages in protobuf; its messages are plain dictionaries."""
     decoding = require_extra("mcap_protobuf.decoder", "logs", "logs of messages in protobuf")
     try:
         decode = decoding.DecoderFactory().decoder_for("protobuf", schema)

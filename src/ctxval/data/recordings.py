@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Rows
+from ctxval._util.columns import FAR, sentinels, time_column, unit_advice
 from ctxval._util.representation import Shown, call, counted
+from ctxval._util.units import conversion
 from ctxval.core.trajectory import Trajectory, Transitions
-from ctxval.data.log import TIMES, Clock, Log, Table
+from ctxval.data.log import Log, Table
 from ctxval.data.mapping import LogMapping
 from ctxval.data.parquet import ACTION, STATE, lerobot_names
 from ctxval.data.readers import is_lerobot, read_logs
@@ -70,28 +72,38 @@ class Recordings:
         """
         numbers = list(range(len(self.runs)) if runs is None else runs)
         parts = [self.runs[number].trajectory.transitions() for number in numbers]
-        return Transitions.joined(parts), np.repeat(np.array(numbers, dtype=np.intp), [len(part) for part in parts])
+        return replace(Transitions.joined(parts), dt=self.dt), np.repeat(
+            np.array(numbers, dtype=np.intp), [len(part) for part in parts]
+        )
 
     def __repr__(self) -> str:
         size = Shown(f"{counted(len(self.runs), 'recording')}, {counted(self.steps, 'step')} of {self.dt:g} s")
         return call(self, size, states=list(self.states), inputs=list(self.inputs), breaks=len(self.breaks))
 
 
-def read_recordings(paths: Sequence[str | Path], mapping: LogMapping | None = None, **changes: Any) -> Recordings:
+def read_recordings(
+    paths: Sequence[str | Path],
+    mapping: LogMapping | None = None,
+    *,
+    states: Mapping[str, str] | None = None,
+    inputs: Mapping[str, str] | None = None,
+    **changes: Any,
+) -> Recordings:
     """Return the recordings in files and folders.
 
     Args:
         paths: CSV, NPZ, MATLAB, Parquet and MCAP files, ROS bags, LeRobot data sets, or folders of such files.
-        mapping: which fields are states and inputs; by default, they are found by usual names.
+        mapping: which fields are states and inputs; by default, they are found by the names below, or by usual names.
+        states, inputs: names and units of an experiment, to which values are converted.
         changes: other values of the mapping, such as ``dt`` and ``delay``.
 
     Raises:
         InputError: if a file cannot be read, or lacks a field; the message names file, field and row.
     """
     logs = read_logs(paths)
-    chosen = LogMapping.usual(logs[0]) if mapping is None else mapping
+    chosen = LogMapping.usual(logs[0], states, inputs) if mapping is None else mapping
     names = _stated_names(paths) if mapping is None else {}
-    return recordings_of(logs, replace(chosen, **changes), names)
+    return recordings_of(logs, replace(chosen.in_units(states or {}, inputs or {}), **changes), names)
 
 
 def recordings_of(
@@ -110,19 +122,23 @@ def recordings_of(
     chosen = LogMapping.usual(logs[0]) if mapping is None else mapping
     runs: list[Recording] = []
     breaks: list[Break] = []
-    dt, first = chosen.dt, None
-    for log in logs:
-        channels = _channels(log, chosen, names or {})
+    notes: list[str] = []
+    dt, first = chosen.dt, list[Channel]()
+    used = [one.path for one in chosen.fields.values()]
+    for log in (part for whole in logs for part in whole.episodes(used)):
+        channels = _channels(log, chosen, names or {}, notes)
         labels = [(channel.name, channel.of_input) for channel in channels]
-        if first is None:
-            first = channels
-        elif labels != [(channel.name, channel.of_input) for channel in first]:
+        if first and labels != [(channel.name, channel.of_input) for channel in first]:
             raise InputError(f"{log.source} has other states or inputs than {logs[0].source}: read them separately.")
+        first = first or channels
+        channels = [_in_unit_of(log, *pair) for pair in zip(channels, first, strict=True)]
         dt = _period(log, channels[0]) if dt is None else dt
+        if chosen.longest_gap is None:
+            _require_period(log, channels, dt)
         parts, found = sampled(log.source, channels, dt, chosen.delay, chosen.longest_gap)
         runs += [Recording(log.source, start, trajectory) for start, trajectory in parts]
         breaks += found
-    if first is None or dt is None or not runs:
+    if dt is None or not runs:
         why = "; ".join(str(one) for one in breaks[:3])
         raise InputError(f"no log has two samples of all states and inputs in a row: {why or 'they are empty'}.")
     units = {channel.name: channel.unit for channel in first}
@@ -133,38 +149,85 @@ def recordings_of(
         dt,
         {name: unit for name, unit in units.items() if name not in inputs},
         {name: unit for name, unit in units.items() if name in inputs},
-        tuple(_notes(chosen, dt, first)),
+        (*_notes(chosen, dt, first), *dict.fromkeys(notes)),
     )
 
 
-def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]]) -> list[Channel]:
-    """Return the components of all states and inputs over time."""
+def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes: list[str]) -> list[Channel]:
+    """Return the components of all states and inputs over time; sentences on how they were read are added to notes."""
+    clock = mapping.clock
+    if clock.field is None and isinstance(log, Table) and time_column(log.source, log.names()) is None:
+        clock = replace(clock, period=mapping.dt)
+    condition = mapping.condition
     fields = mapping.fields
-    stated = mapping.clock
-    regular = mapping.dt if stated.field is None and not _has_times(log) else None
-    clock = Clock(stated.field, stated.unit, regular, stated.stamp)
-    signals = log.signals([one.path for one in fields.values()], clock)
-    found = []
+    signals = log.signals([one.path for one in fields.values()] + ([condition[0]] if condition else []), clock)
+    channels = []
     for name, one in fields.items():
         signal = signals[one.path]
-        width = signal.values.shape[1]
-        own = names.get(one.path, [])
+        values = signal.values.copy()
+        if condition is not None:
+            status, equal, number = signals[condition[0]], condition[1], condition[2]
+            at = np.searchsorted(status.times, signal.times, side="right") - 1
+            rows = slice(None) if status.times is signal.times else np.maximum(at, 0)
+            values[(status.values[rows, 0] == number) != equal] = np.nan
+        if signal.clock:
+            notes.append(f"the times of messages are {_CLOCKS[signal.clock]}")
+        components = names.get(one.path, [])
+        width = values.shape[1]
         for k in range(width):
-            label = own[k] if len(own) == width else (name if width == 1 else f"{name}{k}")
-            found.append(
+            label = components[k] if len(components) == width else (name if width == 1 else f"{name}{k}")
+            for value in sentinels(values[:, k]):
+                rows_of_value = values[:, k] == value
+                notes.append(
+                    f"{log.source}: {label} is {value:g} in {counted(int(rows_of_value.sum()), signal.word)}, far from "
+                    "all other values: it is taken as missing"
+                )
+                values[rows_of_value, k] = np.nan
+            channels.append(
                 Channel(
                     label,
-                    one.unit,
+                    one.unit or (signal.unit if one.factor is None else ""),
                     name in mapping.inputs,
                     signal.times,
-                    one.scale * signal.values[:, k] + one.offset,
+                    one.scale(signal.unit) * values[:, k] + one.offset,
                     angle=one.angle,
                     held=one.held,
                     path=one.path,
                     place=(signal.word, signal.first),
                 )
             )
-    return _distinct(found)
+    return _distinct(channels)
+
+
+_CLOCKS = {
+    "header": "their header stamps",
+    "log": "those at which they were logged",
+    "publish": "those at which they were sent",
+}
+
+
+def _in_unit_of(log: Log, channel: Channel, first: Channel) -> Channel:
+    """Return a channel in the unit of the same channel in the first log."""
+    if channel.unit == first.unit:
+        return channel
+    if not channel.unit or not first.unit:
+        raise InputError(
+            f"{log.source} has {channel.name} in {channel.unit or 'an unknown unit'}, and other logs have it in "
+            f"{first.unit or 'an unknown unit'}: state its unit in all files, or in none."
+        )
+    factor = conversion(channel.unit, first.unit)
+    return replace(channel, unit=first.unit, values=factor * channel.values)
+
+
+def _require_period(log: Log, channels: Sequence[Channel], dt: float) -> None:
+    """Refuse states that are recorded much less often than every step, or whose times have another unit."""
+    period = min((one.period for one in channels if not one.of_input and one.period), default=dt)
+    advice = unit_advice(period, dt)
+    if period > FAR * dt or advice:
+        raise InputError(
+            f"{log.source} has a sample of {channels[0].name} every {period:g} s, and a step takes {dt:g} s: "
+            f"{advice or f'give dt = {period:g}, or longest_gap if states are to be interpolated over so many steps'}."
+        )
 
 
 def _distinct(channels: list[Channel]) -> list[Channel]:
@@ -175,23 +238,22 @@ def _distinct(channels: list[Channel]) -> list[Channel]:
     ]
 
 
-def _has_times(log: Log) -> bool:
-    return not isinstance(log, Table) or any(name in log.names() for name in TIMES)
-
-
 def _period(log: Log, channel: Channel) -> float:
-    """Return the median period of a channel."""
+    """Return the mean period of a channel, in which longer steps count as several ones."""
     steps = np.diff(channel.times)
     steps = steps[np.isfinite(steps) & (steps > 0)]
     if not len(steps):
         raise InputError(f"{log.source} has fewer than two samples of {channel.path}, so its time step is unknown.")
-    period = float(np.median(steps))
-    return float(f"{period:.6g}")
+    counts = np.maximum(np.rint(steps / np.median(steps)), 1)
+    period = float(steps.sum() / counts.sum())
+    rounded = float(f"{period:.6g}")
+    # A rounded step must not drift away from the samples over the whole recording.
+    return rounded if abs(rounded - period) * counts.sum() < 1e-3 * period else period
 
 
 def _notes(mapping: LogMapping, dt: float, channels: Sequence[Channel]) -> Iterable[str]:
     if mapping.dt is None:
-        yield f"the time step {dt:g} s is the median period of {channels[0].path}"
+        yield f"the time step {dt:g} s is the mean period of {channels[0].path}"
     for channel in channels:
         period = channel.period
         if not channel.of_input and period > 1.2 * dt:

@@ -33,11 +33,7 @@ _DEEPEST = 32
 
 
 def ros1_decoder(source: str, topic: str, name: str, definition: str) -> Callable[[bytes], Any]:
-    """Return the decoder of ROS 1 messages with a definition.
-
-    Raises:
-        InputError: if the definition cannot be read.
-    """
+    """Return the decoder of ROS 1 messages with a definition."""
     typesys = require_extra("rosbags.typesys", "logs", "logs of messages")
     try:
         parsed = typesys.get_types_from_msg(definition, name)

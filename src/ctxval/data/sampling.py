@@ -1,14 +1,14 @@
-"""Resampling to equal steps: states are interpolated, inputs are held, and nothing is bridged over a gap."""
+"""Resampling to equal steps: states are interpolated, inputs averaged, and nothing is bridged over a gap."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array, Mask, held_means
 from ctxval._util.representation import record
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
@@ -51,7 +51,7 @@ class Channel:
 
     Attributes:
         name, unit: its name and its unit.
-        of_input: whether it is an input, which is held between samples; a state is interpolated.
+        of_input: whether it is an input, which holds until the next sample; a state is interpolated.
         times, values: its samples, shape ``(N,)``; NaN where there is no value.
         angle: whether it is an angle that is continued over turns.
         held: whether a value holds until the next one, however long that takes.
@@ -85,18 +85,8 @@ def sampled(
 ) -> tuple[list[tuple[float, Trajectory]], list[Break]]:
     """Return the parts of a log in which all channels have values, at equal steps, and where it was split.
 
-    Args:
-        source: the file, and the episode in it, for messages.
-        channels: the states and inputs.
-        dt: length of a step, seconds.
-        delay: seconds between the time at which an input is logged and the time from which it acts.
-        longest_gap: longest time between two samples without a gap; None for 1.5 median periods.
-
     Returns:
         The start of each part in seconds with its trajectory, and the breaks.
-
-    Raises:
-        InputError: if a part has too many steps.
     """
     parts: list[tuple[float, Trajectory]] = []
     breaks: list[Break] = []
@@ -151,10 +141,7 @@ def _moved(channel: Channel, delay: float) -> Channel:
 
 def _replaced(channel: Channel, times: Array, values: Array, skipped: int) -> Channel:
     word, first = channel.place
-    return Channel(
-        *(channel.name, channel.unit, channel.of_input, times, values),
-        *(channel.angle, channel.held, channel.path, (word, first + skipped)),
-    )
+    return replace(channel, times=times, values=values, place=(word, first + skipped))
 
 
 def _intervals(source: str, channel: Channel, longest_gap: float | None, breaks: list[Break]) -> list[Interval]:
@@ -208,6 +195,10 @@ def _intersection(first: list[Interval], second: list[Interval]) -> list[Interva
 
 def _part(source: str, channels: Sequence[Channel], interval: Interval, dt: float) -> tuple[float, Trajectory] | None:
     start, end = interval
+    samples = channels[0].times  # steps begin at samples of the first state, if its input is delayed by a part of one
+    later = samples[np.searchsorted(samples, start - _SLACK * dt) :][:1]
+    if len(later) and 0 < later[0] - start < channels[0].period:
+        start = float(later[0])
     steps = np.floor((end - start) / dt + 1e-3)
     if not 1 <= steps < np.inf:
         return None
@@ -215,7 +206,7 @@ def _part(source: str, channels: Sequence[Channel], interval: Interval, dt: floa
         raise InputError(f"{source} has {steps:.3g} steps of {dt:g} s, more than {_MOST_STEPS}: give a larger dt.")
     times: Array = np.asarray(dt * np.arange(int(steps) + 1), dtype=np.float64)
     states = [_interpolated(one, start + times) for one in channels if not one.of_input]
-    inputs = [_held(one, start + times[:-1], dt) for one in channels if one.of_input]
+    inputs = [_averaged(one, start + times, dt) for one in channels if one.of_input]
     columns = np.stack(inputs, axis=-1) if inputs else np.empty((int(steps), 0))
     return start, Trajectory(times, np.stack(states, axis=-1), columns)
 
@@ -237,8 +228,7 @@ def _interpolated(channel: Channel, times: Array) -> Array:
     return np.asarray(found)
 
 
-def _held(channel: Channel, times: Array, dt: float) -> Array:
+def _averaged(channel: Channel, edges: Array, dt: float) -> Array:
+    """Return the mean input of each step: an input holds until the next sample, which may come within a step."""
     good = np.isfinite(channel.values)
-    own, values = channel.times[good], channel.values[good]
-    at = np.searchsorted(own, times + _SLACK * dt, side="right") - 1
-    return np.asarray(values[np.maximum(at, 0)])
+    return held_means(channel.times[good], channel.values[good, None], edges, _SLACK * dt)[:, 0]

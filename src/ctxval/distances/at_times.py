@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows, vector_norm
+from ctxval._util.checked import Norm
 from ctxval._util.registry import part
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -22,15 +23,15 @@ class AtTimes(ErrorNorm):
 
     Attributes:
         norm: order of the norm over the states at one time: 1, 2 or infinity.
-        components: indices of the states that are compared; all states by default.
+        components: the states that are compared, by index or name; all states by default.
         times: seconds after the start of the task; each is rounded to the nearest step.
         weights, scales, angles: as in :class:`StateNorm`.
 
     Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity, or another argument cannot be used.
+        InputError: if an argument cannot be used.
     """
 
-    norm: float = 2
+    norm: Norm = 2
     times: Sequence[float] = ()
 
     def __post_init__(self) -> None:

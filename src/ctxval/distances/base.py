@@ -6,21 +6,53 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, as_finite, as_norm_order, vector_norm
+from ctxval._util.arrays import Array, ArrayLike, as_finite, vector_norm
+from ctxval._util.checked import Norm
 from ctxval._util.representation import call
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import InputError, ShapeError, UnknownNameError
 
 _COMPARABLE = ("weights", "scales", "angles")
 
 
+class NamedStates:
+    """A dataclass whose options ``components``, ``angles`` and ``state`` may have names of states besides indices."""
+
+    def with_states(self, names: Sequence[str]) -> Self:
+        """Return the same with the indices of states in place of their names.
+
+        Args:
+            names: the names of all states; if empty, nothing is replaced.
+
+        Raises:
+            UnknownNameError: if no state has a name.
+        """
+
+        def index(value: Any) -> Any:
+            if isinstance(value, str) and value not in names:
+                raise UnknownNameError.among("state", value, names)
+            return names.index(value) if isinstance(value, str) else value
+
+        found: dict[str, Any] = {}
+        for name in _STATES if names else ():
+            value: Any = getattr(self, name, None)
+            if isinstance(value, str):
+                found[name] = index(value)
+            elif isinstance(value, list | tuple) and any(isinstance(item, str) for item in value):
+                found[name] = tuple(map(index, value))
+        return dataclasses.replace(self, **found) if found else self  # type: ignore[type-var]
+
+
+_STATES = ("components", "angles", "state")
+
+
 @dataclass(frozen=True, repr=False)
-class StateNorm:
+class StateNorm(NamedStates):
     """A norm of differences between states.
 
     Each difference is multiplied by its weight, divided by its scale, and then enters the norm. With a scale in the
@@ -28,11 +60,11 @@ class StateNorm:
 
     Attributes:
         norm: order of the norm: 1, 2 or infinity.
-        components: indices of the states that are compared; all states by default.
+        components: the states that are compared, by index or by the name in the experiment; all states by default.
         weights: one number >= 0 for each compared state; 1 by default.
         scales: the unit of comparison of each compared state, a positive number; 1 by default.
-        angles: indices of the states that are angles in radians: the difference is taken on the circle, so it is at
-            most pi.
+        angles: the states that are angles in radians, by index or name: the difference is taken on the circle, so it
+            is at most pi.
 
     Raises:
         InputError: if the order of the norm is not 1, 2 or infinity, no state is compared, or a weight or a scale
@@ -40,21 +72,18 @@ class StateNorm:
         ShapeError: if the number of weights or scales is not that of the compared states.
     """
 
-    norm: float = 1
-    components: Sequence[int] | None = None
+    norm: Norm = 1
+    components: Sequence[int | str] | None = None
     _: KW_ONLY
     weights: Sequence[float] | None = None
     scales: Sequence[float] | None = None
-    angles: Sequence[int] = ()
+    angles: Sequence[int | str] = ()
 
     def __post_init__(self) -> None:
-        as_norm_order(self.norm)
         if self.components is not None and not len(self.components):
             raise InputError("components must name at least one state; leave it out to compare all states.")
         require_numbers("weights", self.weights, self.components, zero=True)
         require_numbers("scales", self.scales, self.components, zero=False)
-        if not all(isinstance(index, int | np.integer) and not isinstance(index, bool) for index in self.angles):
-            raise InputError(f"angles must be indices of states, got {self.angles!r}.")
 
     @property
     def factors(self) -> Array | None:
@@ -73,22 +102,19 @@ class StateNorm:
             ShapeError: if there is no state of an index, or the number of weights or scales is another one.
         """
         gap = selected(self.unwrapped(states - others), self.components)
+        counts = [len(given) for given in (self.weights, self.scales) if given is not None]
+        if set(counts) - {gap.shape[-1]}:
+            raise ShapeError(f"there must be a weight or a scale for each of {gap.shape[-1]} states, got {counts[0]}.")
         factors = self.factors
-        if factors is None:
-            return gap
-        if gap.shape[-1] != len(factors):
-            raise ShapeError(
-                f"there must be a weight or a scale for each of {gap.shape[-1]} states, got {len(factors)}."
-            )
-        return gap * factors
+        return gap if factors is None else gap * factors
 
     def unwrapped(self, gap: Array) -> Array:
         """Return differences of states ``(..., n)``; those of angles are moved to at most pi in magnitude."""
         if not len(self.angles):
             return gap
-        require_indices("angles", self.angles, gap.shape[-1])
         moved = np.array(gap)
-        moved[..., list(self.angles)] = turned(gap[..., list(self.angles)])
+        angles = require_indices("angles", self.angles, gap.shape[-1])
+        moved[..., angles] = turned(gap[..., angles])
         return moved
 
     def mixed_units(self, units: Sequence[str]) -> tuple[str, ...]:
@@ -100,7 +126,8 @@ class StateNorm:
         if self.weights is not None or self.scales is not None:
             return ()
         compared = range(len(units)) if self.components is None else self.components
-        found = dict.fromkeys(units[i] for i in compared if -len(units) <= i < len(units) and units[i])
+        places = [i for i in compared if not isinstance(i, str) and -len(units) <= i < len(units)]
+        found = dict.fromkeys(units[i] for i in places if units[i])
         return tuple(found) if len(found) > 1 else ()
 
     def describe(self) -> dict[str, Any]:
@@ -134,16 +161,11 @@ class ErrorNorm(StateNorm, ABC):
         return self.compose(self.error(model_trajectory, system_trajectory, task))
 
 
-def selected(states: Array, components: Sequence[int] | None) -> Array:
-    """Return the selected states ``(..., k)``; all states if ``components`` is None.
-
-    Raises:
-        ShapeError: if there is no state of an index.
-    """
+def selected(states: Array, components: Sequence[int | str] | None) -> Array:
+    """Return the selected states ``(..., k)``; all states if ``components`` is None."""
     if components is None:
         return states
-    require_indices("components", components, states.shape[-1])
-    return states[..., list(components)]
+    return states[..., require_indices("components", components, states.shape[-1])]
 
 
 def turned(angles: Array) -> Array:
@@ -151,18 +173,17 @@ def turned(angles: Array) -> Array:
     return np.asarray(angles - 2 * np.pi * np.round(angles / (2 * np.pi)))
 
 
-def require_indices(name: str, indices: Sequence[int], count: int) -> None:
-    """Check that indices are those of ``count`` states; negative ones count from the end.
+def require_indices(name: str, indices: Sequence[int | str], count: int) -> list[int]:
+    """Return indices of ``count`` states; negative ones count from the end."""
+    right = [index for index in indices if not isinstance(index, str) and -count <= index < count]
+    if len(right) < len(indices):
+        wrong = next(index for index in indices if index not in right)
+        unnamed = " The experiment must name its states." if isinstance(wrong, str) else ""
+        raise ShapeError(f"{name} must be indices of {count} states, from 0 to {count - 1}, got {wrong!r}.{unnamed}")
+    return right
 
-    Raises:
-        ShapeError: if there is no state of an index.
-    """
-    wrong = [index for index in indices if not -count <= index < count]
-    if wrong:
-        raise ShapeError(f"{name} must be indices of {count} states, from 0 to {count - 1}, got {wrong[0]!r}.")
 
-
-def require_numbers(name: str, given: ArrayLike | None, components: Sequence[int] | None, *, zero: bool) -> None:
+def require_numbers(name: str, given: ArrayLike | None, components: Sequence[int | str] | None, *, zero: bool) -> None:
     """Check that an option is None or a list of finite numbers, one for each component if these are known.
 
     Args:
@@ -170,10 +191,6 @@ def require_numbers(name: str, given: ArrayLike | None, components: Sequence[int
         given: the value.
         components: the compared states, if they are known.
         zero: whether 0 is allowed, though not for all of them.
-
-    Raises:
-        InputError: if a number is not allowed.
-        ShapeError: if it is no list, or its length is another one.
     """
     if given is None:
         return

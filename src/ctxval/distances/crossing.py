@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
-from ctxval._util.arrays import Array, as_finite, vector_norm
+from ctxval._util.arrays import Array, vector_norm
+from ctxval._util.checked import FiniteFloat, Norm, PositiveInt
 from ctxval._util.registry import part
 from ctxval._util.representation import record
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.distances.base import ErrorNorm, require_indices, turned
-from ctxval.errors import InputError, UnknownNameError
+from ctxval.distances.base import ErrorNorm, NamedStates, require_indices, turned
 
 Direction = Literal["up", "down", "either"]
 
@@ -28,28 +28,22 @@ class AtCrossing(ErrorNorm):
 
     Attributes:
         norm: order of the norm over the states at one crossing: 1, 2 or infinity.
-        components: indices of the states that are compared; all states by default.
-        state: index of the state that crosses the level.
+        components: the states that are compared, by index or name; all states by default.
+        state: index or name of the state that crosses the level.
         level: the level, in the unit of this state.
         direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
         crossings: number of crossings that are compared; only the first one by default.
         weights, scales, angles: as in :class:`StateNorm`. An angle crosses the level wherever it does on the circle.
 
     Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity, or another argument cannot be used.
+        InputError: if an argument cannot be used.
     """
 
-    norm: float = 2
-    state: int = 0
-    level: float = 0.0
+    norm: Norm = 2
+    state: int | str = 0
+    level: FiniteFloat = 0.0
     direction: Direction = "either"
-    crossings: int = 1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require_level(self.level, self.direction)
-        if not isinstance(self.crossings, int) or self.crossings < 1:
-            raise InputError(f"crossings must be an integer >= 1, got {self.crossings!r}.")
+    crossings: PositiveInt = 1
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         """Return the weighted differences at the crossings, one after the other, shape ``(..., crossings k)``."""
@@ -64,10 +58,10 @@ class AtCrossing(ErrorNorm):
     def _states(self, trajectory: Trajectory) -> Array:
         """Return the states at the crossings, shape ``(..., crossings, n)``."""
         states = trajectory.states
-        require_indices("state", [self.state], states.shape[-1])
         n = states.shape[-1]
-        on_circle = self.state % n in {index % n for index in self.angles}
-        places = _crossings(states[..., self.state] - self.level, self.direction, self.crossings, on_circle)
+        [state] = require_indices("state", [self.state], n)
+        on_circle = state % n in {index % n for index in require_indices("angles", self.angles, n)}
+        places = _crossings(states[..., state] - self.level, self.direction, self.crossings, on_circle)
         before = np.minimum(places.astype(np.intp), trajectory.horizon - 1)[..., None]
         first = np.take_along_axis(states, before, axis=-2)
         second = np.take_along_axis(states, before + 1, axis=-2)
@@ -76,37 +70,33 @@ class AtCrossing(ErrorNorm):
 
 @part()
 @dataclass(frozen=True, repr=False)
-class CrossingTime:
+class CrossingTime(NamedStates):
     """Difference in seconds between the times at which M and S first cross a level; interpolated between samples.
 
     A trajectory that does not cross the level counts as if it crossed it at its end.
 
     Attributes:
-        state: index of the state that crosses the level.
+        state: index or name of the state that crosses the level.
         level: the level, in the unit of this state.
         direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
         angle: whether the state is an angle in radians, which crosses the level wherever it crosses it on the circle.
 
     Raises:
-        InputError: if the level is not finite.
-        UnknownNameError: if there is no such direction.
+        InputError: if an argument cannot be used.
     """
 
-    state: int = 0
-    level: float = 0.0
+    state: int | str = 0
+    level: FiniteFloat = 0.0
     direction: Direction = "either"
     angle: bool = False
-
-    def __post_init__(self) -> None:
-        _require_level(self.level, self.direction)
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         """Return the distance in seconds, shape ``(...)``."""
         return np.asarray(np.abs(self._place(system_trajectory) - self._place(model_trajectory)) * task.dt)
 
     def _place(self, trajectory: Trajectory) -> Array:
-        require_indices("state", [self.state], trajectory.states.shape[-1])
-        above = trajectory.states[..., self.state] - self.level
+        [state] = require_indices("state", [self.state], trajectory.states.shape[-1])
+        above = trajectory.states[..., state] - self.level
         return _crossings(above, self.direction, 1, self.angle)[..., 0]
 
     def __repr__(self) -> str:
@@ -114,14 +104,7 @@ class CrossingTime:
 
 
 def _crossings(above: Array, direction: Direction, count: int, on_circle: bool) -> Array:
-    """Return the places of the first crossings of 0, in steps, shape ``(..., count)``; the last step if there is none.
-
-    Args:
-        above: the values at the steps, shape ``(..., H + 1)``.
-        direction: the direction of the crossings.
-        count: number of crossings.
-        on_circle: whether the values are angles, which are the same after a turn.
-    """
+    """Return the places of the first crossings of 0 in steps, ``(..., count)``; the last step if there is none."""
     if on_circle:
         above = turned(above)
     first, second = above[..., :-1], above[..., 1:]
@@ -138,9 +121,3 @@ def _crossings(above: Array, direction: Direction, count: int, on_circle: bool) 
         place = np.take_along_axis(places, at.argmax(axis=-1)[..., None], axis=-1)[..., 0]
         found.append(np.where(at.any(axis=-1), place, float(first.shape[-1])))
     return np.stack(found, axis=-1)
-
-
-def _require_level(level: float, direction: str) -> None:
-    as_finite("level", level)
-    if direction not in get_args(Direction):
-        raise UnknownNameError.among("direction", str(direction), get_args(Direction))

@@ -14,15 +14,15 @@ from ctxval.distances.base import ErrorNorm
 @part()
 @dataclass(frozen=True, repr=False)
 class FinalState(ErrorNorm):
-    """Norm of the difference between the final states (the paper's eq. 5, with ``norm=1``).
+    """Norm of the difference between the final states (the paper's eq. 4, with ``norm=1``).
 
     Attributes:
         norm: order of the norm: 1, 2 or infinity.
-        components: indices of the states that are compared; all states by default.
+        components: the states that are compared, by index or name; all states by default.
         weights, scales, angles: as in :class:`StateNorm`.
 
     Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity, or another argument cannot be used.
+        InputError: if an argument cannot be used.
     """
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from ctxval._util.arrays import Array
 from ctxval._util.registry import part
@@ -20,12 +21,15 @@ class GoalError(ErrorNorm):
 
     Attributes:
         norm: order of the norm: 1, 2 or infinity.
-        components: indices of the states that are compared; all states by default.
+        components: the states that are compared, by index or name; all states by default.
         weights, scales, angles: as in :class:`StateNorm`.
 
     Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity, or another argument cannot be used.
+        InputError: if an argument cannot be used.
     """
+
+    to_task: ClassVar[bool] = True
+    """Whether it measures the system against the task, so that it need not be 0 if the system is like the model."""
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         """Return the weighted difference between the final state of S and the goal, shape ``(..., k)``."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, vector_norm
+from ctxval._util.checked import Norm
 from ctxval._util.registry import part
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -20,14 +21,14 @@ class MaximumDeviation(StateNorm):
 
     Attributes:
         norm: order of the norm over the states at one time: 1, 2 or infinity.
-        components: indices of the states that are compared; all states by default.
+        components: the states that are compared, by index or name; all states by default.
         weights, scales, angles: as in :class:`StateNorm`.
 
     Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity, or another argument cannot be used.
+        InputError: if an argument cannot be used.
     """
 
-    norm: float = 2
+    norm: Norm = 2
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         """Return the distance, shape ``(...)``."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, vector_norm
+from ctxval._util.checked import Norm
 from ctxval._util.registry import part
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -24,17 +25,17 @@ class RelativeDeviation(StateNorm):
 
     Attributes:
         norm: order of the norm over the states at one time: 1, 2 or infinity.
-        components: indices of the states that are compared; all states by default.
+        components: the states that are compared, by index or name; all states by default.
         least: smallest range that a gap is divided by, for each compared state in its unit. A smaller range of M counts
             as this one, because a state at rest would otherwise have an unbounded relative error.
         weights, scales, angles: as in :class:`StateNorm`.
 
     Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity, or another argument cannot be used.
+        InputError: if an argument cannot be used.
         ShapeError: if the number of smallest ranges is not that of the compared states.
     """
 
-    norm: float = np.inf
+    norm: Norm = np.inf
     least: Sequence[float] = ()
 
     def __post_init__(self) -> None:

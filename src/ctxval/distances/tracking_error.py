@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from ctxval._util.arrays import Array, vector_norm
+from ctxval._util.checked import Norm
 from ctxval._util.registry import part
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.distances.base import StateNorm
-from ctxval.errors import UnknownNameError
 
 Over = Literal["maximum", "mean"]
 
@@ -26,22 +26,18 @@ class TrackingError(StateNorm):
 
     Attributes:
         norm: order of the norm over the states at one time: 1, 2 or infinity.
-        components: indices of the states that are compared; all states by default.
+        components: the states that are compared, by index or name; all states by default.
         over: ``maximum`` or ``mean``: how the norms at the times are combined.
         weights, scales, angles: as in :class:`StateNorm`.
 
     Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity, or another argument cannot be used.
-        UnknownNameError: if ``over`` is neither ``maximum`` nor ``mean``.
+        InputError: if an argument cannot be used.
     """
 
-    norm: float = 2
-    over: Over = "maximum"
+    to_task: ClassVar[bool] = True
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.over not in get_args(Over):
-            raise UnknownNameError.among("combination over time", str(self.over), get_args(Over))
+    norm: Norm = 2
+    over: Over = "maximum"
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         """Return the distance, shape ``(...)``."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, vector_norm
+from ctxval._util.checked import Norm
 from ctxval._util.registry import part
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -23,15 +24,15 @@ class WholeTrajectory(StateNorm):
 
     Attributes:
         norm: order of the norm over times and states together: 1, 2 or infinity.
-        components: indices of the states that are compared; all states by default.
+        components: the states that are compared, by index or name; all states by default.
         weights, scales, angles: as in :class:`StateNorm`.
         per_step: whether the norm is divided by the horizon H.
 
     Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity, or another argument cannot be used.
+        InputError: if an argument cannot be used.
     """
 
-    norm: float = np.inf
+    norm: Norm = np.inf
     per_step: bool = False
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:

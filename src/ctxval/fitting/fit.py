@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import call, counted, record
-from ctxval.core.model import Model
+from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.recordings import Recording, Recordings
 from ctxval.errors import InputError, ModelError, UnknownNameError
@@ -18,6 +18,7 @@ from ctxval.fitting.least_squares import FittedParameter, as_bounds, fit_paramet
 from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear
 from ctxval.models.parametric import ParametricStep
 from ctxval.replay.accuracy import StepError, step_errors
+from ctxval.replay.report import plain_numbers
 from ctxval.replay.steps import RecordedSteps
 
 Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
@@ -57,6 +58,21 @@ class FittedModel:
     def relative(self) -> float:
         """The largest one-step error of a state on held-out recordings, as a share of its recorded change."""
         return max((one.relative for one in self.errors if one.steps == 1), default=float("inf"))
+
+    @property
+    def useless(self) -> str | None:
+        """Why the model is no better than no model, in one sentence; None if it is.
+
+        After one step, or after the largest number of steps, its error in a state is at least the recorded change.
+        """
+        last = max((one.steps for one in self.errors), default=0)
+        worst = max((one for one in self.errors if one.steps in (1, last)), key=lambda one: one.relative, default=None)
+        if worst is None or worst.relative < 1:
+            return None
+        return (
+            f"the {self.kind} model is no better than to predict no change: its held-out error of {worst.state} after "
+            f"{counted(worst.steps, 'step')} is {100 * worst.relative:.3g} % of the recorded change"
+        )
 
     def __repr__(self) -> str:
         return call(self, self.kind, self.model, relative=self.relative)
@@ -101,6 +117,7 @@ class FitReport:
                 "errors": [{**asdict(error), "relative": error.relative} for error in one.errors],
                 "parameters": [asdict(parameter) for parameter in one.parameters],
                 "notes": list(one.notes),
+                "useless": one.useless,
             }
             for one in self.fitted
         ]
@@ -108,7 +125,7 @@ class FitReport:
         held = {"recordings": len(self.held_out.runs), "steps": self.held_out.steps}
         failed = [asdict(one) for one in self.failed]
         report = {"fitted": found, "failed": failed, "learned_from": sizes, "held_out": held}
-        return {**_plain(report), "dt": self.held_out.dt, "notes": list(self.held_out.notes)}
+        return {**plain_numbers(report), "dt": self.held_out.dt, "notes": list(self.held_out.notes)}
 
     def __repr__(self) -> str:
         return call(self, [one.kind for one in self.fitted], failed=[one.kind for one in self.failed])
@@ -169,7 +186,9 @@ def fit(
 
     with single_threaded():
         # Before anything is learned, because what is named must be usable.
-        known = [] if given is None else [FittedModel("given", given, errors_of(_with_step(given, recordings.dt)))]
+        if given is not None:
+            require_time_step(given, recordings.dt, "the recording")
+        known = [] if given is None else [FittedModel("given", given, errors_of(given))]
         for kind in dict.fromkeys(kinds):
             try:
                 model, found, notes = makers[kind]()
@@ -193,14 +212,6 @@ def _require_kinds(
         as_bounds(bounds)
 
 
-def _with_step(model: Model, dt: float) -> Model:
-    """Return a model that exists already, if it has no other time step than the recordings."""
-    own = getattr(model, "dt", None)
-    if isinstance(own, int | float) and not np.isclose(own, dt, rtol=1e-3, atol=0):
-        raise InputError(f"the given model has steps of {own:g} s and the recordings have steps of {dt:g} s.")
-    return model
-
-
 def _rank(one: FittedModel) -> float:
     last = max((error.steps for error in one.errors), default=0)
     found = max((error.relative for error in one.errors if error.steps == last), default=np.inf)
@@ -211,9 +222,6 @@ def split(recordings: Recordings, share: float, seed: int) -> tuple[Recordings, 
     """Return the recordings to learn from, and those that are held out.
 
     Whole recordings are held out, drawn at random. Of a single recording, the last part is held out.
-
-    Raises:
-        InputError: if the share is not between 0 and 1, or too little is recorded.
     """
     if not isinstance(share, int | float) or not 0 < share < 1:
         raise InputError(f"the share that is held out must be between 0 and 1, got {share!r}.")
@@ -253,12 +261,7 @@ _WEAK = 30.0
 
 
 def identifiability(data: Transitions, names: Sequence[str]) -> list[str]:
-    """Return sentences on how well transitions determine a linear model: the variance inflation of each regressor.
-
-    Args:
-        data: the recorded transitions.
-        names: the names of the states and inputs.
-    """
+    """Return sentences on how well transitions determine a linear model: the variance inflation of each regressor."""
     Z = np.concatenate([data.x, data.u], axis=1)
     deviations = Z.std(axis=0)
     still = [name for name, size in zip(names, deviations, strict=True) if size <= 0]
@@ -277,13 +280,3 @@ def identifiability(data: Transitions, names: Sequence[str]) -> list[str]:
         f"all states and inputs vary independently enough: standard errors of coefficients are at most {worst:.2g} "
         "times those of independent excitation"
     ]
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    return value

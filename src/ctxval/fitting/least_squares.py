@@ -94,11 +94,7 @@ def fit_parameters(
 
 
 def as_bounds(bounds: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
-    """Return the lower and the upper bounds of parameters, shapes ``(p,)``.
-
-    Raises:
-        InputError: if there is none, or one is not two numbers with the lower one first.
-    """
+    """Return the lower and the upper bounds of parameters, shapes ``(p,)``."""
     if not bounds:
         raise InputError("at least one parameter with its bounds is needed, such as mass = [0.5, 2.0].")
     for name, pair in bounds.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ctxval._util.files import written_whole
+from ctxval._util.files import MADE_BY, write_text
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.fitting.onnx_file import write_onnx
@@ -25,39 +25,25 @@ SUFFIXES: dict[str, tuple[type, ...]] = {
 }
 """The models that a file of each suffix can hold."""
 
+BESIDE = (".data.npz", ".residual.json", ".residual.txt")
+"""The suffixes of the files that may be written beside a model."""
+
 
 def require_suffix(path: Path) -> None:
-    """Check that the name of the file of a model ends as one that can be written.
-
-    Raises:
-        InputError: if it does not.
-    """
+    """Check that the name of the file of a model ends as one that can be written."""
     if path.suffix not in SUFFIXES:
         raise InputError(f"the file of a model must end in {', '.join(SUFFIXES)}, got {str(path)!r}.")
 
 
 def require_file_for(path: Path, model: Model) -> None:
-    """Check that a file of this suffix can hold a model.
-
-    Raises:
-        InputError: if it cannot.
-    """
+    """Check that a file of this suffix can hold a model."""
     require_suffix(path)
     if not isinstance(model, SUFFIXES[path.suffix]):
         raise InputError(f"the model {model!r} cannot be written to a file that ends in {path.suffix}.")
 
 
 def write_model_file(path: Path, model: Model, step: str | None = None) -> list[str]:
-    """Write a model to a file, and the data of an ONNX file to another one; return their paths.
-
-    Args:
-        path: the file.
-        model: the model.
-        step: ``module:attr`` of the user's function, for its parameters.
-
-    Raises:
-        InputError: if a file of this suffix cannot hold the model, or cannot be written.
-    """
+    """Write a model to a file, and the data of an ONNX file to another one; return their paths."""
     require_file_for(path, model)
     if isinstance(model, Parametric):
         _write_parameters(path, model, step)
@@ -74,11 +60,7 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
 
 
 def require_reference(step: str | None) -> str:
-    """Return the reference ``module:attr`` to the user's function, without which its parameters cannot be written.
-
-    Raises:
-        InputError: if there is none.
-    """
+    """Return the reference ``module:attr`` to the user's function, without which its parameters cannot be written."""
     if step is None:
         raise InputError(
             "the parameters of a function can only be written with the reference module:attr to it (--step)."
@@ -88,8 +70,10 @@ def require_reference(step: str | None) -> str:
 
 def _write_parameters(path: Path, model: Parametric, step: str | None) -> None:
     values = ", ".join(f"{name} = {value!r}" for name, value in model.theta.items())
-    text = f'[model]\ntype = "Parametric"\nstep = {{ ref = "{require_reference(step)}" }}\ntheta = {{ {values} }}\n'
+    text = f'# {MADE_BY}\n[model]\ntype = "Parametric"\n'
+    text += f'step = {{ ref = "{require_reference(step)}" }}\ntheta = {{ {values} }}\n'
+    dt = model.dt or getattr(model.data, "dt", None)
+    text += "" if dt is None else f"dt = {dt!r}\n"
     if model.vectorized:
         text += "vectorized = true\n"
-    with written_whole(path) as file:
-        file.write(text.encode())
+    write_text(path, text)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.extras import require_extra
-from ctxval._util.files import written_whole
+from ctxval._util.files import MADE_BY, written_whole
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear
@@ -19,15 +19,7 @@ _OPSET, _IR = 17, 8
 
 
 def write_onnx(path: str | Path, model: Model) -> None:
-    """Write a model as an ONNX file with one input ``(x, u)`` and the output ``x_next``.
-
-    Args:
-        path: the file.
-        model: a ``Linear``, ``FeedforwardReLU`` or ``GaussianProcessModel``, or one of these ``Corrected``.
-
-    Raises:
-        InputError: if onnx is not installed, the model is another one, or the file cannot be written.
-    """
+    """Write a model as an ONNX file with one input ``(x, u)`` and the output ``x_next``."""
     onnx = require_onnx(model)
     graph = _Graph(onnx)
     n, m = _model(graph, model, "x_next")
@@ -37,20 +29,13 @@ def write_onnx(path: str | Path, model: Model) -> None:
         graph.nodes, "step", [value("z", kind, ["N", n + m])], [value("x_next", kind, ["N", n])], graph.tensors
     )
     opset = [onnx.helper.make_opsetid("", _OPSET)]
-    content = onnx.helper.make_model(made, opset_imports=opset, ir_version=_IR)
+    content = onnx.helper.make_model(made, opset_imports=opset, ir_version=_IR, producer_name=MADE_BY)
     with written_whole(path) as file:
         file.write(content.SerializeToString())
 
 
 def require_onnx(model: Model | None) -> Any:
-    """Return the module onnx, if it is installed and a model can be written.
-
-    Args:
-        model: the model; None if it is one of those that can be written.
-
-    Raises:
-        InputError: if onnx is not installed, or the model cannot be written.
-    """
+    """Return the module onnx, if it is installed and a model can be written."""
     onnx = require_extra("onnx", "fit", "ONNX files")
     while isinstance(model, Corrected):
         model = model.model

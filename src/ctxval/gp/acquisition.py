@@ -44,7 +44,7 @@ _LOG_ROOT_2PI = 0.5 * float(np.log(2 * np.pi))
 
 @dataclass(frozen=True, eq=False)
 class UpperConfidenceBound:
-    """``alpha(p) = mu(p) + beta^(1/2) sigma(p)`` (the paper's eq. 11, GP-UCB).
+    """``alpha(p) = mu(p) + beta^(1/2) sigma(p)`` (the paper's eq. 10, GP-UCB).
 
     Attributes:
         process: the surrogate.

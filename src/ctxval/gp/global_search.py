@@ -16,7 +16,6 @@ from scipy.spatial import KDTree
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import separated_rows
-from ctxval._util.representation import call
 from ctxval.gp.evaluations import Evaluations, Values
 
 _SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88
@@ -67,10 +66,6 @@ class GlobalMaximum:
     values: Array
     elites: Array
     evaluations: int
-
-    def __repr__(self) -> str:
-        largest = float(self.values[0]) if len(self.values) else None
-        return call(self, largest=largest, elites=len(self.elites), evaluations=self.evaluations)
 
 
 def search_globally(
@@ -155,11 +150,7 @@ class _Prominence:
         self._kept: Rows = np.empty(0, dtype=np.intp)
 
     def update(self, points: Array, values: Array) -> Array:
-        """Return the most prominent points, the most prominent first, among the new ones and those kept before.
-
-        Args:
-            points, values: all evaluations in their order, shapes ``(m, d)`` and ``(m,)``.
-        """
+        """Return the most prominent points, the most prominent first, among the new ones and those kept before."""
         rows = np.concatenate([self._kept, np.arange(self._seen, len(points))])
         self._seen = len(points)
         found = _prominences(points, _compressed(values), rows)

@@ -184,9 +184,6 @@ def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: W
         X: points ``(n, d)``.
         values: values ``(n,)``.
         warp: the scale on which the values are a Gaussian process; their own scale if None.
-
-    Raises:
-        InputError: if the correlations are not positive definite.
     """
     scale = Warp() if warp is None else warp
     n, y = len(values), scale.forward(values)

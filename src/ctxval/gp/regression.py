@@ -11,7 +11,6 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array, Rows
-from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
 from ctxval.gp.cholesky import CholeskyFactor, factorise
 from ctxval.gp.kernels import Bounds, Kernel
@@ -71,10 +70,6 @@ class GaussianProcess:
         variance = self.kernel.diagonal(self.theta, X) - (half**2).sum(axis=0)
         return self.mean(X) + k @ self.alpha, np.maximum(variance, 0.0)
 
-    def predict_gradient(self, X: Array) -> tuple[Array, Array]:
-        """Return the gradients of posterior mean and variance with respect to the points, shapes ``(m, d)``."""
-        return self.predict_with_gradient(X)[2:]
-
     def predict_with_gradient(self, X: Array) -> tuple[Array, Array, Array, Array]:
         """Return mean and variance ``(m,)`` and their gradients ``(m, d)``; cheaper than two separate calls."""
         k = self.kernel(self.theta, X, self.X)
@@ -97,9 +92,6 @@ class GaussianProcess:
     def log_marginal_likelihood(self) -> float:
         """Return log p(y | X, theta)."""
         return _log_likelihood(self.factor, self.alpha, self.y - self.mean(self.X))
-
-    def __repr__(self) -> str:
-        return call(self, self.kernel, points=len(self.X), dimension=self.X.shape[1], noise=self.noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,9 +139,6 @@ class MultiOutputProcess:
         """
         return np.asarray(self.Y[rows] - self.weights[rows] / self.factor.precisions_of(rows)[:, None])
 
-    def __repr__(self) -> str:
-        return call(self, self.kernel, points=len(self.X), dimension=self.X.shape[1], outputs=self.Y.shape[1])
-
 
 def _mean_gradient(mean: Mean, X: Array) -> Array:
     """Return the gradient of a prior mean by central differences, since a mean is a function without derivatives."""
@@ -192,9 +181,6 @@ def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, 
         noise: variance of their noise.
         Y: outputs that share the covariance, ``(n, k)``.
 
-    Raises:
-        InputError: if the covariance is not positive definite.
-
     Source:
         Rasmussen and Williams 2006, eqs. 5.8 and 5.9.
     """
@@ -215,9 +201,6 @@ def log_marginal_likelihood(
         noise: variance of the observations' noise.
         X: observed points ``(n, d)``.
         residual: the observations minus the prior mean, ``(n,)``.
-
-    Raises:
-        InputError: if the covariance is not positive definite.
 
     Source:
         Rasmussen and Williams 2006, eq. 5.9.

@@ -10,7 +10,6 @@ from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import farthest_rows
-from ctxval._util.representation import call
 from ctxval.gp.kernels import Covariance
 
 LONG = 1000
@@ -61,9 +60,6 @@ class PivotedCholesky:
     rows: Rows
     L: Array
     left: Array
-
-    def __repr__(self) -> str:
-        return call(self, len(self.rows), of=len(self.left))
 
 
 def pivoted_cholesky(

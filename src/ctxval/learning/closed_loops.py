@@ -11,7 +11,6 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.progress import advance
-from ctxval._util.representation import call
 from ctxval.core.controller import Controller
 from ctxval.core.model import Step
 from ctxval.core.rollout import rollout
@@ -39,9 +38,6 @@ class PlannedTasks:
     task: Task
     controller: Controller
     promised: Trajectory
-
-    def __repr__(self) -> str:
-        return call(self, len(self.rows), horizon=self.task.horizon)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +109,7 @@ class LoopPlanner:
 
     def _plan(self, chosen: Array, rows: Rows) -> PlannedTasks:
         parts = self.validation
-        task = parts.task(parts.space.parameters(parts.space.from_unit(chosen)))
+        task = parts.task_at(parts.space.parameters(parts.space.from_unit(chosen)))
         controller = parts.synthesizer.design(task, parts.model)
         promised = rollout(parts.model.step, controller, task)
         if promised.batch_shape != chosen.shape[:-1]:
@@ -139,7 +135,7 @@ class LoopPlanner:
         for one in self.plan(points.reshape(S * q, d), together=S * q):
             own = int(one.rows[0]) // q
             step: Step = _OwnStep(draws, q, one.rows) if one.task.batch_shape else draws[own].step
-            found[one.rows] = self._distances(one, rollout(step, one.controller, one.task))
+            found[one.rows] = self.compared(one, rollout(step, one.controller, one.task))
             advance(len(one.rows))
         return found.reshape(S, q)
 
@@ -156,7 +152,7 @@ class LoopPlanner:
         states, inputs = np.stack([one.states for one in loops]), np.stack([one.inputs for one in loops])
         shape = (S, len(planned.rows))
         return Loops(
-            np.array([self._distances(planned, one) for one in loops]).reshape(shape),
+            np.array([self.compared(planned, one) for one in loops]).reshape(shape),
             states.reshape(*shape, *states.shape[-2:]),
             inputs.reshape(*shape, *inputs.shape[-2:]),
         )
@@ -171,7 +167,7 @@ class LoopPlanner:
             self._together = _same(planned.controller, start + steps)
         return self._together
 
-    def _distances(self, planned: PlannedTasks, loops: Trajectory) -> Array:
+    def compared(self, planned: PlannedTasks, loops: Trajectory) -> Array:
         """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does."""
         promised, known = planned.promised.finite, planned.promised.finite & loops.finite
         model, system = (_without_divergence(one, known) for one in (planned.promised, loops))
@@ -196,9 +192,6 @@ class LoopPlanner:
             return np.array(np.inf)
         each = (self.measured(task[k], model[k], system[k]) for k in range(model.batch_shape[0]))
         return np.array([float(one) for one in each])
-
-    def __repr__(self) -> str:
-        return call(self, self.validation)
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,9 +40,6 @@ class Gap:
     coordinates: tuple[int, ...]
     place: Array
 
-    def __repr__(self) -> str:
-        return record(self)
-
 
 @dataclass(frozen=True, eq=False)
 class Coverage:

@@ -301,9 +301,6 @@ class DrawnModel:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         return np.asarray(self._draws.step(rows_of(x)[None], rows_of(u)[None]).reshape(x.shape))
 
-    def __repr__(self) -> str:
-        return call(self, self._draws.model)
-
 
 def learn_posterior(
     model: Model,

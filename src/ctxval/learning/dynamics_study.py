@@ -42,8 +42,12 @@ class DynamicsStudy:
     def __init__(self, validation: Validation, seed: int = 0) -> None:
         self.validation, self.seed = validation, seed
         self.planner = LoopPlanner(validation)
-        settings = WorstCaseSettings.for_dimension(validation.space.dimension, self.planner.batched)
-        self.search = WorstCaseSearch(self.planner, seed, settings)
+
+    @functools.cached_property
+    def search(self) -> WorstCaseSearch:
+        """Searches the tasks for the largest distance of each draw."""
+        settings = WorstCaseSettings.for_dimension(self.validation.space.dimension, self.planner.batched)
+        return WorstCaseSearch(self.planner, self.seed, settings)
 
     @functools.cached_property
     def _loops(self) -> Trajectory | None:
@@ -118,6 +122,12 @@ class LearnedDynamics:
     executed: Array
 
     _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
+
+    def expected(self, points: Array) -> Array:
+        """Return the distances ``(m,)`` on the posterior mean at points ``(m, d)``; infinity if a loop diverges."""
+        planner = self.study.planner
+        with single_threaded():
+            return np.asarray(planner.distances(self.posterior.mean, planner.plan(points), len(points))[0])
 
     @property
     def worst_case(self) -> WorstCase:

@@ -9,7 +9,6 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.progress import advance
-from ctxval._util.representation import call
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -70,6 +69,3 @@ class ErrorVectors:
             return plan.task, plan.model_trajectory
         (planned,) = self._plans.plan(point[None])
         return planned.task, planned.promised
-
-    def __repr__(self) -> str:
-        return call(self, self.validation)

@@ -163,9 +163,6 @@ def log_posterior(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array)
 
     The likelihood is ``-n log det(K) / 2 - N / 2 sum_i log(y_i' K^-1 y_i)``, in which the amplitudes are integrated
     out. It does not change beyond the bounds of the hyperparameters, where only the prior does.
-
-    Raises:
-        InputError: if the covariance matrix is not positive definite.
     """
     theta, noise = _within(kernel, parameters)
     value, factor, scaled = _log_likelihood(kernel, theta, noise, Z, Y)

@@ -9,7 +9,6 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.progress import advance
-from ctxval._util.representation import call
 from ctxval.core.validation import Validation
 from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks
 
@@ -56,9 +55,6 @@ class PlanMemory:
         while self._size > _LARGEST:
             self._size -= self._kept.popitem(last=False)[1][1]
         return planned
-
-    def __repr__(self) -> str:
-        return call(self, self.planner.validation, batches=len(self._kept))
 
 
 def _size(planned: PlannedTasks) -> int:

@@ -84,7 +84,7 @@ def closed_loops_on_model(validation: Validation) -> Trajectory | None:
     batches = [points] if getattr(validation.synthesizer, "batched", False) else []
     for rows in [*batches, *points[:_SLOW_LOOPS]]:
         try:
-            task = validation.task(space.parameters(rows))
+            task = validation.task_at(space.parameters(rows))
             loops = rollout(validation.model.step, validation.synthesizer.design(task, validation.model), task)
         except Exception:  # the user's own parts, on tasks that may never be executed
             continue

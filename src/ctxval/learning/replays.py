@@ -7,7 +7,6 @@ system did. The system is never executed.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,13 +15,11 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.progress import advance
 from ctxval._util.representation import call
-from ctxval.core.controller import converged_of
 from ctxval.core.model import Model
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.errors import InputError
 from ctxval.learning.dynamics import Residual, ResidualsWithout, learn_covariance
 from ctxval.learning.error_vectors import Executed, executions_of
 from ctxval.learning.recorded import affordable_centres, closed_loops_on_model, recorded_transitions
@@ -40,16 +37,14 @@ class Replay:
         task: the task.
         corrected: the closed loop on the corrected model; None if nothing can be learned, or if it diverges.
         distance: the distance between the closed loops on M and on the corrected model; NaN if there is none.
-        converged: whether the design of the controller converged; None if the synthesizer does not tell.
     """
 
     task: Task
     corrected: Trajectory | None
     distance: float
-    converged: bool | None
 
     def __repr__(self) -> str:
-        return call(self, self.task, distance=self.distance, converged=self.converged)
+        return call(self, self.task, distance=self.distance)
 
 
 def replay_executed(validation: Validation, executed: Executed, wanted: Sequence[Array]) -> list[Replay | None]:
@@ -111,11 +106,7 @@ def _replayed(validation: Validation, model: _OneCorrected | None, point: Array)
         controller = validation.synthesizer.design(task, validation.model)
     except Exception:  # the user's own parts
         return None
-    converged = None
-    with contextlib.suppress(InputError):  # an attribute of this name that is something else
-        told = converged_of(controller)
-        converged = None if told is None else bool(told)
-    nothing = Replay(task, None, np.nan, converged)
+    nothing = Replay(task, None, np.nan)
     if model is None:
         return nothing
     try:
@@ -127,4 +118,4 @@ def _replayed(validation: Validation, model: _OneCorrected | None, point: Array)
     except Exception:  # the same
         return nothing
     finite = bool(predicted.finite.all()) and np.isfinite(distance)
-    return Replay(task, predicted, distance, converged) if finite else nothing
+    return Replay(task, predicted, distance) if finite else nothing

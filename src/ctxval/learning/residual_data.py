@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval._util.representation import call
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.models.scaling import standard_deviations, standardised_pairs
@@ -59,9 +58,6 @@ class ResidualData:
     def standardised(self, x: Array, u: Array) -> Array:
         """Return standardised pairs ``(..., n + m)`` of states and inputs."""
         return standardised_pairs(x, u, self.shift, self.scale)
-
-    def __repr__(self) -> str:
-        return call(self, len(self.pairs), pairs=self.pairs, outputs=self.outputs)
 
 
 def residual_data(model: Model, transitions: Transitions, sources: Rows) -> ResidualData | None:

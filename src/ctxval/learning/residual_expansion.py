@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.representation import call
 from ctxval.gp.cholesky import factorise, tenfold
 
 _MISFIT = 1e-6
@@ -75,9 +74,6 @@ class ResidualExpansion:
         np.exp(r, out=r)
         r *= r2
         return np.asarray(r)
-
-    def __repr__(self) -> str:
-        return call(self, centres=self.factors.shape[1], weights=self.weights)
 
 
 def weights_without(covariance: Array, noise: float, outputs: Array, gone: Mask) -> Array:

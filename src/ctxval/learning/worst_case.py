@@ -16,7 +16,6 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.boxes import moves_to_bounds, separated_rows
-from ctxval._util.representation import call
 from ctxval.gp.global_search import search_globally
 from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks
 from ctxval.learning.dynamics_posterior import DynamicsDraws, DynamicsPosterior
@@ -106,9 +105,6 @@ class WorstCase:
     left_out: float
     unplanned: float
     sharpness: float = 0.0
-
-    def __repr__(self) -> str:
-        return call(self, draws=len(self.maxima), of_mean=self.of_mean, evaluations=self.evaluations)
 
 
 class WorstCaseSearch:

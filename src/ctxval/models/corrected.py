@@ -54,17 +54,6 @@ class Corrected:
         n = x.shape[-1]
         return A + own[..., :n], B + own[..., n:]
 
-    def describe(self) -> dict[str, Any]:
-        """Return what identifies this model in a store."""
-        middle = self.correction.shift + self.correction.scale * self.correction.centres[:3]
-        n = self.correction.states
-        return {
-            "model": self.model,
-            "centres": len(self.correction.centres),
-            "linearised": self.linearised,
-            "correction": self.correction(middle[:, :n], middle[:, n:]),
-        }
-
     def __repr__(self) -> str:
         learned = None if self.data is None else len(self.data)
         return call(self, self.model, self.correction, linearised=self.linearised, transitions=learned)
@@ -96,10 +85,6 @@ class Refined:
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         return self.model.step(x, u)
-
-    def describe(self) -> dict[str, Any]:
-        """Return what identifies this model in a store."""
-        return {"refined": self.model, "before": self.before}
 
     def __repr__(self) -> str:
         return call(self, self.model, transitions=len(self.data))

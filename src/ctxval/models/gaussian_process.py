@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
 from ctxval._util.registry import part
 from ctxval._util.representation import call, record
 from ctxval.core.trajectory import Transitions
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import ShapeError
 from ctxval.gp.cholesky import factorise
 from ctxval.gp.regression import log_likelihood_of_outputs, most_likely
 from ctxval.models.scaling import IncrementScaling
@@ -93,7 +93,10 @@ class GaussianProcessModel:
         self._moments = np.concatenate([self.weights, moments], axis=1)
 
     @classmethod
-    def fit(cls, data: Transitions, points: int = 400, *, seed: int = 0, iterations: int = 100) -> GaussianProcessModel:
+    @checked
+    def fit(
+        cls, data: Transitions, points: PositiveInt = 400, *, seed: NonNegativeInt = 0, iterations: PositiveInt = 100
+    ) -> GaussianProcessModel:
         """Condition on recorded transitions, with the most likely hyperparameters (eq. 5.8, summed over the states).
 
         Args:
@@ -103,10 +106,8 @@ class GaussianProcessModel:
             iterations: of the search for the hyperparameters, at most.
 
         Raises:
-            InputError: the data are not finite, or points is not positive.
+            InputError: if the data are not finite.
         """
-        if points < 1:
-            raise InputError(f"a Gaussian process needs at least one point, got {points!r}.")
         scaling = IncrementScaling.of(data)
         rows = np.random.default_rng(seed).permutation(len(data))[:points]
         Z, Y = scaling.inputs(data.x, data.u)[rows], scaling.targets(data)[rows]
@@ -152,15 +153,6 @@ class GaussianProcessModel:
         """Return ``k(rows, centres) @ columns``."""
         blocks = [rows[i : i + _BLOCK] for i in range(0, max(1, len(rows)), _BLOCK)]
         return np.concatenate([self.covariance(block, self.centres) @ columns for block in blocks])
-
-    def describe(self) -> dict[str, Any]:
-        """Return what identifies this model in a store."""
-        return {
-            "points": len(self.centres),
-            "variance": self.covariance.variance,
-            "length_scales": self.covariance.length_scales,
-            "step_at_mean": self.step(*self.scaling.mean_pair),
-        }
 
     def __repr__(self) -> str:
         states = self.weights.shape[1]

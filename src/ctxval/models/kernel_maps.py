@@ -10,7 +10,6 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call
 from ctxval.models.smooth_maps import PullBack
 
 
@@ -31,9 +30,6 @@ class Slope:
     def times(self, other: Array | float) -> Slope:
         """Return this term multiplied by ``(N, M)`` numbers."""
         return Slope(self.factor * other, self.pull, self.weight)
-
-    def __repr__(self) -> str:
-        return call(self, pull=self.pull)
 
 
 Slopes = Callable[[], list[Slope]]
@@ -84,9 +80,6 @@ class KernelSum:
 
     def _matrix(self, values: Array | float, Z: Array) -> Array:
         return np.broadcast_to(values, (len(Z), len(self.centres)))
-
-    def __repr__(self) -> str:
-        return call(self, centres=len(self.centres), outputs=self.weights.shape[1])
 
 
 # Kernels

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
@@ -92,10 +90,6 @@ class Linear:
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A and B, which are the same for all states and inputs."""
         return self.A, self.B
-
-    def describe(self) -> dict[str, Any]:
-        """Return what identifies this model in a store."""
-        return {"A": self.A.tolist(), "B": self.B.tolist(), "c": self.c.tolist()}
 
     def __repr__(self) -> str:
         learned = None if self.data is None else len(self.data)

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
+from ctxval._util.checked import Seconds
 from ctxval._util.extras import require_extra
-from ctxval._util.mjcf import compile_mjcf, identity_of_mjcf, is_mjcf_text
+from ctxval._util.mjcf import compile_mjcf, is_mjcf_text
 from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.trajectory import Transitions
@@ -40,9 +41,9 @@ class MuJoCo:
             multiple of its timestep.
     """
 
-    def __init__(self, mjcf: str | Path, *, dt: float | None = None, data: Transitions | None = None) -> None:
+    def __init__(self, mjcf: str | Path, *, dt: Seconds | None = None, data: Transitions | None = None) -> None:
         self._mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo")
-        self._mjcf, self._model = compile_mjcf(mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)))
+        _, self._model = compile_mjcf(mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)))
         self.substeps = _substeps(float(self._model.opt.timestep), dt)
         self.data = data
         if self._model.na:
@@ -80,10 +81,6 @@ class MuJoCo:
                 reached[k] = np.concatenate([data.qpos, data.qvel])
         return reached.reshape(*batch, -1)
 
-    def describe(self) -> dict[str, Any]:
-        """Return what identifies this model in a store."""
-        return {**identity_of_mjcf(self._mjcf, self._model), "substeps": self.substeps}
-
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the module, which another process imports itself."""
         return {name: value for name, value in vars(self).items() if name != "_mujoco"}
@@ -97,11 +94,7 @@ class MuJoCo:
 
 
 def identified_in(path: Path) -> Path:
-    """Return the file of a model: the path itself, or the only identified model in a folder of ``mujoco.sysid``.
-
-    Raises:
-        InputError: if the folder is none of ``mujoco.sysid``, or has several models.
-    """
+    """Return the file of a model: the path itself, or the only identified model in a folder of ``mujoco.sysid``."""
     if not path.is_dir():
         return path
     found = sorted(path.glob("*.xml"))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
 from ctxval._util.representation import call
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
@@ -71,14 +72,15 @@ class FeedforwardReLU:
         return cls(regressor.coefs_, regressor.intercepts_, scaling, data)
 
     @classmethod
+    @checked
     def fit(
         cls,
         data: Transitions,
         hidden: Sequence[int] = (8, 8),
         *,
-        seed: int = 0,
-        restarts: int = 4,
-        iterations: int = 1000,
+        seed: NonNegativeInt = 0,
+        restarts: PositiveInt = 4,
+        iterations: PositiveInt = 1000,
     ) -> FeedforwardReLU:
         """Train networks on recorded transitions with scikit-learn's MLPRegressor and L-BFGS; return the best one.
 
@@ -90,10 +92,8 @@ class FeedforwardReLU:
             iterations: largest number of iterations of one training.
 
         Raises:
-            InputError: if scikit-learn is not installed, the data are not finite, or a number is not positive.
+            InputError: if scikit-learn is not installed, or the data are not finite.
         """
-        if restarts < 1 or iterations < 1:
-            raise InputError(f"restarts and iterations must be positive, got {restarts!r} and {iterations!r}.")
         scaling = IncrementScaling.of(data)
         seeds = np.random.SeedSequence(seed).generate_state(restarts)
         trained = [_trained(data, scaling, tuple(hidden), int(start), iterations) for start in seeds]
@@ -115,14 +115,6 @@ class FeedforwardReLU:
             gradient = (gradient @ weight) * (before > 0)[..., None, :]
             z = np.maximum(before, 0.0)
         return self.scaling.jacobian(np.swapaxes(gradient @ self.weights[-1], -1, -2))
-
-    def describe(self) -> dict[str, Any]:
-        """Return what identifies this model in a store."""
-        return {
-            "layers": [len(bias) for bias in self.biases],
-            "norms": [np.linalg.norm(weight) for weight in self.weights],
-            "step_at_mean": self.step(*self.scaling.mean_pair),
-        }
 
     def __repr__(self) -> str:
         states, hidden = len(self.scaling.shift_out), tuple(bias.size for bias in self.biases[:-1])

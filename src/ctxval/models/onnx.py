@@ -11,6 +11,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
 from ctxval._util.registry import part
 from ctxval._util.representation import call
+from ctxval.core.model import central_differences
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
@@ -60,23 +61,11 @@ class Onnx:
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A ``(..., n, n)`` and B ``(..., n, m)`` by central differences that suit the network's precision."""
-        n = x.shape[-1]
-        z = np.concatenate(_paired(x, u), axis=-1)
-        # The cube root of the precision balances truncation against rounding.
-        h = np.cbrt(self.network.precision) * np.maximum(1.0, np.abs(z))
-        moves = np.eye(z.shape[-1]) * h[..., None, :]
-        up, down = z[..., None, :] + moves, z[..., None, :] - moves
-        difference = self._outputs(up, n) - self._outputs(down, n)
-        jacobian = np.swapaxes(difference / (2 * h[..., :, None]), -1, -2)
-        A, B = jacobian[..., :n], jacobian[..., n:]
-        return (A + np.eye(n) if self.increments else A), B
+        return central_differences(self.step, *_paired(x, u), self.network.precision)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this model in a store."""
         return {**self.network.describe(), "increments": self.increments}
-
-    def _outputs(self, z: Array, n: int) -> Array:
-        return self.network(*self._arguments(z[..., :n], z[..., n:]))
 
     def _arguments(self, x: Array, u: Array) -> tuple[Array, ...]:
         if len(self.network.widths) == 2:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -25,10 +24,11 @@ class Parametric:
         step: a function of one state ``(n,)``, one input ``(m,)`` and the parameters ``(p,)``.
         theta: the values of the parameters by name, in the order of theta.
         vectorized: True if ``step`` takes whole batches ``(..., n)`` and ``(..., m)``.
+        dt: length of a step in seconds, if it is known.
         data: the transitions that the parameters were learned from, if any.
 
     Raises:
-        InputError: if ``step`` is not a function, or a value is not finite.
+        InputError: if there is no parameter, or a value is not finite.
     """
 
     def __init__(
@@ -37,15 +37,15 @@ class Parametric:
         theta: Mapping[str, float],
         *,
         vectorized: bool = False,
+        dt: float | None = None,
         data: Transitions | None = None,
     ) -> None:
-        if not callable(step):
-            raise InputError(f"step must be a function (x, u, theta) -> x_next, got {step!r}.")
-        if not isinstance(theta, Mapping) or not theta:
+        if not theta:
             raise InputError(f"theta must be a table of parameters by name, got {theta!r}.")
         self.function = step
         self.theta = {str(name): float(as_finite(f"theta[{name}]", value)) for name, value in theta.items()}
         self.vectorized = vectorized
+        self.dt = dt
         self.data = data
         values = np.array(list(self.theta.values()))
         self._step = Function(lambda x, u: step(x, u, values), vectorized=vectorized)
@@ -53,10 +53,6 @@ class Parametric:
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         return self._step.step(x, u)
-
-    def describe(self) -> dict[str, Any]:
-        """Return what identifies this model in a store."""
-        return {"step": self.function, "theta": self.theta}
 
     def __repr__(self) -> str:
         return call(self, self.function, theta=self.theta, transitions=None if self.data is None else len(self.data))

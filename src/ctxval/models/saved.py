@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.files import read_bytes, written_whole
+from ctxval._util.files import MADE_BY, read_bytes, written_whole
 from ctxval._util.npz import Archive
 from ctxval._util.registry import part
 from ctxval.core.model import Model
@@ -53,7 +54,7 @@ def write_model(path: str | Path, model: Model, note: dict[str, Any] | None = No
     about, arrays = _contents(inner)
     data = getattr(model, "data", None)
     if data is not None:
-        arrays |= {name: getattr(data, name) for name in _DATA}
+        arrays |= _data_arrays(data)
     about |= {"format": _FORMAT, "version": 1, **({"note": note} if note else {})}
     _write(path, {"about": np.array(json.dumps(about)), **arrays})
 
@@ -64,11 +65,7 @@ def is_savable(model: Model) -> bool:
 
 
 def read_note(source: str | Path) -> dict[str, Any]:
-    """Return the plain values that were kept beside a model; empty if there are none.
-
-    Raises:
-        InputError: if the file cannot be read.
-    """
+    """Return the plain values that were kept beside a model; empty if there are none."""
     try:
         arrays = Archive(read_bytes(source))
         about = json.loads(arrays.text("about")) if "about" in arrays else {}
@@ -79,19 +76,30 @@ def read_note(source: str | Path) -> dict[str, Any]:
 
 
 def write_transitions(path: str | Path, data: Transitions | None) -> None:
-    """Write recorded steps as an NPZ file with x, u and x_next, as the argument ``data`` of a model takes it.
-
-    Raises:
-        InputError: if there are no steps, or the file cannot be written.
-    """
+    """Write recorded steps as an NPZ file with x, u and x_next, as the argument ``data`` of a model takes it."""
     if data is None:
         raise InputError(f"there are no recorded steps to write to {path}.")
-    _write(path, {name: getattr(data, name) for name in _DATA})
+    _write(path, _data_arrays(data))
+
+
+def stored_transitions(arrays: Archive) -> Transitions | None:
+    """Return the recorded steps in an NPZ file with x, u and x_next; None if there are none."""
+    if "x_next" not in arrays:
+        return None
+    x, u, x_next = (arrays.numbers(name) for name in _DATA)
+    return Transitions(x, u, x_next, float(arrays.numbers("dt")) if "dt" in arrays else None)
+
+
+def _data_arrays(data: Transitions) -> dict[str, Any]:
+    step = {} if data.dt is None else {"dt": np.array(data.dt)}
+    return {name: getattr(data, name) for name in _DATA} | step
 
 
 def _write(path: str | Path, arrays: dict[str, Any]) -> None:
     with written_whole(path) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
+        with zipfile.ZipFile(file, "a") as archive:
+            archive.comment = MADE_BY.encode()  # which stands at the end of the file, and is not compressed
 
 
 @part("Saved", files=("source",))
@@ -122,7 +130,7 @@ def read_refined(source: str | Path, before: Model | None) -> SavedModel:
     try:
         arrays = Archive(read_bytes(source))
         about = _about(arrays)
-        data = Transitions(*(arrays.numbers(name) for name in _DATA)) if set(_DATA) <= set(arrays.names) else None
+        data = stored_transitions(arrays)
         if about["kind"] != "Corrected":
             return _plain_model(arrays, about["kind"], data)
         own = about.get("corrects")

@@ -39,12 +39,6 @@ class IncrementScaling:
         shift_in, shift_out = pairs.mean(axis=0), increments.mean(axis=0)
         return cls(shift_in, standard_deviations(pairs), shift_out, standard_deviations(increments))
 
-    @property
-    def mean_pair(self) -> tuple[Array, Array]:
-        """The mean state ``(n,)`` and the mean input ``(m,)`` of the data."""
-        n = len(self.shift_out)
-        return self.shift_in[:n], self.shift_in[n:]
-
     def inputs(self, x: Array, u: Array) -> Array:
         """Return the inputs of f, shape ``(..., n + m)``, for states ``(..., n)`` and inputs ``(..., m)``."""
         return standardised_pairs(x, u, self.shift_in, self.scale_in)
@@ -69,11 +63,7 @@ class IncrementScaling:
 
 
 def standardised_pairs(x: Array, u: Array, shift: Array, scale: Array) -> Array:
-    """Return ``((x, u) - shift) / scale``, shape ``(..., n + m)``, for states ``(..., n)`` and inputs ``(..., m)``.
-
-    Raises:
-        ShapeError: if the number of states and inputs is not n + m.
-    """
+    """Return ``((x, u) - shift) / scale``, shape ``(..., n + m)``, for states ``(..., n)`` and inputs ``(..., m)``."""
     batch = x.shape[:-1] if x.shape[:-1] == u.shape[:-1] else np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
     n = x.shape[-1]
     z = np.empty((*batch, n + u.shape[-1]))

@@ -125,16 +125,6 @@ class ScikitLearn:
         # It is read again each time, because a regressor may be fitted again.
         return smooth_map(self.regressor) if self._known else None
 
-    def describe(self) -> dict[str, Any]:
-        """Return what identifies this model in a store: its kind and its predictions at some points."""
-        probes = np.random.default_rng(0).normal(size=(3, self.features))
-        return {
-            "regressor": type(self.regressor).__qualname__,
-            "features": self.features,
-            "increments": self.increments,
-            "predictions": np.asarray(self.regressor.predict(probes), dtype=np.float64),
-        }
-
     def __repr__(self) -> str:
         learned = None if self.data is None else len(self.data)
         regressor = name_of(type(self.regressor))

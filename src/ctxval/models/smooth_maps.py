@@ -13,7 +13,6 @@ import numpy as np
 from scipy.special import expit
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call
 
 PullBack = Callable[[Array], Array]
 """Maps derivatives by the values of a map, ``(N, p, o)``, to derivatives by its rows, ``(N, p, k)``."""
@@ -57,9 +56,6 @@ class Affine:
         """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
         return self.value(Z), lambda G: np.asarray(G @ self.W.T)
 
-    def __repr__(self) -> str:
-        return call(self, self.W)
-
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
@@ -77,9 +73,6 @@ class Scaled:
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
         """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
         return self.value(Z), lambda G: np.asarray(G * self.scale)
-
-    def __repr__(self) -> str:
-        return call(self, self.scale, self.shift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +122,6 @@ class Monomials:
         for j in np.flatnonzero(powers.any(axis=0)):
             found *= table[powers[:, j], :, j].T
         return found
-
-    def __repr__(self) -> str:
-        return call(self, self.powers)
 
 
 Activation = tuple[Callable[[Array], Array], Callable[[Array], Array]]
@@ -192,9 +182,6 @@ class Network:
             found.append(Z)
         return [*found, Z @ self.weights[-1] + self.biases[-1]]
 
-    def __repr__(self) -> str:
-        return call(self, layers=tuple(len(bias) for bias in self.biases), activation=self.activation)
-
 
 @dataclass(frozen=True, eq=False)
 class Chain:
@@ -227,9 +214,6 @@ class Chain:
 
         return Z, pull_back
 
-    def __repr__(self) -> str:
-        return call(self, *self.parts)
-
 
 @dataclass(frozen=True, eq=False)
 class SideBySide:
@@ -256,6 +240,3 @@ class SideBySide:
             return np.asarray(np.sum([pull(piece) for (_, pull), piece in zip(found, pieces, strict=True)], axis=0))
 
         return np.concatenate([values for values, _ in found], axis=1), pull_back
-
-    def __repr__(self) -> str:
-        return call(self, *self.parts)

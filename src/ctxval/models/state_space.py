@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, as_finite
+from ctxval._util.checked import Seconds
 from ctxval._util.registry import part
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.linear import Linear
 
 
 @part()
-def state_space(system: Any, dt: float) -> Linear:
+def state_space(system: Any, dt: Seconds) -> Linear:
     """Return a ``StateSpace`` of python-control or of scipy as a linear model with its Jacobian.
 
     The model has the state of the system; C and D are not used. A continuous system is discretised exactly for inputs
@@ -30,8 +31,6 @@ def state_space(system: Any, dt: float) -> Linear:
     """
     if not all(hasattr(system, name) for name in ("A", "B")):
         raise InputError(f"a state-space model must have A and B, got {system!r}.")
-    if not isinstance(dt, int | float | np.number) or isinstance(dt, bool) or not (np.isfinite(dt) and dt > 0):
-        raise InputError(f"dt must be a positive number of seconds, got {dt!r}.")
     A, B = as_finite("A", system.A), as_finite("B", system.B)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
         raise ShapeError(f"a state-space model needs A (n, n) and B (n, m), got {A.shape} and {B.shape}.")
@@ -45,7 +44,7 @@ def state_space(system: Any, dt: float) -> Linear:
     return Linear(A, B)
 
 
-def _held(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
+def _held(A: Array, B: Array, dt: Seconds) -> tuple[Array, Array]:
     """Discretise ``dx/dt = A x + B u`` for an input held over dt: the exponential of [[A, B], [0, 0]] dt."""
     from scipy.linalg import expm
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.representation import record
 from ctxval.core.model import Model, linearize
 from ctxval.core.plan import gives_inputs
 from ctxval.core.task import Task
@@ -46,9 +45,6 @@ class SameControllers:
     same: int = 0
     worst: float | None = None
 
-    def __repr__(self) -> str:
-        return record(self)
-
 
 def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refined, str | None]:
     """Return a refined model with the Jacobian whose controllers complete the tasks best on the refined model itself.
@@ -56,10 +52,6 @@ def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refine
     A synthesizer that linearises once, such as LQR, needs a linear model that is good on the whole task. If M is
     linear, it is such a model, and the Jacobian of a nonlinear M' at one point may be none. It is used only if random
     tasks have a clearly smaller cost on M' with it. Nothing is executed.
-
-    Args:
-        validation: the map p -> d(p) of the first model.
-        refined: the refined model.
 
     Returns:
         the model, and a sentence if the Jacobian of M is used.
@@ -140,12 +132,7 @@ def _cost(validation: Validation, task: Task, loops: Trajectory) -> Array:
 
 
 def same_controllers(validation: Validation, executed: Sequence[tuple[Trial, Trajectory]]) -> SameControllers:
-    """Return on how many executed tasks the controllers of a refined model are those that were executed.
-
-    Args:
-        validation: the map p -> d(p) of the refined model.
-        executed: completed trials of earlier rounds, with the trajectories of the system.
-    """
+    """Return on how many executed tasks the controllers of a refined model are those that were executed."""
     some = executed[-_TASKS:]
     distances = [one for one in (_known_distance(validation, *pair) for pair in some) if one is not None]
     return SameControllers(len(some), len(distances), max(distances, default=None))

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from ctxval._util.describe import describe
-from ctxval._util.files import written_whole
+from ctxval._util.files import MADE_BY, write_text
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.fitting.model_file import SUFFIXES, require_reference, require_suffix, write_model_file
@@ -21,15 +21,6 @@ def require_file_of(path: Path, method: Method, model: Model, step: str | None =
     """Check that a file can hold the model that a method will learn, before executions are paid for.
 
     A function of the user may return any model, so what it returns is checked when it is written.
-
-    Args:
-        path: the file.
-        method: the method.
-        model: the first model.
-        step: ``module:attr`` of the user's function, for its parameters.
-
-    Raises:
-        InputError: if a file of this suffix cannot hold the model.
     """
     require_suffix(path)
     if method.makes is None:
@@ -47,16 +38,7 @@ def require_file_of(path: Path, method: Method, model: Model, step: str | None =
 
 
 def write_refined(path: str | Path, found: Refinement, step: str | None = None) -> list[str]:
-    """Write the last model of a refinement, and next to it its residual as JSON and as a table; return the paths.
-
-    Args:
-        path: the file of the model: ``.onnx``, ``.npz``, or ``.toml`` for the parameters of a function.
-        found: the refinement.
-        step: ``module:attr`` of the user's function, for its parameters.
-
-    Raises:
-        InputError: if no model was refined, a file of this suffix cannot hold the model, or a file cannot be written.
-    """
+    """Write the last model of a refinement, and next to it its residual as JSON and as a table; return the paths."""
     if not found.last.number:
         raise InputError("no model was refined, so there is none to write.")
     target = Path(path)
@@ -64,6 +46,7 @@ def write_refined(path: str | Path, found: Refinement, step: str | None = None) 
     if found.residual is None:
         return written
     about = {
+        "made_by": MADE_BY,
         "model": target.name,
         "verdict": found.answer,
         "threshold": found.threshold,
@@ -77,13 +60,12 @@ def write_refined(path: str | Path, found: Refinement, step: str | None = None) 
     }
     for suffix, text in texts.items():
         beside = target.with_suffix(suffix)
-        with written_whole(beside) as file:
-            file.write(text.encode())
+        write_text(beside, text)
         written.append(str(beside))
     return written
 
 
 _REMARK = (
-    "Residual S(x, u) - M(x, u) of one step, measured on executions that the model was not learned from, and not "
-    "guaranteed.\nMeasured for {range}.\nA robust controller must assume at least these disturbances."
+    f"{MADE_BY}. Residual S(x, u) - M(x, u) of one step, measured on executions that the model was not learned from, "
+    "and not guaranteed.\nMeasured for {range}.\nA robust controller must assume at least these disturbances."
 )

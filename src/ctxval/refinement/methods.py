@@ -287,11 +287,7 @@ class UserFit(Method):
 
 
 def _usable(model: Model, records: Records) -> Model:
-    """Return a model that gives finite states of the right shape at recorded pairs.
-
-    Raises:
-        ModelError: if it does not.
-    """
+    """Return a model that gives finite states of the right shape at recorded pairs."""
     data = records.transitions
     rows = np.linspace(0, len(data) - 1, min(_CHECKED, len(data))).astype(int)
     try:
@@ -311,12 +307,7 @@ def _usable(model: Model, records: Records) -> Model:
 
 
 def method_of(method: str | Method | Callable[[Transitions], Any], *, seed: int = 0) -> Method:
-    """Return a method by its name, a method unchanged, and a function ``fit(data) -> model`` as a method.
-
-    Raises:
-        UnknownNameError: if there is no such method.
-        InputError: if the method needs more than its name.
-    """
+    """Return a method by its name, a method unchanged, and a function ``fit(data) -> model`` as a method."""
     if isinstance(method, Method):
         return method
     if not isinstance(method, str):

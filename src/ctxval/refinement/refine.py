@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from ctxval._util.arrays import positive_count
+from ctxval._util.checked import PositiveFloat, PositiveInt, checked
 from ctxval._util.progress import stage
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import executed_trials
 from ctxval.certificates import CertificateOptions, Verdict
-from ctxval.certificates.verdict import counterexample, require_threshold
+from ctxval.certificates.verdict import counterexample
 from ctxval.core.model import Model, Step
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.trial import Trial
@@ -36,20 +36,14 @@ class OpensRound(Protocol):
     def __call__(
         self, validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
     ) -> Campaign:
-        """Return the campaign of a refined model.
-
-        Args:
-            validation: the map p -> d(p) of the model.
-            store: the store of the round; None to keep its trials in memory.
-            model_file: the file of the model; None if there is none.
-            certificate: the certificate of the round, with its confidence.
-        """
+        """Return the campaign of a refined model."""
 
 
+@checked
 def refine(
     campaign: Campaign,
-    threshold: float,
-    budget: int,
+    threshold: PositiveFloat,
+    budget: PositiveInt,
     *,
     method: str | Method | Callable[[Transitions], Model | Step] = "residual",
     certificate: CertificateOptions | None = None,
@@ -87,10 +81,7 @@ def refine(
         ModelError, DesignError, DistanceError, CampaignError: as in :meth:`ctxval.Campaign.run`; all executions are
             stored.
     """
-    if not isinstance(campaign, Campaign):
-        raise InputError(f"campaign must be a Campaign, got {campaign!r}.")
-    total = positive_count("budget must be a positive integer", budget)
-    if total < campaign.executions:
+    if budget < campaign.executions:
         raise InputError(
             f"the campaign has {campaign.executions} executions already, and the budget of {budget} is a total: give "
             "more."
@@ -99,8 +90,8 @@ def refine(
     options = CertificateOptions() if certificate is None else certificate
     loop = _Loop(
         campaign,
-        require_threshold(threshold),
-        total,
+        float(threshold),
+        int(budget),
         chosen,
         options,
         open_round or _SameSettings(campaign),
@@ -228,11 +219,7 @@ class _Loop:
         return None
 
     def _stored(self, number: int) -> _RefinedModel | None:
-        """Return the model of a round from its file; None if there is none.
-
-        Raises:
-            InputError: if the file cannot be read, or its model was learned by another method.
-        """
+        """Return the model of a round from its file; None if there is none."""
         file = self._beside(number, ".npz")
         if file is None or not file.exists():
             return None
@@ -327,10 +314,6 @@ def confidence_of_round(confidence: float, number: int) -> float:
     """Return the confidence with which the k-th refined model is judged, ``1 - alpha / (k (k + 1))``.
 
     The shares sum up to alpha, so all rounds together are wrong with probability at most alpha.
-
-    Args:
-        confidence: 1 - alpha.
-        number: k, from 1.
     """
     return 1 - (1 - confidence) / (number * (number + 1))
 

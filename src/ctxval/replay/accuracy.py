@@ -80,11 +80,7 @@ class Region:
 
 
 def step_errors(model: Model, recorded: RecordedSteps, steps: Sequence[int]) -> tuple[StepError, ...]:
-    """Return the errors of all states after numbers of steps; those for which no recording is long enough are left out.
-
-    Raises:
-        ModelError: if the model cannot be run on the recorded states and inputs.
-    """
+    """Return the errors of all states after numbers of steps for which a recording is long enough."""
     found: list[StepError] = []
     for count in steps:
         made = predicted(model, recorded, count)

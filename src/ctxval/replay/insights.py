@@ -30,13 +30,7 @@ def insights(
     changes: Sequence[Suggestion],
     tasks: PredictedTasks | None,
 ) -> tuple[str, ...]:
-    """Return what follows from the results of a replay, the most important first.
-
-    Args:
-        names: the names of states and inputs with their units, in their order.
-        held_out: number of recordings that were compared.
-        errors, found, residuals, changes, tasks: the parts of the report.
-    """
+    """Return what follows from the results of a replay, the most important first."""
     return (
         *(one.sentence for one in changes),
         *_of_errors(errors, held_out),

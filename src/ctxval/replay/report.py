@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import single_threaded
+from ctxval._util.columns import unit_advice
 from ctxval._util.representation import call, counted
-from ctxval.core.model import Model
+from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Transitions
 from ctxval.core.validation import Validation
 from ctxval.data.recordings import Recordings
@@ -81,9 +82,9 @@ class ReplayReport:
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values; numbers that are not finite are None."""
-        found: dict[str, Any] = _plain(asdict(self))
+        found: dict[str, Any] = plain_numbers(asdict(self))
         for row, error in zip(found["errors"], self.errors, strict=True):
-            row["relative"] = _plain(error.relative)
+            row["relative"] = plain_numbers(error.relative)
         return found
 
     def __repr__(self) -> str:
@@ -111,13 +112,15 @@ def replay(
         seed: seed of all random numbers.
 
     Raises:
-        InputError: if a number of steps is not positive, or the tasks have another time step than the recordings.
+        InputError: if a number of steps is not positive, or the model or the tasks have another time step than the
+            recordings.
         ModelError: if the model cannot be run on the recorded states and inputs.
     """
     if not steps or not all(isinstance(k, int) and not isinstance(k, bool) and k >= 1 for k in steps):
         raise InputError(f"steps must be positive integers, got {list(steps)}.")
     if validation is not None:
         _require_same_step(validation, recordings)
+    require_time_step(model, recordings.dt, "the recording")
     seen = _seen(model, recordings)
     used = [number for number in range(len(recordings.runs)) if number not in seen] or list(range(len(recordings.runs)))
     recorded = RecordedSteps(recordings, used)
@@ -205,18 +208,19 @@ def _require_same_step(validation: Validation, recordings: Recordings) -> None:
         )
     if not np.isclose(task.dt, recordings.dt, rtol=1e-3, atol=0):
         raise InputError(
-            f"the tasks have steps of {task.dt:g} s and the recordings have steps of {recordings.dt:g} s: give "
-            f"dt = {task.dt:g} in the mapping of the recordings."
+            f"the tasks have steps of {task.dt:g} s and the recordings have steps of {recordings.dt:g} s: "
+            f"{unit_advice(recordings.dt, task.dt) or f'give dt = {task.dt:g} in the mapping of the recordings'}."
         )
 
 
-def _plain(value: Any) -> Any:
+def plain_numbers(value: Any) -> Any:
+    """Return plain values for JSON; numbers that are not finite are None."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain_numbers(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain_numbers(item) for item in value]
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain_numbers(value.tolist())
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return value

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval._util.representation import call
 from ctxval.core.model import Model
 from ctxval.data.recordings import Recordings
 from ctxval.errors import CtxvalError, ModelError
@@ -38,9 +37,6 @@ class Predictions:
     inputs: Array
     groups: Rows
 
-    def __repr__(self) -> str:
-        return call(self, len(self.errors), steps=self.steps, errors=self.errors)
-
 
 @dataclass(frozen=True, eq=False)
 class Windows:
@@ -57,9 +53,6 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.runs)
-
-    def __repr__(self) -> str:
-        return call(self, len(self))
 
 
 _PARTS = 5
@@ -91,12 +84,7 @@ class RecordedSteps:
         return len(self._used) if len(self._used) > 1 else _PARTS
 
     def windows(self, before: int, after: int, most: int = _MOST) -> Windows:
-        """Return places with so many recorded steps before and after them.
-
-        Args:
-            before, after: numbers of steps.
-            most: largest number of places; of more, every second, third, ... one is returned.
-        """
+        """Return places with so many recorded steps before and after them."""
         runs, places, groups = [], [], []
         for number, horizon in enumerate(self._horizons.tolist()):
             at = np.arange(before, horizon - after + 1)
@@ -115,16 +103,9 @@ class RecordedSteps:
         """Return the recorded inputs so many steps after places, shape ``(N, m)``."""
         return np.asarray(self._inputs[self._first_input[where.runs] + where.places + shift])
 
-    def __repr__(self) -> str:
-        return call(self, self.recordings, groups=self.groups)
-
 
 def predicted(model: Model, recorded: RecordedSteps, steps: int) -> Predictions:
-    """Return predictions of a number of steps from recorded states; none if no recording is so long.
-
-    Raises:
-        ModelError: if the model cannot be run on these states and inputs.
-    """
+    """Return predictions of a number of steps from recorded states; none if no recording is so long."""
     where = recorded.windows(0, steps, min(_MOST, max(200, _EVALUATIONS // steps)))
     if not len(where):
         n, m = len(recorded.recordings.states), len(recorded.recordings.inputs)
@@ -138,11 +119,7 @@ def predicted(model: Model, recorded: RecordedSteps, steps: int) -> Predictions:
 
 
 def stepped(model: Model, x: Array, u: Array) -> Array:
-    """Return the next states of a model, ``(N, n)``.
-
-    Raises:
-        ModelError: if the model cannot be run on these states and inputs; the message states their numbers.
-    """
+    """Return the next states of a model, ``(N, n)``."""
     try:
         with np.errstate(all="ignore"):
             found = np.asarray(model.step(x, u), dtype=np.float64)

@@ -5,9 +5,10 @@ A suggestion is made only if the errors on recordings that did not choose it cle
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 
@@ -16,14 +17,14 @@ from ctxval._util.representation import record
 from ctxval.core.model import Model
 from ctxval.replay.steps import RecordedSteps, Windows, stepped
 
-Value = TypeVar("Value", int, float)
-
 _SHIFTS = tuple(range(-3, 11))
-"""Delays of the inputs that are tried, in steps."""
+"""Delays of the inputs that are tried in whole steps; tenths of a step are tried around the best of them."""
 _MULTIPLES = (2, 3, 4, 5, 10)
 """Ratios of the two time steps that are tried."""
 _CLEAR = {"delay": 0.85, "time step": 0.7}
 """Largest ratio of held-out errors with and without a change that is suggested."""
+_ALIKE_VALUES = {"delay": 0.5, "time step": 0.0}
+"""Largest difference between the values that two halves of the recordings choose: steps, or ratios of time steps."""
 _AGREE = 0.8
 """Smallest share of the recordings in which the error falls."""
 _MOST = 8000
@@ -67,34 +68,52 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     """Suggest a delay if the model, or an affine model of the recordings themselves, predicts better with it."""
     if not recorded.recordings.inputs:
         return None
-    where = recorded.windows(max(_SHIFTS), 1 - min(_SHIFTS), _MOST)
+    where = recorded.windows(max(_SHIFTS) + 1, 1 - min(_SHIFTS), _MOST)
+    if not len(where):
+        return None
     x, reached = recorded.states(where), recorded.states(where, 1)
-    shifted = {shift: recorded.inputs(where, -shift) for shift in _SHIFTS} if len(where) else {}
     sizes = _sizes(reached - x)
-    by_model = {shift: _errors(stepped(model, x, u) - reached, sizes) for shift, u in shifted.items()}
-    chosen = _chosen("delay", by_model, where.groups, 0)
+
+    def delayed(shift: float) -> Array:
+        """Return the mean input of each step if an input acts so many steps later."""
+        whole = math.floor(shift)
+        part = shift - whole
+        now = recorded.inputs(where, -whole)
+        return now + part * (recorded.inputs(where, -whole - 1) - now) if part else now
+
+    by_model = _over_shifts(lambda shift: _errors(stepped(model, x, delayed(shift)) - reached, sizes))
+    chosen = _chosen("delay", by_model, where.groups, 0.0)
     dt = recorded.recordings.dt
     if chosen is not None:
         shift, ratio, agreeing = chosen
         when = "after" if shift > 0 else "before"
         text = (
-            f"the one-step error falls to {100 * ratio:.0f} % if the inputs act {abs(shift) * dt:g} s ({abs(shift)} "
-            f"steps) {when} the time at which they are taken here: add {shift * dt:g} to delay in the mapping of the "
-            "recordings, or let the model have this delay"
+            f"the one-step error falls to {100 * ratio:.0f} % if the inputs act {abs(shift) * dt:.3g} s "
+            f"({abs(shift):g} steps) {when} the time at which they are taken here: add {shift * dt:.3g} to delay in "
+            "the mapping of the recordings, or let the model have this delay"
         )
         return Suggestion("delay", shift * dt, ratio, agreeing, text)
-    fitted = {shift: _errors(_affine_errors(x, u, reached, where.groups), sizes) for shift, u in shifted.items()}
-    chosen = _chosen("delay", fitted, where.groups, 0)
+    groups = where.groups
+    fitted = _over_shifts(lambda shift: _errors(_affine_errors(x, delayed(shift), reached, groups), sizes))
+    chosen = _chosen("delay", fitted, where.groups, 0.0)
     # A model that predicts better than these affine models was not learned with inputs of another time.
     if chosen is None or by_model[0].mean() <= fitted[chosen[0]].mean():
         return None
     shift, ratio, agreeing = chosen
     text = (
         f"an affine model that is fitted to the recordings has {100 * ratio:.0f} % of the error if the inputs act "
-        f"{abs(shift) * dt:g} s ({abs(shift)} steps) {'after' if shift > 0 else 'before'} the time at which they are "
-        "taken here; the model was perhaps learned with inputs of another time"
+        f"{abs(shift) * dt:.3g} s ({abs(shift):g} steps) {'after' if shift > 0 else 'before'} the time at which they "
+        "are taken here; the model was perhaps learned with inputs of another time"
     )
     return Suggestion("delay", shift * dt, ratio, agreeing, text)
+
+
+def _over_shifts(errors_of: Callable[[float], Array]) -> dict[float, Array]:
+    """Return the errors for all delays in whole steps, and in tenths of steps around the best of them."""
+    errors = {float(shift): errors_of(shift) for shift in _SHIFTS}
+    best = min(errors, key=lambda shift: errors[shift].mean())
+    around = {round(best + k / 10, 1) for k in range(-9, 10)} - {best}
+    return errors | {s: errors_of(s) for s in sorted(around) if min(_SHIFTS) <= s <= max(_SHIFTS)}
 
 
 def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
@@ -154,23 +173,23 @@ def _affine_errors(x: Array, u: Array, reached: Array, groups: Rows) -> Array:
     return found
 
 
-def _chosen(kind: str, errors: Mapping[Value, Array], groups: Rows, usual: Value) -> tuple[Value, float, float] | None:
+def _chosen(kind: str, errors: Mapping[float, Array], groups: Rows, usual: float) -> tuple[float, float, float] | None:
     """Return the value that two halves of the recordings choose alike, its held-out ratio and the agreeing share.
 
     Returns None unless the error clearly falls, in most recordings.
     """
     known = np.unique(groups)
-    if len(known) < 2 or usual not in errors:
+    if len(known) < 2:
         return None
     values = list(errors)
     table = np.array([[errors[value][groups == group].mean() for group in known] for value in values])
     base = table[values.index(usual)]
     halves = [np.arange(len(known)) % 2 == k for k in (0, 1)]
     picked = [values[int(np.argmin(table[:, half].sum(axis=1)))] for half in halves]
-    if picked[0] != picked[1] or picked[0] == usual or base.mean() < _ALIKE**2:
+    if abs(picked[0] - picked[1]) > _ALIKE_VALUES[kind] or usual in picked or base.mean() < _ALIKE**2:
         return None
-    own = table[values.index(picked[0])]
-    ratio, agreeing = float(np.sqrt(own.sum() / base.sum())), float((own < base).mean())
+    row = int(np.argmin(table.sum(axis=1)))
+    ratio, agreeing = float(np.sqrt(table[row].sum() / base.sum())), float((table[row] < base).mean())
     if ratio > _CLEAR[kind] or agreeing < _AGREE:
         return None
-    return picked[0], ratio, agreeing
+    return values[row], ratio, agreeing

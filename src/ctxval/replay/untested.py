@@ -87,12 +87,6 @@ def predicted_tasks(
     """Return what recordings predict of the tasks of an experiment; S is never executed.
 
     Returns None if the model explains the recordings, or if no task can be planned.
-
-    Args:
-        validation: the map p -> d(p).
-        recorded: trajectories of the system with the time step of the tasks.
-        executions: number of executions that are proposed.
-        seed: seed of all random numbers.
     """
     study = DynamicsStudy(validation, seed)
     learned = study.learn([], recorded)
@@ -153,13 +147,6 @@ def _informative(drawn: Array, count: int) -> tuple[Rows, Array]:
     The distances of tasks are taken as jointly normal, with the covariance of the draws. The weight of a task is the
     share of the draws in which it is worst. Each choice resolves the largest part of the weighted variance that those
     before it leave.
-
-    Args:
-        drawn: distances of T tasks on S draws, shape ``(S, T)``.
-        count: the number of tasks to choose.
-
-    Returns:
-        The tasks, and the share of the weighted variance that each and those before it resolve.
     """
     C = np.cov(drawn, rowvar=False).reshape(drawn.shape[1], -1)
     worst = np.bincount(drawn.argmax(axis=1), minlength=drawn.shape[1]) / len(drawn)

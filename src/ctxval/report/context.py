@@ -18,7 +18,7 @@ from ctxval.certificates import Certificate, CertificateOptions, Provenance, Ver
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.space import TaskSpace
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Change, Trial
+from ctxval.core.trial import Change, Trial, designs_sentence
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.replays import Replay, replay_executed
@@ -46,9 +46,6 @@ class Recording:
 
     model: Trajectory
     system: Trajectory
-
-    def __repr__(self) -> str:
-        return call(self, self.model, self.system)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +152,11 @@ class ReportContext:
     def bound(self) -> float | None:
         """The bound on d*; None if there is none, or it is withdrawn."""
         return None if self.verdict is None else self.verdict.bound
+
+    @property
+    def designs(self) -> str | None:
+        """Which controllers did not converge or jump, as a clause; None if that is not known of any."""
+        return designs_sentence(self.trials)
 
     # Trajectories
 
@@ -284,7 +286,8 @@ def context_of_store(
         InputError: if the store does not describe its task space, or its trials do not lie in it.
         StoreError: if the store cannot be read.
     """
-    description, changes, trials = store.description(), store.history(), store.trials()
+    with store.snapshot():
+        description, changes, trials = store.description(), store.history(), store.trials()
     provenance = Provenance.of(description, changes)
     space = provenance.space
     if space is None or any(len(trial.unit_point) != space.dimension for trial in trials):

@@ -118,7 +118,8 @@ def _smooth(context: ReportContext) -> Finding | None:
         "A Gaussian process of the distance predicts each trial from the others with errors of "
         f"{number(size, 2)} of its own standard deviations (root mean square; about 1 is expected)."
     )
-    return Finding("Distance is smooth over the tasks", light, text, {"standardised_error": size})
+    found = Finding("Distance is smooth over the tasks", light, text, {"standardised_error": size})
+    return found.unless(context.designs)
 
 
 def stored_predictions(context: ReportContext) -> list[tuple[Trial, ExecutionPrediction]]:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.representation import call
 from ctxval.core.trial import Trial
 from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.surrogate import Learned, learn
@@ -40,9 +39,6 @@ class Band:
     median: Array
     low: Array
     high: Array
-
-    def __repr__(self) -> str:
-        return call(self, len(self.median))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +119,6 @@ class DistanceModel:
 
         half = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
         return Band(on_own_scale(mean), on_own_scale(mean - half), on_own_scale(mean + half))
-
-    def __repr__(self) -> str:
-        return call(self, trials=len(self.values), dimension=self.points.shape[1])
 
 
 def _some(trials: Sequence[Trial]) -> Sequence[Trial]:

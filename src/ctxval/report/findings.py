@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from ctxval._util.representation import record
@@ -39,6 +39,13 @@ class Finding:
     light: Light
     text: str
     numbers: dict[str, Any] = field(default_factory=dict)
+
+    def unless(self, doubt: str | None) -> Finding:
+        """Return this finding, which is not good if there is a doubt about what it concludes."""
+        if self.light != "good" or doubt is None:
+            return self
+        text = f"{self.text} But {doubt}: tasks between the executed ones may be unlike them."
+        return replace(self, light="attention", text=text)
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON."""

@@ -7,6 +7,7 @@ import numpy as np
 from ctxval._util.representation import counted
 from ctxval.core import soundness
 from ctxval.core.distance import ComposedDistance
+from ctxval.core.trial import CONVERGED
 from ctxval.report.context import Recording, ReportContext
 from ctxval.report.findings import Finding
 from ctxval.report.markup import number, percent
@@ -80,7 +81,7 @@ def flips(context: ReportContext) -> Finding | None:
             f"The controllers of the {found.pairs} pairs of neighbouring tasks are alike: their inputs on M differ by "
             f"at most {percent(found.largest)} of the range of the inputs."
         )
-        return Finding("Controllers of neighbouring tasks", "good", text, values)
+        return Finding("Controllers of neighbouring tasks", "good", text, values).unless(context.designs)
     text = (
         f"{found.flipped} of {found.pairs} pairs of neighbouring tasks have controllers that differ abruptly, for "
         f"example trials {numbers[i]} and {numbers[j]}: their inputs on M differ by {percent(found.largest)} of the "
@@ -137,21 +138,15 @@ def _rest(share: float) -> str:
 
 
 def converged(context: ReportContext) -> Finding | None:
-    """Whether the designs of the controllers converged."""
-    told = {k: one.converged for k, one in context.replays.items() if one.converged is not None}
+    """Whether the designs of the controllers converged, and whether controllers jump."""
+    told = [trial.number for trial in context.trials if CONVERGED in (trial.note or {})]
+    if context.designs is not None:
+        sentence = f"{context.designs[0].upper()}{context.designs[1:]}."
+        return Finding("Design of the controllers", "attention", sentence)
     if not told:
         return None
-    failed = [k for k, one in told.items() if not one]
-    among = sum(k in failed for k in list(context.recordings)[:_WORST])
-    values = {"designs": len(told), "not_converged": failed}
-    if not failed:
-        text = f"The design of the controller converged in all {len(told)} trials that were designed again."
-        return Finding("Design of the controllers", "good", text, values)
-    text = (
-        f"The design of the controller did not converge in {len(failed)} of {len(told)} trials: it stopped at its "
-        f"limit of iterations. {among} of them are among the {_WORST} worst."
-    )
-    return Finding("Design of the controllers", "attention", text, values)
+    text = f"The design of the controller converged in all {len(told)} trials that tell."
+    return Finding("Design of the controllers", "good", text)
 
 
 def goals(context: ReportContext) -> Finding | None:

@@ -141,12 +141,7 @@ def quantity(value: float | None, units: str = "") -> str:
 
 
 def code(words: str, label: str) -> Markup:
-    """Return a block to copy.
-
-    Args:
-        words: the code.
-        label: what it is, for screen readers.
-    """
+    """Return a block to copy."""
     return element("pre", element("code", words), tabindex="0", role="region", aria_label=label)
 
 

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.representation import call
+from ctxval._util.files import write_text
 from ctxval._util.texts import reason_of, visible
 from ctxval.report.context import ReportContext
 from ctxval.report.markup import paragraph, text
 from ctxval.report.sections import SECTIONS, Section, sections_of
-from ctxval.report.twins import write_text
 from ctxval.version import VERSION
 
 if TYPE_CHECKING:
@@ -52,9 +51,6 @@ class Rendered:
 
     title: str
     content: Markup
-
-    def __repr__(self) -> str:
-        return call(self, self.title)
 
 
 def page(context: ReportContext, sections: Sequence[Section] = ()) -> str:
@@ -98,16 +94,7 @@ def write_page(context: ReportContext, path: str | Path, sections: Sequence[Sect
     Raises:
         InputError: if the file cannot be written or is a store, or a section is none.
     """
-    return write_content(page(context, sections), path)
-
-
-def write_content(content: str, path: str | Path) -> Path:
-    """Write a page as one HTML file; its folder is made if there is none.
-
-    Raises:
-        InputError: if the file cannot be written or is a store.
-    """
-    return write_text(path, content)
+    return write_text(path, page(context, sections))
 
 
 def rendered_section(section: SectionOf[Context], context: Context) -> Rendered:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval._util.representation import call
 from ctxval._util.texts import shortened, visible
 from ctxval.report.context import Recording, ReportContext
 
@@ -41,17 +40,9 @@ class RecordedLines:
     points: int
     thinned: bool
 
-    def __repr__(self) -> str:
-        return call(self, kept=len(self.kept), left_out=len(self.left_out), points=self.points)
-
 
 def recorded_lines(context: ReportContext, most: int = MOST_CHARACTERS) -> RecordedLines:
-    """Return the lines of the trials, with fewer points or fewer trials if they would be too many.
-
-    Args:
-        context: the trials.
-        most: the largest number of characters of all lines.
-    """
+    """Return the lines of the trials, with fewer points or fewer trials if they would be too many."""
     numbers, points = list(context.recordings), _POINTS[0]
     found: dict[int, dict[str, Any]] = {}
     for points in _POINTS:

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.representation import call, counted
+from ctxval._util.files import write_text
+from ctxval._util.representation import counted
 from ctxval._util.texts import visible
 from ctxval.replay import PredictedTask, ReplayReport, StepError
 from ctxval.report.charts import SMALL, Axis, Chart, small_charts
 from ctxval.report.markup import bar, bullets, details, joined, number, paragraph, percent, quantity, table
-from ctxval.report.page import Rendered, SectionOf, framed, now, rendered_section, write_content
+from ctxval.report.page import Rendered, SectionOf, framed, now, rendered_section
 
 __all__ = ["replay_page", "write_replay_page"]
 
@@ -26,9 +27,6 @@ _CHARTED = 12
 
 class _Section:
     """What all sections share."""
-
-    def __repr__(self) -> str:
-        return call(self)
 
 
 class InsightsOfReplay(_Section):
@@ -220,13 +218,7 @@ class RecordingsOfReplay(_Section):
 
 
 def replay_page(report: ReplayReport, *, name: str = "", units: str = "") -> str:
-    """Return what recordings show of a model as one HTML page, which opens no connection.
-
-    Args:
-        report: the result of :func:`ctxval.replay.replay`.
-        name: the name of the model or of its experiment, for the heading.
-        units: the units of the distance of the experiment.
-    """
+    """Return what recordings show of a model as one HTML page, which opens no connection."""
     sections: tuple[SectionOf[ReplayReport], ...] = (
         InsightsOfReplay(),
         ErrorsOfReplay(),
@@ -243,12 +235,8 @@ def replay_page(report: ReplayReport, *, name: str = "", units: str = "") -> str
 
 
 def write_replay_page(report: ReplayReport, path: str | Path, *, name: str = "", units: str = "") -> Path:
-    """Write :func:`replay_page` as one file, and return its path.
-
-    Raises:
-        InputError: if the file cannot be written or is a store.
-    """
-    return write_content(replay_page(report, name=name, units=units), path)
+    """Write :func:`replay_page` as one file, and return its path."""
+    return write_text(path, replay_page(report, name=name, units=units))
 
 
 def _sentence(words: str) -> str:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from ctxval._util.describe import describe
-from ctxval._util.files import make_folder_of
+from ctxval._util.files import MADE_BY
 from ctxval._util.texts import markdown_text, shortened, visible
-from ctxval.errors import InputError
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
 from ctxval.report.findings import WORDS, Finding
@@ -23,7 +21,6 @@ from ctxval.report.sections.repeat import command_of, command_snippet, identity,
 
 _WORST = 5
 
-_DATABASE = b"SQLite format 3\0"
 """The first bytes of a store."""
 
 
@@ -80,7 +77,11 @@ def junit(context: ReportContext) -> str:
     )
     suite.extend(cases)
     ElementTree.indent(suite)
-    return '<?xml version="1.0" encoding="utf-8"?>\n' + ElementTree.tostring(suite, encoding="unicode") + "\n"
+    return (
+        f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {MADE_BY} -->\n'
+        + ElementTree.tostring(suite, encoding="unicode")
+        + "\n"
+    )
 
 
 def _verdict_case(context: ReportContext) -> ElementTree.Element:
@@ -145,6 +146,8 @@ def markdown(context: ReportContext) -> str:
             for one in appendix(context)
         ),
         "",
+        f"<!-- {MADE_BY} -->",
+        "",
     ]
     return "\n".join(lines)
 
@@ -159,27 +162,3 @@ def _worst_rows(context: ReportContext, units: str) -> list[str]:
         f"| {trial.number} | {markdown_text(quantity(distance_of(trial), units))} | {' | '.join(map(number, point))} |"
         for trial, point in zip(trials, context.coordinates(trials).tolist(), strict=True)
     ]
-
-
-def write_text(path: str | Path, content: str) -> Path:
-    """Write a report or a twin of it; its folder is made if there is none.
-
-    Raises:
-        InputError: if the file cannot be written, or is a store, whose executions were paid for.
-    """
-    target = Path(path)
-    make_folder_of(target)
-    try:
-        if _begins_with(target, _DATABASE):
-            raise InputError(f"{path} is a store or another database, and a report must not replace it.")
-        target.write_text(content, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
-    return target
-
-
-def _begins_with(path: Path, content: bytes) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(content)) == content

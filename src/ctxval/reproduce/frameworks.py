@@ -21,6 +21,9 @@ WHOLE = distances.WholeTrajectory(norm=np.inf)
 FINAL = distances.FinalState(norm=1)
 """The distance of OLCD and CuSTOM."""
 
+PAPERS_GOAL = 0.04
+"""The goal angle of the paper's Fig. 2, rad, where CCDT is largest in the paper."""
+
 BOUND = pendulum.Settings().torque
 """Bound of the open-loop torques, N m. It is that of the training data, so that the model does not extrapolate.
 
@@ -51,29 +54,9 @@ class Frameworks:
     bound: float
     closed_loop_torque: float
 
-    @property
-    def worst_ccdt_goal(self) -> float:
-        """The goal with the largest CCDT distance, rad."""
-        return float(self.goals[np.argmax(self.ccdt)])
-
-    @property
-    def worst_custom_goal(self) -> float:
-        """The goal with the largest CuSTOM distance, rad."""
-        return float(self.goals[np.argmax(self.custom)])
-
 
 def frameworks(seed: int = 0, *, per_axis: int = 2001, restarts: int = 64, bound: float = BOUND) -> Frameworks:
-    """Return the four distances of the running example.
-
-    Args:
-        seed: seed of the data that the model is learned from, and of the starts of the open-loop searches.
-        per_axis: number of goals on the grid.
-        restarts: number of restarts of each open-loop search.
-        bound: bound of the open-loop torques, N m.
-
-    Raises:
-        InputError: if an argument cannot be used.
-    """
+    """Return the four distances of the running example."""
     validation = pendulum.experiment(seed).validation
     goals = validation.space.grid(per_axis)
     task = validation.task(validation.space.parameters(goals))

@@ -8,7 +8,7 @@ import inspect
 import re
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,22 @@ from ctxval._util.code_digest import module_digest
 from ctxval._util.json_lines import JsonLines
 from ctxval.campaign.campaign import Campaign
 from ctxval.core.experiment import Experiment
+from ctxval.distances import TrackingError
 from ctxval.errors import InputError
+from ctxval.gp.kernels import Matern
+from ctxval.gp.surrogate import fit_surrogate
+from ctxval.reproduce.revision import provenance
 
 Result = dict[str, Any]
 
 DISCARDED = 5
 """The paper's k in sampling and discarding."""
+
+_KNOWN = 101
+"""Number of tasks whose distance to another trial's model a prior is made from."""
+
+_FACTOR = 1.5
+"""Largest ratio of a length-scale to that of another trial, in both directions."""
 
 _DIGITS = 10
 """Number of significant digits in stored results: more than any figure shows, at half the size."""
@@ -77,7 +87,7 @@ class Job:
 def _search(job: Job) -> Result:
     """Return the points and distances of one campaign in order, or only the records for independent draws."""
     experiment = job.experiment()
-    search = searches.by_name(job.search)
+    search = INFORMED[job.search](job) if job.search in INFORMED else searches.by_name(job.search)
     if searches.BaseSearch.of(search).iid:
         # The points do not depend on the distances, so all of them are executed in one batch.
         search.reset(experiment.validation.space.dimension, job.seed)
@@ -88,6 +98,30 @@ def _search(job: Job) -> Result:
     points = experiment.validation.space.from_unit(np.array([trial.unit_point for trial in campaign.trials]))
     distances = [np.nan if trial.distance is None else trial.distance for trial in campaign.trials]
     return {"points": points.tolist(), "distances": distances}
+
+
+def _with_prior_mean(job: Job) -> searches.Search:
+    """Return GP-UCB whose prior mean is the distance of the model of the next seed."""
+    before = replace(job, seed=job.seed + 1).experiment().validation
+    goals = before.space.grid(_KNOWN)
+    distances = before.distances(goals)
+    return searches.GPUCB(prior_mean=before.space.unit_function(lambda p: np.interp(p.goal, goals[:, 0], distances)))
+
+
+def _with_hyperprior(job: Job) -> searches.Search:
+    """Return GP-UCB whose length-scale is uniform around that of the distance of the model of the next seed."""
+    before = replace(job, seed=job.seed + 1).experiment().validation
+    goals = before.space.grid(_KNOWN)
+    known = fit_surrogate(before.space.to_unit(goals), before.distances(goals))
+    length = float(np.exp(known.process.theta[1]))
+    return searches.GPUCB(kernel=Matern(1.5, length_scale=(length / _FACTOR, length * _FACTOR)))
+
+
+INFORMED: dict[str, Callable[[Job], searches.Search]] = {
+    "gp-ucb-prior-mean": _with_prior_mean,
+    "gp-ucb-hyperprior": _with_hyperprior,
+}
+"""Searches that know what another trial found, for a one-dimensional task space."""
 
 
 def records(distances: Array) -> list[list[float]]:
@@ -147,11 +181,40 @@ def _frameworks(job: Job) -> Result:
 
 
 def _aspects(job: Job) -> Result:
-    """Return the final distances of model and system from a grid of targets (Remark 1)."""
-    from ctxval.cases.arm import aspects
+    """Return how far model and system are from completing their tasks (Remark 1).
 
-    found = aspects(job.seed, **dict(job.options), per_axis=job.budget)
-    return {"model_error": found.model_error.tolist(), "system_error": found.system_error.tolist()}
+    For the arm, it is the final distance from a grid of targets. For other cases, it is the mean distance of the
+    position from the reference of random tasks, beside that of a car that goes straight ahead.
+    """
+    if job.case == "arm":
+        from ctxval.cases.arm import aspects
+
+        found = aspects(job.seed, **dict(job.options), per_axis=job.budget)
+        return {"model_error": found.model_error.tolist(), "system_error": found.system_error.tolist()}
+    validation = job.experiment().validation
+    points = validation.space.iid(job.budget, np.random.default_rng(job.seed))
+    missed = TrackingError(components=(0, 1), over="mean")
+    references = validation.task(validation.space.parameters(points)).reference
+    return {
+        "model_error": validation.on_model(missed).distances(points).tolist(),
+        "system_error": validation.with_distance(missed).distances(points).tolist(),
+        "size": np.abs(references[..., 1:, 1]).mean(axis=-1).tolist(),
+    }
+
+
+def _loops(job: Job) -> Result:
+    """Return how far the closed loops on M and on S go below the paper's goal, and how far they are apart."""
+    from ctxval.reproduce.frameworks import PAPERS_GOAL, closed_loops
+
+    validation = job.experiment().validation
+    model, system = closed_loops(validation, validation.task(validation.space.parameters([PAPERS_GOAL])))
+    gap = np.abs(system.states - model.states)
+    return {
+        "model_undershoot": PAPERS_GOAL - float(model.states[:, 0].min()),
+        "system_undershoot": PAPERS_GOAL - float(system.states[:, 0].min()),
+        "apart": float(gap.max()),
+        "end": float(gap[-1].sum()),
+    }
 
 
 KINDS: dict[str, Callable[[Job], Result]] = {
@@ -160,16 +223,13 @@ KINDS: dict[str, Callable[[Job], Result]] = {
     "profile": _profile,
     "frameworks": _frameworks,
     "aspects": _aspects,
+    "loops": _loops,
 }
 """The kinds of jobs, each with the function that runs it."""
 
 
 def run_job(job: Job) -> Result:
-    """Run one job on one thread.
-
-    Raises:
-        InputError: if there is no such kind of job.
-    """
+    """Run one job on one thread."""
     if job.kind not in KINDS:
         raise InputError(f"there is no kind of job {job.kind!r}.")
     with single_threaded():
@@ -178,6 +238,8 @@ def run_job(job: Job) -> Result:
 
 class Results:
     """Stored results, a file of JSON lines for each kind of job; those of a case that has changed since do not count.
+
+    A change of the searches makes no result invalid: the table says which results were measured before it.
 
     Args:
         folder: of the files; it is made with the first result.
@@ -195,13 +257,7 @@ class Results:
         return self._of_kind(job.kind)[job.key,]
 
     def fill(self, jobs: Iterable[Job], workers: int, on_done: Callable[[Job], None]) -> None:
-        """Run the jobs that are not stored yet, in parallel; each result is stored as soon as it is complete.
-
-        Args:
-            jobs: the jobs; stored ones are skipped.
-            workers: number of processes.
-            on_done: function that is called with each job after its run.
-        """
+        """Run the jobs that are not stored yet, in parallel; each result is stored as soon as it is complete."""
         missing = [job for job in dict.fromkeys(jobs) if job not in self]
         if not missing:
             return
@@ -222,7 +278,7 @@ class Results:
         return self._files[kind]
 
     def _store(self, job: Job, result: Result) -> None:
-        stored = {"key": job.key, **_rounded(result), "case_digest": case_digest(job.case)}
+        stored = {"key": job.key, **_rounded(result), "case_digest": case_digest(job.case), **provenance()}
         self._of_kind(job.kind).append(stored)
 
 

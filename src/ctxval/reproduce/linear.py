@@ -13,6 +13,7 @@ from ctxval.reproduce.study import (
     Claim,
     Columns,
     Scale,
+    agreement,
     counted,
     draw_executions,
     executions_within,
@@ -29,6 +30,8 @@ _RANDOM = 20_000
 _ACTIVE = 100
 """Executions of the active searches."""
 _STATES = tuple(range(1, 11))
+_DIMENSIONS = 10
+"""Ratio of the largest dimension to the smallest one; a growth up to it is at most linear."""
 
 
 class LinearComplexity:
@@ -104,6 +107,6 @@ class LinearComplexity:
             Claim(
                 "growth with the dimension is modest for CuSTOM, drastic for SC and SD (within 5 %)",
                 f"executions in 2-D, 10-D, 20-D: {'; '.join(texts)}",
-                "yes" if ucb[2] <= _ACTIVE and sc[2] > 10 * ucb[2] else "partly",
+                agreement(ucb[2] / ucb[0] <= _DIMENSIONS and sc[2] / sc[0] > 10 * ucb[2] / ucb[0], sc[2] > ucb[2]),
             )
         ]

@@ -15,12 +15,14 @@ from typing import Protocol
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Rows, as_finite, single_threaded, vector_norm
+from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
 from ctxval.core.model import Model, Step, as_model, linearize
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.distances import FinalState, WholeTrajectory
-from ctxval.errors import InputError, ModelError, ShapeError
+from ctxval.distances.base import require_indices
+from ctxval.errors import InputError, ModelError
 
 _ROLLOUTS = 4096
 """Number of rollouts in one batch, large enough to be fast and small enough for memory."""
@@ -50,6 +52,7 @@ class OpenLoopWorst:
     restarts: Array
 
 
+@checked
 def worst_open_loop(
     system: Model | Step,
     model: Model | Step,
@@ -57,9 +60,9 @@ def worst_open_loop(
     bound: ArrayLike,
     distance: FinalState | WholeTrajectory,
     *,
-    restarts: int = 64,
-    seed: int = 0,
-    iterations: int = 200,
+    restarts: PositiveInt = 64,
+    seed: NonNegativeInt = 0,
+    iterations: PositiveInt = 200,
 ) -> OpenLoopWorst:
     """Maximise the distance between M and S over the inputs ``|u| <= bound``, from the task's initial state.
 
@@ -75,13 +78,8 @@ def worst_open_loop(
         restarts: number R of sequences that are improved.
         seed: seed of the first sequences.
         iterations: largest number of improvements of one sequence in each of the three passes of the search.
-
-    Raises:
-        InputError: if an argument cannot be used.
-        ModelError: if M or S is not finite under inputs within the bound.
     """
-    _require_counts(restarts, seed, iterations)
-    pair = _Pair(as_model(system), as_model(model), _single(task), _as_bound(bound))
+    pair = _Pair(as_model(system), as_model(model), task, np.atleast_1d(as_finite("bound", bound)))
     norm = _Norm.of(distance, task)
     with single_threaded():
         U = _first_inputs(pair, restarts, seed)
@@ -93,25 +91,6 @@ def worst_open_loop(
     return OpenLoopWorst(
         float(values.max()), best, pair.run(pair.model, best), pair.run(pair.system, best), np.sort(values)[::-1]
     )
-
-
-def _require_counts(restarts: int, seed: int, iterations: int) -> None:
-    for name, value, least in (("restarts", restarts, 1), ("seed", seed, 0), ("iterations", iterations, 1)):
-        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-            raise InputError(f"{name} must be an integer >= {least}, got {value!r}.")
-
-
-def _single(task: Task) -> Task:
-    if task.batch_shape:
-        raise ShapeError(f"open-loop validation takes one task, got a batch of shape {task.batch_shape}.")
-    return task
-
-
-def _as_bound(bound: ArrayLike) -> Array:
-    array = np.atleast_1d(as_finite("bound", bound))
-    if array.ndim != 1 or not (array > 0).all():
-        raise InputError(f"bound must be a positive number for each input, got {array.tolist()}.")
-    return array
 
 
 class _Pair:
@@ -189,7 +168,8 @@ class _Norm:
         if len(distance.angles):
             raise InputError("open-loop validation needs a distance without angles, which are no linear function.")
         factors = np.zeros((task.horizon + 1, task.initial_state.shape[-1]))
-        components = slice(None) if distance.components is None else list(distance.components)
+        states = range(factors.shape[-1]) if distance.components is None else distance.components
+        components = require_indices("components", states, factors.shape[-1])
         if isinstance(distance, FinalState):
             factors[-1, components] = 1.0
         else:

@@ -6,7 +6,7 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 
@@ -50,6 +50,14 @@ class Scale:
 FULL, QUICK = Scale("full", 10, 1.0), Scale("quick", 3, 0.3)
 
 
+Agreement = Literal["yes", "partly", "no"]
+
+
+def agreement(whole: bool, part: bool = False) -> Agreement:
+    """Return whether numbers agree with a claim: wholly, at least with a part of it, or not."""
+    return "yes" if whole else "partly" if part else "no"
+
+
 @dataclass(frozen=True)
 class Claim:
     """One claim of the paper, with the measured numbers.
@@ -58,12 +66,12 @@ class Claim:
         paper: the claim of the paper.
         measured: the measured numbers.
         agrees: whether they agree with the claim: yes, partly or no.
-        remark: the reason for a difference, if known.
+        remark: the reason for a difference, if known; it is shown only if the numbers do not agree.
     """
 
     paper: str
     measured: str
-    agrees: str
+    agrees: Agreement
     remark: str = ""
 
 
@@ -132,11 +140,15 @@ def executions_within(distances: Sequence[float] | Array, search: str, truth: fl
 
 
 def spread(values: Sequence[float] | Array) -> tuple[float, float, float]:
-    """Return median, smallest and largest value."""
+    """Return median, smallest and largest value, where infinity stands for never: its mean with a number is never."""
     array = np.asarray(values, dtype=np.float64)
-    # Infinity stands for "never"; the median of a number and "never" is "never".
-    ordered = np.sort(array)
-    return float(ordered[len(ordered) // 2] if np.isinf(array).any() else np.median(array)), ordered[0], ordered[-1]
+    return float(np.median(array)), float(array.min()), float(array.max())
+
+
+def ranged(values: Sequence[float] | Array, digits: int) -> str:
+    """Return the median of values with their range, as text with so many decimals."""
+    median, low, high = (f"{value:.{digits}f}" for value in spread(values))
+    return f"{median} (from {low} to {high})"
 
 
 def draw_executions(axes: Axes, x: Array, medians: dict[str, Array], budgets: dict[str, int], dodge: float) -> None:

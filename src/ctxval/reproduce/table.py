@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ctxval.reproduce.jobs import Results
+from ctxval.reproduce.revision import measured_with
 from ctxval.reproduce.study import Scale, Study
 
 
@@ -20,6 +21,8 @@ def write_table(out: Path, studies: Sequence[Study], results: Results, scale: Sc
 
 def table_text(out: Path, studies: Sequence[Study], results: Results, scale: Scale) -> str:
     """Return the text of ``<out>.md``."""
+    jobs = dict.fromkeys(job for study in studies for job in study.jobs(scale))
+    searches = [job for job in jobs if job.kind == "search"]
     lines = [
         "# The paper's experiments, reproduced",
         "",
@@ -27,12 +30,15 @@ def table_text(out: Path, studies: Sequence[Study], results: Results, scale: Sca
         f"written by hand. Scale: {scale.name}, medians over {scale.trials} trials with seeds 0 to {scale.trials - 1}. "
         "Each trial has new data and a new model. Ranges go from the smallest to the largest value.",
         "",
+        "Single runs depend on the processor: the kernels of linear algebra round differently, and a search magnifies "
+        f"this. Compare medians. {measured_with(results[job] for job in searches)}",
+        "",
         "| the paper's claim | measured | agrees | reason for a difference, if known |",
         "|---|---|---|---|",
     ]
     for study in studies:
         for claim in study.claims(results, scale):
-            cells = (claim.paper, claim.measured, claim.agrees, claim.remark)
+            cells = (claim.paper, claim.measured, claim.agrees, "" if claim.agrees == "yes" else claim.remark)
             lines.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
     for study in studies:
         lines += ["", f"## {study.title}", "", f"![{study.title}]({out.name}/{study.name}.png)", ""]
@@ -45,7 +51,12 @@ def table_text(out: Path, studies: Sequence[Study], results: Results, scale: Sca
 
 def _parameters(case: str) -> list[str]:
     """Return a case's settings and the reasons that its docstring gives."""
-    settings = importlib.import_module(f"ctxval.cases.{case}").Settings
-    values = [f"`{field.name}` = {field.default}" for field in dataclasses.fields(settings)]
-    reasons = [line.strip() for line in (settings.__doc__ or "").splitlines()]
-    return [", ".join(values), "", "```text", *reasons, "```"]
+    module = importlib.import_module(f"ctxval.cases.{case}")
+    fields = dataclasses.fields(module.Settings)
+    values = [f"`{field.name}` = {field.default}" for field in fields]
+    for name, variant in getattr(module, "VARIANTS", {}).items():
+        others = [field.name for field in fields if getattr(variant, field.name) != field.default]
+        if others:
+            values.append(f"in the variant `{name}` " + ", ".join(f"`{n}` = {getattr(variant, n)}" for n in others))
+    reasons = [line.strip() for line in (module.Settings.__doc__ or "").splitlines()]
+    return ["; ".join(values), "", "```text", *reasons, "```"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from ctxval._util.registry import Registry
-from ctxval.searches.annealing import Annealing
 from ctxval.searches.auto import Auto
 from ctxval.searches.base import BaseSearch, Costs, Note, Prediction, Search, SequentialSearch
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
@@ -21,29 +20,21 @@ __all__ = [
     "GPUCB",
     "NAMES",
     "REGISTRY",
-    "Annealing",
     "Auto",
     "BaseSearch",
     "BayesianOptimisation",
-    "Climbs",
     "Costs",
     "Note",
     "Prediction",
     "Random",
     "Repeated",
     "SamplingDiscarding",
-    "Scalar",
     "Search",
     "SequentialSearch",
     "TrustRegion",
     "TrustRegionSettings",
     "by_name",
 ]
-
-Scalar = BayesianOptimisation
-"""The older name of :class:`BayesianOptimisation`."""
-Climbs = TrustRegion
-"""The older name of :class:`TrustRegion`."""
 
 REGISTRY: Registry[Search] = Registry("search", __name__, method="ask")
 """The searches that are found by name: those of this package, and those that installed packages add."""

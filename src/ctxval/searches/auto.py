@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.progress import expect
 from ctxval._util.registry import part
-from ctxval.errors import InputError
 from ctxval.gp.ascent import usual_effort
 from ctxval.searches.base import Costs, Prediction
 from ctxval.searches.trust_region import TrustRegion
@@ -42,14 +42,13 @@ class Auto(TrustRegion):
             measured once, after the first execution, and stored in a note; so another campaign with the same seed may
             make other choices. A whole number: at most so many, whatever they cost.
         optimism, misses: see :class:`TrustRegion`.
-
-    Raises:
-        InputError: if the thinking is none of these, misses is below 1, or the optimism is negative or infinite.
     """
 
-    def __init__(self, thinking: Thinking | int = "balanced", optimism: float = 2.0, misses: int = 3) -> None:
+    def __init__(
+        self, thinking: Thinking | PositiveInt = "balanced", optimism: NonNegativeFloat = 2.0, misses: PositiveInt = 3
+    ) -> None:
         super().__init__(optimism, misses)
-        self.thinking = _checked(thinking)
+        self.thinking = thinking
         self._fixed_now: int | None = None
 
     def use_prediction(self, prediction: Prediction | None) -> None:
@@ -103,24 +102,6 @@ class Auto(TrustRegion):
         """Return the number of designs that was fixed at an earlier choice; None if there was none."""
         noted = (note.get(DESIGNS) for note in self.notes if note is not None)
         return next((number for number in noted if isinstance(number, int) and number >= 1), None)
-
-
-def present_options(options: dict[str, Any]) -> dict[str, Any]:
-    """Return stored options of ``auto``, in which older versions had ``designs`` in place of ``thinking``."""
-    if "designs" not in options or "thinking" in options:
-        return options
-    others = {name: value for name, value in options.items() if name != "designs"}
-    return {**others, "thinking": "balanced" if options["designs"] is None else options["designs"]}
-
-
-def _checked(thinking: Thinking | int) -> Thinking | int:
-    if thinking in ("balanced", "fast", "thorough"):
-        return thinking
-    if isinstance(thinking, int | np.integer) and not isinstance(thinking, bool) and thinking >= 1:
-        return int(thinking)
-    raise InputError(
-        f"thinking must be 'balanced', 'fast', 'thorough' or a number of designs of at least 1, got {thinking!r}."
-    )
 
 
 def _designs(share: float, most: int) -> int:

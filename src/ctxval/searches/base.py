@@ -11,6 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Rows, as_floats
+from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
 from ctxval._util.representation import call, options, record
 from ctxval.errors import InputError, ShapeError
 from ctxval.gp.ascent import Effort
@@ -58,6 +59,7 @@ class Prediction:
             there is no other.
         costs: measures the costs, which takes some predictions; None if they cannot be measured.
         rough: an approximation of ``expected`` that is cheaper to evaluate; None if there is none.
+        steady: whether a point ``(d,)`` has the value of its neighbours, and may be evaluated; None if all may.
     """
 
     expected: Callable[[Array], tuple[Array, Array]]
@@ -66,6 +68,7 @@ class Prediction:
     otherwise: Callable[[], Prediction | None] | None = None
     costs: Callable[[], Costs] | None = None
     rough: Callable[[Array], tuple[Array, Array]] | None = None
+    steady: Callable[[Array], bool] | None = None
 
     def with_rows(self, left_out_of: Callable[[Prediction], Callable[[Rows], Array]]) -> Prediction:
         """Return the prediction with other rows, also in those that it may turn to.
@@ -91,6 +94,8 @@ class Search(Protocol):
     The state of a search is a function of the seed and of the history of points and values, in their order: a new
     search that is reset with the same seed and told the same history asks for the same points. So a campaign saves no
     search, and resumes by telling the history.
+
+    A campaign may execute a point that differs by 1e-9 from the one that was asked for, and tells that one.
 
     These three methods are all that a search needs. A search that offers more, such as independent draws or notes,
     inherits :class:`BaseSearch`. A campaign ignores other attributes and methods of other classes, whatever their
@@ -207,10 +212,9 @@ class _WithDefaults(BaseSearch):
 class SequentialSearch(BaseSearch):
     """Base class of searches that propose one point at a time from the history of all points."""
 
-    def reset(self, dimension: int, seed: int) -> None:
+    @checked
+    def reset(self, dimension: PositiveInt, seed: NonNegativeInt) -> None:
         """Forget everything and start on the unit cube of this dimension."""
-        if dimension < 1:
-            raise InputError(f"a search needs at least one dimension, got {dimension}.")
         self._dimension, self._seed = dimension, seed
         self._points: list[Array] = []
         self._values: list[float] = []
@@ -218,11 +222,10 @@ class SequentialSearch(BaseSearch):
         self._slots: dict[bytes, list[int]] = {}
         self._last_note: Note | None = None
 
-    def ask(self, n: int = 1) -> Array:
+    @checked
+    def ask(self, n: PositiveInt = 1) -> Array:
         """Return the next points, shape ``(n, d)``; they are pending until told."""
         self._require_reset()
-        if n < 1:
-            raise InputError(f"a search is asked for at least one point, got n = {n}.")
         proposals = []
         for _ in range(n):
             rng = np.random.default_rng(np.random.SeedSequence([self._seed, len(self._points)]))
@@ -252,6 +255,16 @@ class SequentialSearch(BaseSearch):
                 self._append(point, value, None)
             else:
                 self._values[slot] = value
+
+    def amend(self, point: Array) -> None:
+        """Replace the point that was asked for last by the one that is evaluated, which has fewer digits."""
+        last = len(self._points) - 1
+        key = _key(self._points[last])
+        self._slots[key].remove(last)
+        if not self._slots[key]:
+            del self._slots[key]
+        self._slots.setdefault(_key(point), []).append(last)
+        self._points[last] = point
 
     def note(self) -> Note | None:
         """Return the note on the point that was asked for last; None if there is none."""

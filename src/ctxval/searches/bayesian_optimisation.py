@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval.errors import InputError
 from ctxval.gp.acquisition import Acquisition, Box, LogExpectedImprovement, UpperConfidenceBound, maximise
 from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.subset import kept_rows
@@ -87,16 +87,9 @@ class BayesianOptimisation(SequentialSearch):
     Args:
         initial: number of random points at the start; in one and two dimensions they are far from each other.
         beta: confidence parameter of the upper confidence bounds.
-
-    Raises:
-        InputError: if beta is negative or infinite, or there is no initial point.
     """
 
-    def __init__(self, initial: int = 3, beta: float = 4.0) -> None:
-        if initial < 1:
-            raise InputError(f"Bayesian optimisation needs at least one initial point, got {initial}.")
-        if not 0 <= beta < float("inf"):
-            raise InputError(f"beta must not be negative or infinite, got {beta!r}.")
+    def __init__(self, initial: PositiveInt = 3, beta: NonNegativeFloat = 4.0) -> None:
         self.initial = initial
         self.beta = beta
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.checked import PositiveFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch
@@ -33,12 +34,10 @@ class CMAES(SequentialSearch):
         population: number of points in a generation; ``4 + floor(3 ln d)`` by default.
 
     Raises:
-        InputError: if sigma is not positive, the population is below 4, or ``cmaes`` is not installed.
+        InputError: if the population is below 4, or ``cmaes`` is not installed.
     """
 
-    def __init__(self, sigma: float = 0.3, population: int | None = None) -> None:
-        if not 0 < sigma < np.inf:
-            raise InputError(f"sigma must be a positive number, got {sigma!r}.")
+    def __init__(self, sigma: PositiveFloat = 0.3, population: PositiveInt | None = None) -> None:
         if population is not None and population < _SMALLEST_POPULATION:
             raise InputError(f"CMA-ES needs a population of at least {_SMALLEST_POPULATION}, got {population!r}.")
         _cma_class()

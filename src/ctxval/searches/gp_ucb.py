@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.checked import NonNegativeFloat, PositiveFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval.errors import InputError
 from ctxval.gp.acquisition import Uncertainty, UpperConfidenceBound, maximise
 from ctxval.gp.kernels import Kernel, Matern
 from ctxval.gp.regression import NOISE, Mean
@@ -22,36 +22,29 @@ _KEPT = 500
 
 @part("gp-ucb")
 class GPUCB(SequentialSearch):
-    """Bayesian optimisation with the GP upper confidence bound (Algorithm 1, eqs. 10 and 11).
+    """Bayesian optimisation with the GP upper confidence bound (Algorithm 1, eqs. 9 and 10).
 
     From 1,000 points on, the surrogate is fitted to 500 of them: the largest values, the latest, and well-spread ones.
 
     Args:
-        beta: confidence parameter of eq. 11.
+        beta: confidence parameter of eq. 10.
         initial: number of random points at the start.
         kernel: covariance of the surrogate; Matern 3/2 with one length-scale by default.
         noise: bounds of the noise variance relative to that of the values; equal bounds fix it. Widen them for a
             stochastic system.
         prior_mean: prior mean of the distance as a function of unit-cube points ``(n, d) -> (n,)``; see
             :meth:`ctxval.TaskSpace.unit_function`. The mean of the values by default.
-
-    Raises:
-        InputError: if beta is negative or infinite, or there is no initial point.
     """
 
     def __init__(
         self,
-        beta: float = 2.0,
-        initial: int = 5,
+        beta: NonNegativeFloat = 2.0,
+        initial: PositiveInt = 5,
         *,
         kernel: Kernel | None = None,
-        noise: tuple[float, float] = (NOISE, NOISE),
+        noise: tuple[PositiveFloat, PositiveFloat] = (NOISE, NOISE),
         prior_mean: Mean | None = None,
     ) -> None:
-        if not 0 <= beta < float("inf"):
-            raise InputError(f"beta must not be negative or infinite, got {beta!r}.")
-        if initial < 1:
-            raise InputError(f"GP-UCB needs at least one initial point, got {initial}.")
         self.beta = beta
         self.initial = initial
         self.kernel: Kernel = Matern(1.5) if kernel is None else kernel

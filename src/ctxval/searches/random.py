@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.checked import NonNegativeInt
 from ctxval._util.registry import part
-from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch
 
 
@@ -27,12 +27,7 @@ class SamplingDiscarding(Random):
 
     Args:
         discard: number of the largest distances that the estimate of d* leaves out, the paper's k.
-
-    Raises:
-        InputError: if discard is negative.
     """
 
-    def __init__(self, discard: int = 5) -> None:
-        if discard < 0:
-            raise InputError(f"discard must not be negative, got {discard}.")
+    def __init__(self, discard: NonNegativeInt = 5) -> None:
         self.discard = discard

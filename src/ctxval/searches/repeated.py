@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval.errors import InputError
+from ctxval._util.checked import PositiveInt, checked
 from ctxval.searches.base import BaseSearch, Note, Prediction, Search, SequentialSearch
 
 
@@ -49,6 +49,7 @@ class _Means:
         )
 
 
+@checked
 class Repeated(SequentialSearch):
     """A search for the largest mean value of a noisy function: it asks for each point several times.
 
@@ -57,16 +58,9 @@ class Repeated(SequentialSearch):
     Args:
         search: the search that chooses the points; it is told the mean of the known values at each point.
         times: number of evaluations of each point.
-
-    Raises:
-        InputError: if ``search`` lacks a method of a search, or ``times`` is not positive.
     """
 
-    def __init__(self, search: Search, times: int = 3) -> None:
-        if not isinstance(search, Search):
-            raise InputError(f"search must have reset, ask and tell, got {search!r}.")
-        if times < 1:
-            raise InputError(f"each point must be evaluated at least once, got times = {times}.")
+    def __init__(self, search: Search, times: PositiveInt = 3) -> None:
         self.search = search
         self.times = times
         self._inner = BaseSearch.of(search)

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Mask, single_threaded
+from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval.errors import InputError
 from ctxval.gp.acquisition import Box
 from ctxval.gp.ascent import Ascent
 from ctxval.searches.base import Note, Prediction, SequentialSearch, best_first
@@ -108,18 +108,13 @@ class TrustRegion(SequentialSearch):
         optimism: kappa, the relative excess of a value over its prediction that is assumed if the doubt is 1.
         misses: number of executions without improvement after which a region is left.
         settings: further settings, for studies; the defaults if None.
-
-    Raises:
-        InputError: if the optimism is negative or infinite, or no miss is allowed.
     """
 
     initial = 1
 
-    def __init__(self, optimism: float = 2.0, misses: int = 3, *, settings: TrustRegionSettings | None = None) -> None:
-        if not 0 <= optimism < float("inf"):
-            raise InputError(f"optimism must not be negative or infinite, got {optimism!r}.")
-        if misses < 1:
-            raise InputError(f"a region must be allowed at least one miss, got {misses}.")
+    def __init__(
+        self, optimism: NonNegativeFloat = 2.0, misses: PositiveInt = 3, *, settings: TrustRegionSettings | None = None
+    ) -> None:
         self.optimism = optimism
         self.misses = misses
         self._settings = TrustRegionSettings() if settings is None else settings
@@ -221,7 +216,9 @@ class TrustRegion(SequentialSearch):
         ascent = Ascent(value, *region.box(self.dimension), budget, value.rough)
         points, promised = ascent.run(best_first(self.points, self.values)[:_STARTS], rng)
         points = points[self._is_new(points) & np.isfinite(promised)]
-        return value.at(points[0]) if len(points) else None
+        steady = value.prediction.steady or (lambda point: True)
+        best = next(filter(steady, points), points[0]) if len(points) else None
+        return None if best is None else value.at(best)
 
     def _noted(self, found: Candidate | None, region: _Region) -> Array | None:
         """Return the next point of a region, and record the prediction for it in the note; None if there is none."""

@@ -13,19 +13,15 @@ from typing import Any
 from ctxval._util.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
 from ctxval._util.progress import advance, stage
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
-from ctxval.storage import rows, schema
+from ctxval.storage import schema
 from ctxval.storage.disks import make_folder, on_network, warn_of_network
-from ctxval.storage.migrations import MIGRATIONS
-
-_APPLICATION = 0x63747876
-"""SQLite's application_id of a store, the letters "ctxv"; it marks a file as a store of ctxval."""
 
 _WAIT = 0.02
 """Seconds between two attempts to take the lock."""
 
 
 class Database:
-    """A SQLite file with the tables of a store; opening it brings the tables to the newest version.
+    """A SQLite file with the tables of a store; opening a new one makes them.
 
     Attributes:
         path: the absolute path of the file; None if the tables are in memory.
@@ -33,7 +29,7 @@ class Database:
 
     Raises:
         StoreAccessError: if the file cannot be opened or written.
-        ForeignStoreError: if the file is not a store, or a store of a newer version.
+        ForeignStoreError: if the file is not a store, or a store of another version.
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
@@ -73,15 +69,18 @@ class Database:
             yield cursor
 
     @contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """Make all reads inside see the file at one moment. Keep them short: other processes wait to write."""
+        with self.translated_errors():
+            if self._connection.in_transaction:
+                yield
+            else:
+                with schema.snapshot(self._connection):
+                    yield
+
+    @contextmanager
     def sole_writer(self, wait: float = 0.0) -> Iterator[None]:
-        """Prevent other processes from running this store. The lock is released when the process ends, however it ends.
-
-        Args:
-            wait: seconds to wait for another process that is about to end.
-
-        Raises:
-            StoreAccessError: if another process is running the store.
-        """
+        """Prevent other processes from running this store; the lock ends with the process, however that ends."""
         if self.path is None or self._locked:
             yield
             return
@@ -158,7 +157,7 @@ class Database:
 
     def _prepare(self) -> None:
         with schema.snapshot(self._connection):
-            version = schema.version(self._connection, self.name, _APPLICATION, [sql for _, sql in MIGRATIONS])
+            new = schema.is_new(self._connection, self.name)
             page = self._connection.execute("PRAGMA page_size").fetchone()[0]
             if self.path is not None and self.path.stat().st_size % page:
                 raise self.damaged("its end is missing")
@@ -168,22 +167,17 @@ class Database:
         # FULL does not sync the folder after a journal is removed: a power cut may bring the journal back, and SQLite
         # then undoes the last transaction.
         self._connection.execute("PRAGMA synchronous = EXTRA")
-        for number in range(version, len(MIGRATIONS)):
-            self._migrate(number)
+        if new:
+            self._make_tables()
 
-    def _migrate(self, number: int) -> None:
-        title, script = MIGRATIONS[number]
+    def _make_tables(self) -> None:
         with self.transaction():
-            if self._connection.execute("PRAGMA user_version").fetchone()[0] > number:
-                return  # another process has done this migration
-            if number == 0:
-                self._connection.execute(f"PRAGMA application_id = {_APPLICATION}")
-            for statement in script.split(";"):
+            if not schema.is_new(self._connection, self.name):
+                return  # another process has made them
+            self._connection.execute(f"PRAGMA application_id = {schema.APPLICATION}")
+            for statement in schema.TABLES.split(";"):
                 self._connection.execute(statement)
-            if number + 1 == rows.CHECKED:
-                rows.write_checksums(self._connection)
-            self._connection.execute("INSERT INTO migrations VALUES (?, ?, ?)", (number + 1, title, now()))
-            self._connection.execute(f"PRAGMA user_version = {number + 1}")
+            self._connection.execute(f"PRAGMA user_version = {schema.VERSION}")
 
 
 def _lockable(path: Path) -> Path:

@@ -32,7 +32,7 @@ _UNREADABLE = (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, Mem
 
 
 def other_stores(path: Path) -> list[Path]:
-    """Return the other stores in a store's folder with trials of the same validation, of any search and seed.
+    """Return the other stores in a store's folder with trials of the same validation and model, of any search and seed.
 
     Nothing is built, run or written. Files that cannot be read are skipped.
     """
@@ -52,12 +52,7 @@ def _is_of(path: Path, own: dict[str, Any]) -> bool:
 
 
 def _validation_of(path: Path) -> dict[str, Any]:
-    """Return a store's description of its validation.
-
-    Raises:
-        ValueError: if the store has no description of its validation, or no executed trial.
-        sqlite3.Error, OSError: if the store cannot be read.
-    """
+    """Return a store's description of its validation, and the number that depends on its model."""
     with path.open("rb") as file:
         header = file.read(_HEADER)
     if not header.startswith(b"SQLite format 3\0") or header[-4:] != _MARK:
@@ -66,15 +61,13 @@ def _validation_of(path: Path) -> dict[str, Any]:
     with closing(sqlite3.connect(uri, uri=True, factory=schema.Guarded)) as connection:
         if not {"key", "value", "executed"} <= _columns(connection):
             raise ValueError(f"{path} is not a store")
-        row = connection.execute(
-            "SELECT value FROM experiment WHERE key = 'validation' AND length(value) <= ?", (_LONGEST,)
-        ).fetchone()
+        rows = connection.execute(
+            "SELECT key, value FROM experiment WHERE key IN ('validation', 'draws') AND length(value) <= ?", (_LONGEST,)
+        ).fetchall()
         executed = connection.execute("SELECT EXISTS (SELECT 1 FROM trials WHERE executed)").fetchone()[0]
-    if row is None or not executed:
+    found = {str(key): json.loads(value) for key, value in rows}
+    if not isinstance(found.get("validation"), dict) or not executed:
         raise ValueError(f"{path} has no executed trials of an experiment")
-    found = json.loads(row[0])
-    if not isinstance(found, dict):
-        raise ValueError(f"{path} does not describe its validation")
     return found
 
 

@@ -15,13 +15,14 @@ from typing import Any, get_args
 from urllib.parse import quote
 
 from ctxval._util.describe import describe
+from ctxval._util.files import MADE_BY, write_text, written_whole
 from ctxval._util.temporary import temporary_folder
 from ctxval._util.texts import guarded, shortened, visible
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError, InputError, StoreAccessError
 from ctxval.storage import schema
-from ctxval.storage.rows import CHECKED, COLUMNS, read_json, read_trajectory, read_trial, trial_checksum
+from ctxval.storage.rows import COLUMNS, checksum_of, read_json, read_trajectory, read_trial
 from ctxval.storage.store import Store
 from ctxval.storage.trajectories import Side
 
@@ -62,11 +63,7 @@ class Recovered:
 
 
 def recover(path: Path) -> Recovered:
-    """Read the readable parts of a store. The file is not changed if it is damaged or has a journal.
-
-    Raises:
-        StoreAccessError: if there is no such file, or it cannot be read at all.
-    """
+    """Read the readable parts of a store. The file is not changed if it is damaged or has a journal."""
     schema.require_file(path)
     if not path.is_file():
         raise StoreAccessError(f"there is no store at {path}.")
@@ -126,14 +123,12 @@ def _read(connection: sqlite3.Connection, size: int, found: Recovered) -> None:
     try:
         # Without this SQLite refuses a file that is shorter than its header states.
         connection.execute("PRAGMA writable_schema = ON")
-        unchecked = connection.execute("PRAGMA user_version").fetchone()[0] < CHECKED
         tables = schema.plain_tables(connection, _TABLES)
     except _UNREADABLE as error:
         found.damaged.append(f"nothing is readable: {error}")
         return
-    missing = [name for name in _TABLES if name not in tables and (name != "history" or not unchecked)]
-    found.damaged += [f"the table {name} is missing, or is no plain table" for name in missing]
-    reader = _Reader(connection, tables, size, unchecked, found)
+    found.damaged += [f"the table {name} is missing, or is no plain table" for name in _TABLES if name not in tables]
+    reader = _Reader(connection, tables, size, found)
     for table in ("experiment", "settings"):
         found.about[table] = dict(reader.pairs(table))
     found.about["history"] = list(reader.history())
@@ -150,7 +145,6 @@ class _Reader:
     connection: sqlite3.Connection
     tables: dict[str, set[str]]
     size: int
-    unchecked: bool
     found: Recovered
 
     def pairs(self, table: str) -> Iterator[tuple[str, Any]]:
@@ -161,7 +155,7 @@ class _Reader:
                 self._note(f"the table {table}, {key}: {error}")
 
     def history(self) -> Iterator[dict[str, Any]]:
-        """Yield the changes of the store; older versions of stores have no table of them."""
+        """Yield the changes of the store."""
         for at, what, why, content in self.rows("history", ["at", "what", "why", "content"]):
             try:
                 yield {"at": str(at), "what": str(what), "why": str(why), "content": read_json(content, finite=False)}
@@ -169,7 +163,7 @@ class _Reader:
                 self._note(f"the table history, {at}: {error}")
 
     def rows(self, table: str, columns: list[str]) -> Iterator[tuple[Any, ...]]:
-        """Yield the readable rows of a table; a column that an older version does not have is None."""
+        """Yield the readable rows of a table; a column that it does not have is None."""
         if table not in self.tables:
             return
         wanted = ", ".join(name if name in self.tables[table] else f"NULL AS {name}" for name in columns)
@@ -204,12 +198,12 @@ class _Reader:
 
     def take_trial(self, row: tuple[Any, ...]) -> None:
         number, *values, checksum = row
-        trial = read_trial((number, *values), checksum, unchecked=self.unchecked)
+        trial = read_trial((number, *values), checksum)
         if trial is not None and trial.number not in self.found.trials:
             self.found.trials[trial.number] = trial
         elif trial is not None:
             self._note(f"trial {number} is there more than once, and the first one is taken")
-        elif checksum is not None and trial_checksum((number, *values)) == checksum:
+        elif checksum_of((number, *values)) == checksum:
             self._note(f"trial {number}: it holds what no trial can")
         else:
             self._note(f"trial {number}: its checksum does not fit")
@@ -220,7 +214,7 @@ class _Reader:
             self._note(f"{name}: there is no such thing")
         elif (number, side) in self.found.trajectories:
             self._note(f"{name} is there more than once, and the first one is taken")
-        elif trajectory := read_trajectory(number, side, npz, checksum, unchecked=self.unchecked):
+        elif trajectory := read_trajectory(number, side, npz, checksum):
             self.found.trajectories[number, side] = trajectory
         else:
             self._note(f"{name}: its checksum does not fit")
@@ -237,18 +231,14 @@ def _rows(places: list[int]) -> str:
 
 
 def export(found: Recovered, folder: Path) -> list[Path]:
-    """Write trials.csv, trials.json and a CSV file of each trajectory.
-
-    Raises:
-        InputError: if the folder cannot be written.
-    """
+    """Write trials.csv, trials.json and a CSV file of each trajectory."""
     try:
         (folder / "trajectories").mkdir(parents=True, exist_ok=True)
         paths = [folder / "trials.csv", folder / "trials.json"]
         _write_table(paths[0], found)
         trials = [asdict(trial) | {"unit_point": trial.unit_point.tolist()} for trial in found.trials.values()]
         content = describe({**found.about, "damaged": found.damaged, "trials": trials}, _DEPTH)
-        paths[1].write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
+        write_text(paths[1], json.dumps({"made_by": MADE_BY, **content}, indent=1, allow_nan=False))
         for (number, side), trajectory in found.trajectories.items():
             paths.append(folder / "trajectories" / f"{number}.{side}.csv")
             trajectory.to_csv(paths[-1])
@@ -260,7 +250,7 @@ def export(found: Recovered, folder: Path) -> list[Path]:
 def _write_table(path: Path, found: Recovered) -> None:
     rows = [_flat(trial) for trial in found.trials.values()]
     header = list(dict.fromkeys(name for row in rows for name in row))
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with written_whole(path, text=True) as file:
         writer = csv.writer(file)
         writer.writerow([_cell(name) for name in header])
         writer.writerows([_cell(row.get(name)) for name in header] for row in rows)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sqlite3
 import sys
 import zlib
 from collections.abc import Iterable
@@ -16,38 +15,16 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Origin, State, Trial
 from ctxval.errors import InputError
 
-COLUMNS = (
-    "number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds, note, because, "
-    "unmeasured"
-)
+COLUMNS = "number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds, note, because"
 """Columns of a trial, in the order that :func:`read_trial` takes."""
-
-
-CHECKED = 6
-"""The schema version from which on every row has a checksum; the migration to it writes the missing ones."""
-
-ENDED = "state = ?, distance = ?, failure = ?, executed = ?, unmeasured = ?"
-"""The assignments that take the values of :func:`ended_row`."""
-
-
-def ended_row(trial: Trial) -> tuple[Any, ...]:
-    """Return the values that say how a trial ended."""
-    state, unmeasured = _states(trial)
-    return (state, real(trial.distance), trial.failure, int(trial.executed), unmeasured)
-
-
-def _states(trial: Trial) -> tuple[str, int]:
-    # Tables of version 0.1.0 allow three states, so an unmeasured trial is stored as failed, with a mark.
-    return ("failed", 1) if trial.state == "unmeasured" else (trial.state, 0)
 
 
 def row_of(trial: Trial) -> tuple[Any, ...]:
     """Return a trial as the values of its columns."""
-    state, unmeasured = _states(trial)
     return (
-        *(trial.number, trial.origin, state, json.dumps(trial.unit_point.tolist())),
+        *(trial.number, trial.origin, trial.state, json.dumps(trial.unit_point.tolist())),
         *(json.dumps(trial.parameters), trial.attempts, int(trial.executed)),
-        *(real(trial.distance), trial.failure, real(trial.seconds), json.dumps(trial.note), trial.because, unmeasured),
+        *(real(trial.distance), trial.failure, real(trial.seconds), json.dumps(trial.note), trial.because),
     )
 
 
@@ -61,24 +38,10 @@ def checksum_of(row: tuple[Any, ...]) -> int:
     return zlib.crc32(repr(row).encode("utf-8", "backslashreplace"))
 
 
-def trial_checksum(row: tuple[Any, ...]) -> int:
-    """Return the checksum of a trial's row.
-
-    The last two columns are left out if they are empty, because older versions do not have them.
-    """
-    return checksum_of(row if any(row[-2:]) else row[:-2])
-
-
-def read_trial(row: tuple[Any, ...], checksum: Any, *, unchecked: bool = False) -> Trial | None:
-    """Return the trial of a row. Returns None if the row is damaged, or if its values are not those of a trial.
-
-    Args:
-        row: the values of the columns.
-        checksum: the stored checksum of the row.
-        unchecked: accept a row without a checksum, from a version of the store that had none.
-    """
-    number, origin, state, point, names, attempts, executed, distance, failure, seconds, note, because, unmeasured = row
-    if not (unchecked and checksum is None) and trial_checksum(row) != checksum:
+def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial | None:
+    """Return the trial of a row. Returns None if the row is damaged, or if its values are not those of a trial."""
+    number, origin, state, point, names, attempts, executed, distance, failure, seconds, note, because = row
+    if checksum_of(row) != checksum:
         return None
     try:
         unit_point, parameters, notes = read_json(point), read_json(names), read_json(note or "null", finite=False)
@@ -86,25 +49,20 @@ def read_trial(row: tuple[Any, ...], checksum: Any, *, unchecked: bool = False) 
         return None
     valid = (
         _count(number) and _count(attempts) and executed in (0, 1),
-        state in _STATES and origin in get_args(Origin),
+        state in get_args(State) and origin in get_args(Origin),
         _numbers(unit_point) and all(0 <= value <= 1 for value in unit_point),
         isinstance(parameters, dict) and all(_number(v) or _numbers(v) for v in parameters.values()),
         distance is None or (isinstance(distance, float) and 0 <= distance < np.inf),
         seconds is None or (isinstance(seconds, float) and 0 <= seconds < np.inf),
-        (state == "completed") == (distance is not None) and (state != "open" or not executed),
+        (state == "completed") == (distance is not None),
+        executed if state == "unmeasured" else state != "open" or not executed,
         isinstance(failure, str | None) and isinstance(notes, dict | None) and isinstance(because, str | None),
-        unmeasured in (None, 0) or (unmeasured == 1 and state == "failed" and executed),
     )
     if not all(valid):
         return None
-    ended: State = "unmeasured" if unmeasured else state
     where = np.array(unit_point, dtype=np.float64)
-    known = Trial(number, origin, ended, where, parameters, attempts, bool(executed), note=notes, because=because)
+    known = Trial(number, origin, state, where, parameters, attempts, bool(executed), note=notes, because=because)
     return replace(known, distance=distance, failure=failure, seconds=seconds)
-
-
-_STATES = ("open", "completed", "failed")
-"""The states of trials in the table."""
 
 
 def _count(value: Any) -> bool:
@@ -131,15 +89,7 @@ def follows(trial: Trial, earlier: list[Trial]) -> bool:
 
 
 def read_json(text: Any, *, finite: bool = True) -> Any:
-    """Return the value of a JSON text.
-
-    Args:
-        text: the text, as the database returns it.
-        finite: refuse NaN and infinity, which are not part of JSON.
-
-    Raises:
-        InputError: if the value is not a text, not JSON, or nested too deeply.
-    """
+    """Return the value of a JSON text."""
     if not isinstance(text, str):
         raise InputError(f"JSON must be text, got {type(text).__name__}.")
     try:
@@ -166,11 +116,7 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def read_pairs(rows: Iterable[tuple[Any, Any]]) -> dict[str, Any]:
-    """Return the rows of a table of keys and JSON values as a dictionary.
-
-    Raises:
-        InputError: if a key is not a text or occurs twice, or a value is not JSON.
-    """
+    """Return the rows of a table of keys and JSON values as a dictionary."""
     found: dict[str, Any] = {}
     for key, value in rows:
         if not isinstance(key, str) or key in found:
@@ -179,22 +125,11 @@ def read_pairs(rows: Iterable[tuple[Any, Any]]) -> dict[str, Any]:
     return found
 
 
-def read_trajectory(number: int, side: str, npz: Any, checksum: Any, *, unchecked: bool = False) -> Trajectory | None:
+def read_trajectory(number: int, side: str, npz: Any, checksum: Any) -> Trajectory | None:
     """Return the trajectory of a row. Returns None if it is damaged, or belongs to another trial or side."""
-    if not (unchecked and checksum is None) and checksum_of((number, side, npz)) != checksum:
+    if checksum_of((number, side, npz)) != checksum:
         return None
     try:
         return Trajectory.from_npz(npz) if isinstance(npz, bytes) else None
     except (InputError, TypeError, ValueError):
         return None
-
-
-def write_checksums(connection: sqlite3.Connection) -> None:
-    """Write the checksums of rows that a version without checksums stored."""
-    for row in connection.execute(f"SELECT {COLUMNS} FROM trials WHERE checksum IS NULL").fetchall():
-        connection.execute("UPDATE trials SET checksum = ? WHERE number = ?", (trial_checksum(row), row[0]))
-    missing = "SELECT rowid, trial, side FROM trajectories WHERE checksum IS NULL"
-    for place, number, side in connection.execute(missing).fetchall():
-        npz = connection.execute("SELECT npz FROM trajectories WHERE rowid = ?", (place,)).fetchone()[0]
-        checksum = checksum_of((number, side, npz))
-        connection.execute("UPDATE trajectories SET checksum = ? WHERE rowid = ?", (checksum, place))

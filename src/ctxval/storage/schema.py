@@ -12,12 +12,51 @@ import os
 import re
 import sqlite3
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from ctxval.errors import ForeignStoreError, StoreAccessError
+
+APPLICATION = 0x63747876
+"""SQLite's application_id of a store, the letters "ctxv"; it marks a file as a store of ctxval."""
+
+VERSION = 7
+"""SQLite's user_version of a store; it changes with :data:`TABLES`."""
+
+TABLES = """
+CREATE TABLE trials (
+    number INTEGER PRIMARY KEY,
+    origin TEXT NOT NULL,
+    state TEXT NOT NULL,
+    unit_point TEXT NOT NULL,
+    parameters TEXT NOT NULL,
+    attempts INTEGER NOT NULL,
+    executed INTEGER NOT NULL,
+    distance REAL,
+    failure TEXT,
+    seconds REAL,
+    note TEXT,
+    because TEXT,
+    checksum INTEGER NOT NULL,
+    opened_at TEXT NOT NULL,
+    closed_at TEXT
+);
+CREATE TABLE trajectories (
+    trial INTEGER NOT NULL REFERENCES trials (number),
+    side TEXT NOT NULL,
+    npz BLOB NOT NULL,
+    checksum INTEGER NOT NULL,
+    PRIMARY KEY (trial, side)
+);
+CREATE TABLE experiment (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE settings (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE history (
+    number INTEGER PRIMARY KEY, at TEXT NOT NULL, what TEXT NOT NULL, why TEXT NOT NULL, content TEXT NOT NULL
+);
+"""
+"""The statements that make the tables of a store, with which those of a file are compared."""
 
 _EVERY = 10_000
 """Instructions of SQLite between two checks of their number."""
@@ -74,12 +113,7 @@ class _Steps:
 
 
 def require_files(path: Path) -> None:
-    """Check that a store and the files that SQLite reads beside it are regular files, if they exist.
-
-    Raises:
-        StoreAccessError: if one of them is something else, such as a folder, a pipe or a device.
-        ForeignStoreError: if the journal names another file, which SQLite would delete.
-    """
+    """Check that a store and the files that SQLite reads beside it are regular files, if they exist."""
     require_file(path)
     real = os.path.realpath(path)
     for ending in _BESIDE:
@@ -94,11 +128,7 @@ def require_files(path: Path) -> None:
 
 
 def require_file(path: Path) -> None:
-    """Check that a path is a regular file or does not exist.
-
-    Raises:
-        StoreAccessError: if the path is something else, or cannot be examined.
-    """
+    """Check that a path is a regular file or does not exist."""
     try:
         mode = _mode(path)
     except (OSError, ValueError) as error:
@@ -154,42 +184,25 @@ def snapshot(connection: sqlite3.Connection) -> Iterator[None]:
             connection.execute("ROLLBACK")
 
 
-def version(connection: sqlite3.Connection, name: str, application: int, scripts: Sequence[str]) -> int:
-    """Return the version of a file's tables, after a check that the file has exactly the tables of a store.
-
-    Args:
-        connection: the connection to the file.
-        name: the name of the store in messages.
-        application: the application_id of stores.
-        scripts: the statements that bring a store from each version to the next; version 0 is an empty file.
-
-    Raises:
-        ForeignStoreError: if the file is not a store, or a store of a newer version.
-    """
+def is_new(connection: sqlite3.Connection, name: str) -> bool:
+    """Return whether a file is empty, after a check that it has exactly the tables of a store otherwise."""
     mark = connection.execute("PRAGMA application_id").fetchone()[0]
-    found = int(connection.execute("PRAGMA user_version").fetchone()[0])
-    if mark == application and found > len(scripts):
-        raise ForeignStoreError(
-            f"{name} has schema version {found} of a newer ctxval; this version reads up to {len(scripts)}."
-        )
-    differs = difference(connection, tuple(scripts[: max(found, 0)]))
-    if found == 0 and differs is None:
-        return 0
-    if mark != application:
+    version = int(connection.execute("PRAGMA user_version").fetchone()[0])
+    if version == 0 and difference(connection, "") is None:
+        return True
+    if mark != APPLICATION:
         raise ForeignStoreError(f"{name} is a database, but not a ctxval store.")
-    if differs is not None or found < 0:
-        what = f"its schema version is {found}" if found < 0 else differs
-        raise ForeignStoreError(f"{name} is not a ctxval store: {what}; `ctxval export` saves what is readable.")
-    return found
+    if version != VERSION:
+        age = "a newer" if version > VERSION else "an older"
+        raise ForeignStoreError(f"{name} has schema version {version} of {age} ctxval; this one reads only {VERSION}.")
+    differs = difference(connection, TABLES)
+    if differs is not None:
+        raise ForeignStoreError(f"{name} is not a ctxval store: {differs}; `ctxval export` saves what is readable.")
+    return False
 
 
 def plain_tables(connection: sqlite3.Connection, names: Iterable[str]) -> dict[str, set[str]]:
-    """Return the names of the columns of each table that can be read row by row without running anything in the file.
-
-    Args:
-        connection: the connection to the file.
-        names: the names of the tables to look for.
-    """
+    """Return the column names of each table that can be read row by row without running anything in the file."""
     wanted, found = set(names), {}
     for kind, name, _, definition in itertools.islice(connection.execute(_MASTER), _OBJECTS):
         if (
@@ -205,9 +218,9 @@ def plain_tables(connection: sqlite3.Connection, names: Iterable[str]) -> dict[s
     return found
 
 
-def difference(connection: sqlite3.Connection, scripts: tuple[str, ...]) -> str | None:
-    """Return how the tables of a file differ from those that these scripts make. Returns None if they agree."""
-    expected, found = _expected(scripts), {}
+def difference(connection: sqlite3.Connection, script: str) -> str | None:
+    """Return how the tables of a file differ from those that a script makes. Returns None if they agree."""
+    expected, found = _expected(script), {}
     for place, (kind, name, table, definition) in enumerate(connection.execute(_MASTER)):
         if place == _OBJECTS:
             return f"it has more than {_OBJECTS} tables"
@@ -228,11 +241,10 @@ def _article(kind: object) -> str:
 
 
 @functools.cache
-def _expected(scripts: tuple[str, ...]) -> dict[tuple[str, str], tuple[str, str]]:
+def _expected(script: str) -> dict[tuple[str, str], tuple[str, str]]:
     connection = sqlite3.connect(":memory:", isolation_level=None)
     try:
-        for script in scripts:
-            connection.executescript(script)
+        connection.executescript(script)
         rows = connection.execute(_MASTER).fetchall()
     finally:
         connection.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 from collections.abc import Iterable, Sequence
@@ -9,27 +10,24 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+from ctxval._util.checked import checked
 from ctxval._util.representation import Shown, call
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Change, Trial
 from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
 from ctxval.storage import rows, schema
 from ctxval.storage.database import Database, now
-from ctxval.storage.rows import (
-    COLUMNS,
-    ENDED,
-    ended_row,
-    read_trial,
-    real,
-    row_of,
-    trial_checksum,
-)
+from ctxval.storage.rows import COLUMNS, checksum_of, read_trial, real, row_of
 from ctxval.storage.trajectories import Side, StoredTrajectories
 
 _DRAWS = "draws"
 """Key in the table experiment that is not part of the description of the experiment."""
 
+_ENDED = "state = ?, distance = ?, failure = ?, executed = ?, checksum = ?"
+"""The assignments that take the values of :func:`_ended`."""
 
+
+@checked
 class Store:
     """A file with the trials of one experiment.
 
@@ -40,7 +38,7 @@ class Store:
 
     Raises:
         StoreAccessError: if the file cannot be opened or written.
-        ForeignStoreError: if the file is not a store, or a store of a newer version.
+        ForeignStoreError: if the file is not a store, or a store of another version.
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
@@ -66,7 +64,7 @@ class Store:
 
         Raises:
             StoreAccessError: if there is no such file, or it cannot be read.
-            ForeignStoreError: if the file is not a store, or a store of a newer version.
+            ForeignStoreError: if the file is not a store, or a store of another version.
         """
         schema.require_files(Path(path))
         if not os.path.exists(path):
@@ -92,6 +90,10 @@ class Store:
         """
         return self._database.sole_writer(wait)
 
+    def snapshot(self) -> AbstractContextManager[None]:
+        """Make all reads inside see the store at one moment. Keep them short: other processes wait to write."""
+        return self._database.snapshot()
+
     # The experiment
 
     def describe_first(self, description: dict[str, Any]) -> dict[str, Any]:
@@ -99,7 +101,7 @@ class Store:
         with self._database.transaction():
             if not self.description():
                 self._write_description(description)
-        return self.description()
+            return self.description()
 
     def describe_anew(self, description: dict[str, Any], change: Change) -> None:
         """Replace the description of the experiment, and record in the history what has changed and why."""
@@ -184,23 +186,13 @@ class Store:
             if self.signature() != seen:
                 return False
             for trial in trials:
-                self._database.execute(
-                    f"UPDATE trials SET {ENDED}, checksum = ? WHERE number = ?",
-                    (*ended_row(trial), trial_checksum(row_of(trial)), trial.number),
-                )
+                self._database.execute(f"UPDATE trials SET {_ENDED} WHERE number = ?", (*_ended(trial), trial.number))
             self._write_description(description)
             self._insert_change(change)
         return True
 
     def _require_unchanged(self, changes: int | None) -> None:
-        """Check that the experiment of the store has not changed since a campaign opened it.
-
-        Args:
-            changes: the number of changes that the campaign knows; None skips the check.
-
-        Raises:
-            StoreMismatchError: if the store has another number of changes.
-        """
+        """Check that the experiment of the store has not changed since a campaign opened it."""
         if changes is not None and self.signature()[2] != changes:
             raise StoreMismatchError(
                 f"{self.name} has changed since the campaign was opened, by remeasure or by accept_change; open the "
@@ -223,20 +215,16 @@ class Store:
             self._insert(trial)
 
     def record_known(
-        self,
-        trial: Trial,
-        model_trajectory: Trajectory,
-        system_trajectory: Trajectory | None,
-        *,
-        changes: int | None = None,
+        self, ended: Iterable[tuple[Trial, Trajectory, Trajectory | None]], *, changes: int | None = None
     ) -> None:
-        """Store a new trial that has ended already, in one transaction."""
+        """Store new trials that have ended already, with the trajectories of model and system, in one transaction."""
         with self._database.transaction():
             self._require_unchanged(changes)
-            self._insert(trial)
-            self._write_trajectory(trial.number, "model", model_trajectory)
-            if system_trajectory is not None:
-                self._write_trajectory(trial.number, "system", system_trajectory)
+            for trial, model_trajectory, system_trajectory in ended:
+                self._insert(trial)
+                self._write_trajectory(trial.number, "model", model_trajectory)
+                if system_trajectory is not None:
+                    self._write_trajectory(trial.number, "system", system_trajectory)
 
     def _insert(self, trial: Trial) -> None:
         row = row_of(trial)
@@ -244,7 +232,7 @@ class Store:
         places = ", ".join("?" * (len(row) + 3))
         self._database.execute(
             f"INSERT INTO trials ({COLUMNS}, checksum, opened_at, closed_at) VALUES ({places})",
-            (*row, trial_checksum(row), now(), closed_at),
+            (*row, checksum_of(row), now(), closed_at),
         )
 
     def begin_attempt(self, trial: Trial, *, changes: int | None = None) -> None:
@@ -262,7 +250,7 @@ class Store:
             self._require_unchanged(changes)
             changed = self._database.execute(
                 "UPDATE trials SET attempts = ?, checksum = ? WHERE number = ? AND state = 'open'",
-                (trial.attempts, trial_checksum(row_of(trial)), trial.number),
+                (trial.attempts, checksum_of(row_of(trial)), trial.number),
             ).rowcount
             if changed != 1:
                 raise self._not_open(trial.number)
@@ -277,17 +265,36 @@ class Store:
         with self._database.transaction():
             self._require_unchanged(changes)
             changed = self._database.execute(
-                f"UPDATE trials SET {ENDED}, seconds = ?, closed_at = ?, checksum = ? "
+                f"UPDATE trials SET {_ENDED}, seconds = ?, closed_at = ? "
                 "WHERE number = ? AND state = 'open' AND attempts = ?",
-                (
-                    *(*ended_row(trial), real(trial.seconds), now(), trial_checksum(row_of(trial))),
-                    *(trial.number, trial.attempts),
-                ),
+                (*_ended(trial), real(trial.seconds), now(), trial.number, trial.attempts),
             ).rowcount
             if changed != 1:
                 raise self._not_open(trial.number)
             if system_trajectory is not None:
                 self._write_trajectory(trial.number, "system", system_trajectory)
+
+    def replace_result(
+        self, before: Trial, after: Trial, trajectory: Trajectory | None, why: str, *, changes: int | None = None
+    ) -> None:
+        """Replace the result of a trial; the history keeps the earlier one, with its trajectory as NPZ in base 64.
+
+        Raises:
+            StoreMismatchError: if the store has another number of changes than ``changes``.
+        """
+        executed = self.trajectory(before.number, "system")
+        npz = None if executed is None else base64.b64encode(executed.to_npz()).decode()
+        result = {"state": before.state, "distance": before.distance, "failure": before.failure, "npz": npz}
+        with self._database.transaction():
+            self._require_unchanged(changes)
+            self._database.execute(
+                f"UPDATE trials SET {_ENDED}, closed_at = ? WHERE number = ?",
+                (*_ended(after), now(), after.number),
+            )
+            self._trajectories.remove(after.number, "system")
+            if trajectory is not None:
+                self._write_trajectory(after.number, "system", trajectory)
+            self._insert_change(Change("replaced", why, {"before": {str(before.number): result}}))
 
     def _not_open(self, number: int) -> InputError:
         row = self._database.execute("SELECT state FROM trials WHERE number = ?", (number,)).fetchone()
@@ -355,3 +362,7 @@ class Store:
         except CtxvalError:
             return call(self, place, Shown("cannot be read"))
         return call(self, place, trials=trials, open=waiting)
+
+
+def _ended(trial: Trial) -> tuple[Any, ...]:
+    return (trial.state, real(trial.distance), trial.failure, int(trial.executed), checksum_of(row_of(trial)))

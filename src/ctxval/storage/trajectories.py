@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Literal
 
-from ctxval._util.representation import call
 from ctxval.core.trajectory import Trajectory
 from ctxval.storage.database import Database
 from ctxval.storage.rows import checksum_of, read_trajectory
@@ -35,11 +34,7 @@ class StoredTrajectories:
         self._version: int | None = None
 
     def read(self, numbers: Iterable[int], side: Side) -> dict[int, Trajectory]:
-        """Return the stored trajectories of trials by the trials' numbers; a trial without one is left out.
-
-        Raises:
-            ForeignStoreError: if a trajectory is damaged.
-        """
+        """Return the stored trajectories of trials by the trials' numbers; a trial without one is left out."""
         if side == "model":
             found = ((number, self._read(number, side)) for number in numbers)
             return {number: one[1] for number, one in found if one is not None}
@@ -55,6 +50,12 @@ class StoredTrajectories:
             "INSERT INTO trajectories (trial, side, npz, checksum) VALUES (?, ?, ?, ?)",
             (number, side, npz, checksum_of((number, side, npz))),
         )
+
+    def remove(self, number: int, side: Side) -> None:
+        """Remove a trajectory of a trial, if there is one. Call this inside a transaction."""
+        self._database.execute("DELETE FROM trajectories WHERE trial = ? AND side = ?", (number, side))
+        if number in self._kept:
+            self._left += _size(self._kept.pop(number)[1])
 
     def _of_system(self, number: int) -> Trajectory | None:
         """Return the trajectory of the system in a trial, from memory if it is there."""
@@ -80,7 +81,7 @@ class StoredTrajectories:
 
     def _forget_changed(self) -> None:
         """Forget what another connection may have changed in the file."""
-        with self._database.translated_errors():
+        with self._database.snapshot():
             version = self._database.execute("PRAGMA data_version").fetchone()[0]
             if version == self._version:
                 return
@@ -94,7 +95,7 @@ class StoredTrajectories:
     def _read(self, number: int, side: Side) -> tuple[int, Trajectory] | None:
         """Return the checksum and the trajectory of a row. Returns None if there is none."""
         where = "FROM trajectories {} WHERE trial = ? AND side = ?"
-        with self._database.translated_errors():
+        with self._database.snapshot():
             row = self._database.execute(f"SELECT npz, checksum {where.format('')}", (number, side)).fetchone()
             # A damaged index may hide a row. The search without the index is slower, so it runs only if none is found.
             hidden = (
@@ -107,9 +108,6 @@ class StoredTrajectories:
         if found is None:
             raise self._database.damaged(f"the {side}'s trajectory of its trial {number} cannot be read")
         return int(row[1]), found
-
-    def __repr__(self) -> str:
-        return call(self, self._database.name, in_memory=len(self._kept))
 
 
 def _size(trajectory: Trajectory) -> int:

@@ -30,9 +30,6 @@ def run_episode(advance: Advance, controller: Controller, task: Task, inputs: in
         controller: the controller for this task.
         task: one task, not a batch.
         inputs: the number of inputs m.
-
-    Raises:
-        ShapeError: if the controller returns another number of inputs.
     """
     x = np.array(task.initial_state)
     states, applied = np.full((task.horizon + 1, len(x)), np.nan), np.full((task.horizon, inputs), np.nan)
@@ -56,32 +53,19 @@ def run_episode(advance: Advance, controller: Controller, task: Task, inputs: in
 
 
 def require_one(task: Task) -> None:
-    """Check that a task is one task, not a batch.
-
-    Raises:
-        ShapeError: if the task is a batch.
-    """
+    """Check that a task is one task, not a batch."""
     if task.batch_shape:
         raise ShapeError(f"this system executes one task at a time, got a batch of shape {task.batch_shape}.")
 
 
 def require_time_step(task: Task, dt: float, what: str) -> None:
-    """Check that a task has the system's time step.
-
-    Raises:
-        InputError: if the time step differs; the message gives the system's.
-    """
+    """Check that a task has the system's time step."""
     if not np.isclose(task.dt, dt, rtol=1e-9, atol=0):
         raise InputError(f"the task's dt must be {what}, {dt:g} s, got {task.dt:g} s.")
 
 
 def require_started(task: Task, state: Array) -> None:
-    """Check that a system is in the task's initial state.
-
-    Raises:
-        ShapeError: if the number of states differs.
-        InputError: if the system is in another state.
-    """
+    """Check that a system is in the task's initial state."""
     wanted = task.initial_state
     if state.shape != wanted.shape:
         raise ShapeError(f"the task must have the system's {state.size} states, got {wanted.size}.")

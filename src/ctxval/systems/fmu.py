@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.checked import Seconds
 from ctxval._util.files import require_regular_file
 from ctxval._util.registry import part
 from ctxval._util.representation import call, options
@@ -61,14 +62,12 @@ class FMU:
         inputs: Sequence[str],
         start: Mapping[str, str] | None = None,
         parameters: Mapping[str, float | int | bool | str] | None = None,
-        step: float | None = None,
+        step: Seconds | None = None,
     ) -> None:
         self.path = Path(path).absolute()
         self.states, self.inputs = _names("states", states), _names("inputs", inputs)
         self.start = {name: name for name in self.states} | dict(start or {})
         self.parameters = dict(parameters or {})
-        if step is not None and not (np.isfinite(step) and step > 0):
-            raise InputError(f"step must be a positive number of seconds, got {step!r}.")
         self.step = step
         self._open()
 
@@ -198,11 +197,7 @@ class _Process:
             self._process.stdin.flush()
 
     def ask(self, act: str, *arguments: Any) -> Any:
-        """Send one request; return the value of its answer.
-
-        Raises:
-            InputError, ExecutionError: if the FMU refuses the request or crashes.
-        """
+        """Send one request; return the value of its answer."""
         assert self._process.stdout is not None
         self._send([act, *arguments])
         line = self._process.stdout.readline()

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, as_floats
+from ctxval._util.checked import NonNegativeInt, Seconds
 from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
@@ -57,8 +58,8 @@ class Gymnasium:
         *,
         get_state: StateGetter | None = None,
         set_state: StateSetter | None = None,
-        dt: float | None = None,
-        seed: int | None = 0,
+        dt: Seconds | None = None,
+        seed: NonNegativeInt | None = 0,
         ignore_termination: bool = False,
         **options: Any,
     ) -> None:

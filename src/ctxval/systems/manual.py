@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NoReturn
 
-import numpy as np
-
+from ctxval._util.checked import Seconds
 from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
+from ctxval.core.labels import require_names
 from ctxval.core.task import Task
 from ctxval.errors import ExecutionError, InputError
 
@@ -23,20 +23,19 @@ class Manual:
         dt: length of a step, seconds.
 
     Raises:
-        InputError: if there is no state, a name or a unit is not a text, or dt is not positive.
+        InputError: if there is no state, or a name or a unit is not a text.
     """
 
     manual = True
     """Mark of a system that a program cannot execute."""
 
-    def __init__(self, *, states: Mapping[str, str], inputs: Mapping[str, str], dt: float) -> None:
+    def __init__(self, *, states: Mapping[str, str], inputs: Mapping[str, str], dt: Seconds) -> None:
         self.states, self.inputs = dict(states), dict(inputs)
         if not self.states or not all(
             isinstance(t, str) for d in (self.states, self.inputs) for t in (*d, *d.values())
         ):
             raise InputError(f"states and inputs must be names with units, got {self.states} and {self.inputs}.")
-        if not isinstance(dt, int | float | np.number) or isinstance(dt, bool) or not (np.isfinite(dt) and dt > 0):
-            raise InputError(f"dt must be a positive number of seconds, got {dt!r}.")
+        require_names(self.states, self.inputs)
         self.dt = float(dt)
 
     def execute(self, controller: Controller, task: Task) -> NoReturn:

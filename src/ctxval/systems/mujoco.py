@@ -8,8 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, positive_count, require_shape
-from ctxval._util.mjcf import compile_mjcf, identity_of_mjcf
+from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
+from ctxval._util.checked import PositiveInt
+from ctxval._util.mjcf import compile_mjcf
 from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval.core.controller import Controller
@@ -52,14 +53,14 @@ class MuJoCo:
         self,
         mjcf: str | Path,
         *,
-        substeps: int = 1,
+        substeps: PositiveInt = 1,
         sites: str | Sequence[str] = (),
         axes: str = "xy",
-        threads: int = 1,
+        threads: PositiveInt = 1,
     ) -> None:
-        self._mjcf, self._model = compile_mjcf(mjcf)
-        self.substeps = positive_count("substeps must be a positive integer", substeps)
-        self.threads = positive_count("threads must be a positive integer", threads)
+        self._digest, self._model = compile_mjcf(mjcf)
+        self.substeps = substeps
+        self.threads = threads
         self.sites = (sites,) if isinstance(sites, str) else tuple(sites)
         self.axes = axes
         self._coordinates = _coordinates(self._model, self.sites, axes)
@@ -71,8 +72,7 @@ class MuJoCo:
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this system in a store."""
-        known = identity_of_mjcf(self._mjcf, self._model)
-        return {**known, "substeps": self.substeps, "sites": self.sites, "axes": self.axes}
+        return {"mjcf": self._digest, "substeps": self.substeps, "sites": self.sites, "axes": self.axes}
 
     def state(self, qpos: ArrayLike, qvel: ArrayLike | None = None) -> Array:
         """Return the complete states for configurations and velocities.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import shlex
 import shutil
@@ -14,11 +15,13 @@ from typing import IO
 
 import numpy as np
 
+from ctxval._util.checked import TimeLimit
 from ctxval._util.registry import part
 from ctxval._util.representation import call
 from ctxval._util.temporary import temporary_folder
 from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
+from ctxval.core.labels import require_names
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import CtxvalError, ExecutionError, InputError
@@ -55,14 +58,14 @@ class Subprocess:
             there, the current folder is used.
 
     Raises:
-        InputError: if the program does not exist, or the timeout is not positive.
+        InputError: if the program does not exist.
     """
 
     def __init__(
         self,
         command: str | Sequence[str],
         *,
-        timeout: float,
+        timeout: TimeLimit,
         states: Mapping[str, str] | None = None,
         inputs: Mapping[str, str] | None = None,
         keep: str | Path | None = None,
@@ -72,18 +75,23 @@ class Subprocess:
         self._located = self.command if folder is None else _located(self.command, Path(folder).absolute())
         if not self.command or shutil.which(self._located[0]) is None:
             raise InputError(f"the command must begin with a program that can be run, got {self.command}.")
-        if not (isinstance(timeout, int | float) and timeout > 0):
-            raise InputError(f"timeout must be a positive number of seconds, got {timeout!r}.")
         self.timeout = timeout
         self.states = None if states is None else dict(states)
         self.inputs = None if inputs is None else dict(inputs)
+        require_names(states or (), inputs or ())
         # Absolute, because other code in this process may change the current folder.
         self.keep = None if keep is None else Path(keep).absolute()
         self._home = Path.cwd()
 
     def describe(self) -> dict[str, object]:
-        """Return what identifies this system in a store."""
-        return {"command": self.command, "states": self.states, "inputs": self.inputs}
+        """Return what identifies this system in a store: its program, and digests of the files that the command names.
+
+        Other arguments are left out, because they may be secrets.
+        """
+        named = [*self._located[1:], *(self._located[:1] if not os.path.isabs(self.command[0]) else [])]
+        files = {Path(name).name: Path(name).read_bytes() for name in named if os.path.isfile(name)}
+        digests = {name: hashlib.sha256(content).hexdigest()[:16] for name, content in files.items()}
+        return {"program": Path(self.command[0]).name, "files": digests, "states": self.states, "inputs": self.inputs}
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Run the command on one task.
@@ -163,11 +171,7 @@ def _trajectory(folder: Path, task: Task) -> Trajectory:
 
 
 def _of_task(trajectory: Trajectory, task: Task) -> Trajectory:
-    """Return a trajectory after a check that it has the shape and the times of this task.
-
-    Raises:
-        ExecutionError: if the trajectory is complete and its shape or its times differ.
-    """
+    """Return a trajectory after a check that it has the shape and the times of this task."""
     if trajectory.ended != COMPLETE:
         return trajectory
     n = task.initial_state.size

@@ -32,17 +32,8 @@ def run_supervised(
 ) -> int | None:
     """Run a command, and end all processes that it started, however this call ends.
 
-    Args:
-        command: the program and its arguments.
-        folder: the folder in which the command runs; None for the current folder.
-        stdout, stderr: open files for the output of the command.
-        timeout: seconds after which the command is killed.
-
     Returns:
         The exit status, negative for a signal; None if the command did not end in time and was killed.
-
-    Raises:
-        ExecutionError: if the command cannot be started, or its supervisor was killed.
     """
     if os.name != "posix":
         return _run_alone(command, folder, stdout, stderr, timeout)

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from importlib.resources import files as resources
 from typing import Any
 
-import python_multipart  # noqa: F401 (starlette reads forms with it, and would miss it only then)
+from python_multipart.exceptions import FormParserError
 from starlette.applications import Starlette
 from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
@@ -89,7 +89,7 @@ class OperatorPage:
 
     async def enter(self, request: Request) -> Response:
         """Take the token from the form of the entrance."""
-        async with request.form(max_files=0, max_fields=4) as form:
+        async with _form(request, max_files=0, max_fields=4) as form:
             return await self._enter(_texts(form).get("token", "").strip())
 
     async def _enter(self, token: str) -> Response:
@@ -135,7 +135,7 @@ class OperatorPage:
 
     async def choose(self, request: Request, session: str) -> Response:
         """Start to choose a task."""
-        async with request.form(max_files=0, max_fields=1_000, max_part_size=4096) as form:
+        async with _form(request, max_files=0, max_fields=1_000, max_part_size=4096) as form:
             fields = _texts(form)
         if not self.access.allows_form(session, fields.get("token", "")):
             return self._problem(request, session, Problem("choose", _OUT_OF_DATE, fields, 403))
@@ -156,7 +156,7 @@ class OperatorPage:
         fields: dict[str, str] = {}
         where = self._where(number, kind)
         try:
-            async with request.form(max_files=1, max_fields=20, max_part_size=65_536) as form:
+            async with _form(request, max_files=1, max_fields=20, max_part_size=65_536) as form:
                 fields = _texts(form)
                 if not self.access.allows_form(session, fields.get("token", "")):
                     return self._problem(request, session, Problem(where, _OUT_OF_DATE, fields, 403))
@@ -273,6 +273,16 @@ def _plain(work: Work) -> dict[str, Any]:
     return {"text": work.text, "done": work.stage.done, "expected": work.stage.expected, "seconds": work.seconds}
 
 
+@contextlib.asynccontextmanager
+async def _form(request: Request, **limits: int) -> AsyncIterator[FormData]:
+    """Yield the form of a request; not every version of starlette refuses a damaged one."""
+    try:
+        async with request.form(**limits) as form:
+            yield form
+    except FormParserError as error:
+        raise HTTPException(400, "it is damaged") from error
+
+
 def _texts(form: FormData) -> dict[str, str]:
     return {name: value for name, value in form.items() if isinstance(value, str)}
 
@@ -295,14 +305,7 @@ async def static(request: Request) -> Response:
 
 
 def application(service: CampaignService, access: Access, hosts: Hosts, most: int = MOST_UPLOAD) -> Guard:
-    """Return the ASGI application of a campaign.
-
-    Args:
-        service: the campaign.
-        access: who may use the page.
-        hosts: the names of the server.
-        most: largest size of a request's body in bytes.
-    """
+    """Return the ASGI application of a campaign."""
 
     @contextlib.asynccontextmanager
     async def running(app: Starlette) -> AsyncIterator[None]:
@@ -312,4 +315,4 @@ def application(service: CampaignService, access: Access, hosts: Hosts, most: in
         finally:
             await service.stop()
 
-    return Guard(Starlette(routes=OperatorPage(service, access).routes(), lifespan=running), hosts, most)
+    return Guard(Starlette(routes=OperatorPage(service, access).routes(), lifespan=running), hosts, access, most)

@@ -16,7 +16,6 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from ctxval._util.progress import Progress, listening
-from ctxval._util.representation import call
 from ctxval._util.texts import reason_of
 from ctxval.errors import CampaignError, CtxvalError
 from ctxval.web.served import OpenCampaign, ServedCampaign
@@ -111,9 +110,6 @@ class BackgroundProcess:
             if kind == "failed":
                 raise CampaignError(content)
             self._on_stage(content)
-
-    def __repr__(self) -> str:
-        return call(self, alive=self._process is not None and self._process.is_alive())
 
 
 def _kill(process: int) -> None:

@@ -11,7 +11,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from ctxval._util.representation import call
 from ctxval._util.texts import reason_of
 from ctxval.campaign.telling import ToldResult, tell_result
 from ctxval.campaign.until_decided import require_decisive
@@ -117,11 +116,7 @@ class Desk:
             raise
 
     async def snapshot(self) -> Snapshot:
-        """Return the present state of the store.
-
-        Raises:
-            StoreError: if the store cannot be read any more, or belongs to another experiment.
-        """
+        """Return the present state of the store."""
         return await self._in_thread(self._snapshot)
 
     async def signature(self) -> tuple[int, int, int]:
@@ -129,12 +124,7 @@ class Desk:
         return await self._in_thread(lambda: self._served.campaign.store.signature())
 
     async def tell(self, number: int, told: ToldResult) -> Trial:
-        """Check and store the result of an open trial; return the trial, which may be unmeasured.
-
-        Raises:
-            InputError, ExecutionError, StoreError: as in :meth:`ctxval.Campaign.tell`.
-            CampaignError: if users' code fails.
-        """
+        """Check and store the result of an open trial; return the trial, which may be unmeasured."""
         return await self._in_thread(lambda: self._tell(number, told))
 
     def close(self) -> None:
@@ -182,7 +172,7 @@ class Desk:
 
     def _task(self, trial: Trial) -> OpenTask:
         validation = self._served.campaign.validation
-        task: Task = validation.task(validation.space.parameters(validation.space.from_unit(trial.unit_point)))
+        task: Task = validation.task(validation.space.parameters(validation.space.point(trial.parameters)))
         start = np.atleast_1d(task.initial_state)
         states, _ = self._served.experiment.names(start.size, 0)
         return OpenTask(tuple(zip(labels_of(states), start.tolist(), strict=True)), task.horizon, task.dt)
@@ -196,9 +186,6 @@ class Desk:
             if ended.state != "unmeasured":
                 raise
             return ended
-
-    def __repr__(self) -> str:
-        return call(self, self._served.campaign.store)
 
 
 def _guarded(function: Callable[[], Result]) -> Callable[[], Result]:
@@ -216,12 +203,7 @@ def _guarded(function: Callable[[], Result]) -> Callable[[], Result]:
 
 
 def recording_in(folder: str, name: str) -> Path:
-    """Return the path for an uploaded recording: its own name without anything that is not plain.
-
-    Args:
-        folder: a temporary folder.
-        name: the name of the file in the operator's browser.
-    """
+    """Return the path for an uploaded recording: its own name without anything that is not plain."""
     base = name.replace("\\", "/").rpartition("/")[2]
     plain = "".join(letter if letter.isalnum() or letter in "._- " else "_" for letter in base)[-80:].lstrip(".")
     return Path(folder) / (plain or "recording.csv")

@@ -9,7 +9,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from ctxval.campaign.telling import ToldResult, require_tolerance
+from ctxval._util.checked import NonNegativeFloat, require
+from ctxval.campaign.telling import ToldResult
 from ctxval.core.space import TaskSpace
 from ctxval.errors import InputError
 from ctxval.web.jobs import TaskRequest
@@ -21,15 +22,7 @@ Fields = Mapping[str, str]
 
 
 def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
-    """Return what an operator asks for.
-
-    Args:
-        fields: ``how`` is next, decides, draw, own or again; ``seen`` is the number of trials on the operator's page.
-        space: the task space.
-
-    Raises:
-        InputError: if a field is missing or cannot be used.
-    """
+    """Return what an operator asks for."""
     seen = _whole(fields, "seen", "the number of trials on the page")
     match fields.get("how"):
         case "next":
@@ -51,16 +44,7 @@ def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
 
 
 def result(kind: str, fields: Fields, recording: Path | None) -> ToldResult:
-    """Return what an operator reports of a trial.
-
-    Args:
-        kind: recording, distance or failure.
-        fields: the fields of the form.
-        recording: the uploaded file; None if there is none.
-
-    Raises:
-        InputError: if a field is missing or cannot be used.
-    """
+    """Return what an operator reports of a trial."""
     if kind == "failure":
         reason = fields.get("reason", "").strip()
         if not reason:
@@ -71,8 +55,8 @@ def result(kind: str, fields: Fields, recording: Path | None) -> ToldResult:
     if recording is None:
         raise InputError("choose the file of the recording.")
     tolerance = _number(fields, "tolerance", "the start tolerance") if fields.get("tolerance", "").strip() else None
-    require_tolerance(tolerance, "the start tolerance")
-    return ToldResult(recording, resample="resample" in fields, start_tolerance=tolerance)
+    require("the start tolerance", NonNegativeFloat | None, tolerance)
+    return ToldResult(recording, resample="resample" in fields, start_tolerance=tolerance, uploaded=True)
 
 
 def _number(fields: Fields, field: str, name: str) -> float:

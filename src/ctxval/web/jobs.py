@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ctxval._util.representation import record
 from ctxval._util.texts import reason_of
 from ctxval.campaign.by_hand import write_files
 from ctxval.campaign.choices import OpenTrial
@@ -56,9 +55,6 @@ class TaskRequest:
     trials: int | None = None
     decides: bool = False
 
-    def __repr__(self) -> str:
-        return record(self)
-
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
@@ -101,13 +97,7 @@ def warm_up(served: ServedCampaign, tell: TellStage) -> None:
 
 
 def choose(served: ServedCampaign, tell: TellStage, request: TaskRequest) -> tuple[int, Files]:
-    """Open the next trial; return its number and its files.
-
-    Raises:
-        InputError: if the request cannot be met, or another trial was opened since the operator looked.
-        StoreAccessError: if another process is running the store.
-        ModelError, DesignError: as in :meth:`ctxval.Campaign.ask`.
-    """
+    """Open the next trial; return its number and its files."""
     tell(Stage("choosing a task"))
     opened = _ask(served, request)
     return opened.number, _files(served, opened)
@@ -146,12 +136,7 @@ def _ask_until_decided(served: ServedCampaign) -> OpenTrial:
 
 
 def files_of(served: ServedCampaign, tell: TellStage, number: int) -> Files:
-    """Return the files of an open trial.
-
-    Raises:
-        InputError: if the trial is not open.
-        ModelError, DesignError: if its controller cannot be designed.
-    """
+    """Return the files of an open trial."""
     tell(Stage(f"preparing the files of trial {number}"))
     return _files(served, served.campaign.reopen(number))
 

@@ -10,7 +10,6 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from ctxval._util.representation import record
 from ctxval.campaign.telling import result_sentence
 from ctxval.core.trial import Trial
 from ctxval.web.desk import Snapshot
@@ -41,9 +40,6 @@ class Problem:
     sentence: str
     fields: Mapping[str, str] = field(default_factory=dict)
     status: int = 422
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,14 +88,7 @@ class Page:
         self._templates.filters["text"] = text
 
     def campaign(self, form_token: str, *, problem: Problem | None = None, told: int | None = None, all_: bool) -> str:
-        """Return the page of the campaign.
-
-        Args:
-            form_token: the token that each form contains.
-            problem: why a form was not accepted; None if there is no problem.
-            told: the number of a trial whose result was recorded just now.
-            all_: whether the table has all trials.
-        """
+        """Return the page of the campaign."""
         service = self._service
         snapshot, background, description = service.snapshot, service.background, service.description
         opened = [self._open_view(trial, snapshot) for trial in snapshot.waiting]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import ipaddress
 import socket
 from collections.abc import Iterable
@@ -10,13 +12,20 @@ from html import escape
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect, HTTPConnection
 from starlette.responses import HTMLResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ctxval._util.representation import call, record
+from ctxval.web.access import Access
 
 MOST_UPLOAD = 64 * 2**20
-"""Largest size of a request in bytes: a recording, or a form."""
+"""Largest size of a recording in bytes."""
+
+_MOST_FORM, _MOST_OF_STRANGER = 2**18, 2**12
+"""Largest size of any other form in bytes, and of a request without a session."""
+
+_SECONDS = 30.0
+"""Largest time in seconds without a further part of a body."""
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; form-action 'self'; "
@@ -59,12 +68,7 @@ class Hosts:
 
     @staticmethod
     def of(host: str, more: Iterable[str] = ()) -> Hosts:
-        """Return the permitted names of a server.
-
-        Args:
-            host: the address that the server listens at.
-            more: further names, for example that of a proxy.
-        """
+        """Return the permitted names of a server."""
         names = {"localhost", "127.0.0.1", "::1", host.lower(), *(name.lower() for name in more)}
         local = is_loopback(host)
         if not local:
@@ -80,9 +84,6 @@ class Hosts:
             return False
         name = None if "@" in place.netloc else place.hostname
         return bool(name) and (name in self.names or (self.any_address and is_address(str(name))))
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 def is_address(host: str) -> bool:
@@ -100,13 +101,7 @@ def is_loopback(host: str) -> bool:
 
 
 def refusal(method: str, headers: Headers, hosts: Hosts) -> str | None:
-    """Return why a request is refused, in one sentence; None if it is not.
-
-    Args:
-        method: the method of HTTP.
-        headers: the headers of the request.
-        hosts: the names of this server.
-    """
+    """Return why a request is refused, in one sentence; None if it is not."""
     host = headers.get("host")
     if not hosts.permit(host):
         return (
@@ -126,8 +121,40 @@ def refusal(method: str, headers: Headers, hosts: Hosts) -> str | None:
     return None
 
 
-class _TooLargeError(Exception):
-    """A body has more bytes than permitted."""
+class _Body:
+    """Receives a body of a limited size, of which parts arrive in limited time.
+
+    Args:
+        receive: receives the next part.
+        most: largest size in bytes.
+
+    Attributes:
+        refused: the status and the sentence of the response, if the body has more bytes or takes too long.
+    """
+
+    def __init__(self, receive: Receive, most: int) -> None:
+        self.receive, self.most = receive, most
+        self.size, self.whole = 0, False
+        self.refused: tuple[int, str] | None = None
+
+    def require(self, size: int) -> None:
+        if size > self.most:
+            mega = self.most >= 2**20
+            limit = f"{self.most / 2**20:g} MiB" if mega else f"{self.most / 2**10:g} KiB"
+            self.refused = 413, f"This is too large: at most {limit} are accepted here. Nothing is stored."
+            raise ClientDisconnect
+
+    async def __call__(self) -> Message:
+        try:
+            async with asyncio.timeout(None if self.whole else _SECONDS):
+                message = await self.receive()
+        except TimeoutError:
+            self.refused = 408, "The request arrives too slowly. Nothing is stored."
+            raise ClientDisconnect from None
+        self.size += len(message.get("body", b""))
+        self.whole = self.whole or not message.get("more_body", False)
+        self.require(self.size)
+        return message
 
 
 class Guard:
@@ -136,11 +163,12 @@ class Guard:
     Args:
         app: the application.
         hosts: the names of this server.
-        most: largest size of a request's body in bytes. It is counted as the body arrives.
+        access: who may use the page.
+        most: largest size of a recording in bytes. It is counted as the body arrives.
     """
 
-    def __init__(self, app: ASGIApp, hosts: Hosts, most: int = MOST_UPLOAD) -> None:
-        self.app, self.hosts, self.most = app, hosts, most
+    def __init__(self, app: ASGIApp, hosts: Hosts, access: Access, most: int = MOST_UPLOAD) -> None:
+        self.app, self.hosts, self.access, self.most = app, hosts, access, most
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
@@ -155,20 +183,27 @@ class Guard:
             status, said = (403, reason) if reason is not None else (414, "The address is too long.")
             await _refused(status, said)(scope, receive, guarded)
             return
-        if (declared := headers.get("content-length", "0")).isdecimal() and int(declared) > self.most:
-            await self._too_large(scope, receive, guarded)
-            return
-        try:
-            await self.app(scope, _counting(receive, self.most), guarded)
-        except _TooLargeError:
-            await self._too_large(scope, receive, guarded)
+        body = _Body(receive, self._most(scope))
 
-    async def _too_large(self, scope: Scope, receive: Receive, send: Send) -> None:
-        sentence = f"The file is too large: at most {self.most / 2**20:g} MiB are accepted. Nothing is stored."
-        await _refused(413, sentence)(scope, receive, send)
+        async def sending(message: Message) -> None:
+            if body.refused is None:  # otherwise starlette sends that it has failed
+                await guarded(message)
 
-    def __repr__(self) -> str:
-        return call(self, self.hosts, most=self.most)
+        with contextlib.suppress(ClientDisconnect):
+            declared = headers.get("content-length", "0")
+            body.require(int(declared) if declared.isdecimal() else 0)
+            await self.app(scope, body, sending)
+        if body.refused is not None:
+            await _refused(*body.refused)(scope, receive, guarded)
+
+    def _most(self, scope: Scope) -> int:
+        """Return the largest size of a request; one of a session lets its connection wait no longer."""
+        known = self.access.session(HTTPConnection(scope).cookies) is not None
+        if known and (connection := scope.get("state", {}).get("connection")) is not None:
+            connection.waiting.remove(connection)
+        if scope["path"] == "/enter" or not (known or not self.access.needs_token):
+            return _MOST_OF_STRANGER
+        return self.most if scope["path"].endswith("/recording") else min(self.most, _MOST_FORM)
 
 
 def _refused(status: int, sentence: str) -> HTMLResponse:
@@ -189,17 +224,3 @@ def _with_headers(send: Send) -> Send:
         await send(message)
 
     return sending
-
-
-def _counting(receive: Receive, most: int) -> Receive:
-    read = 0
-
-    async def receiving() -> Message:
-        nonlocal read
-        message = await receive()
-        read += len(message.get("body", b""))
-        if read > most:
-            raise _TooLargeError
-        return message
-
-    return receiving

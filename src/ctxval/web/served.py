@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ctxval._util.representation import record
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions
 from ctxval.core.experiment import Experiment
@@ -26,9 +25,6 @@ class ServedCampaign:
     campaign: Campaign
     threshold: float | None
     certificate: CertificateOptions
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 OpenCampaign = Callable[[], ServedCampaign]

@@ -7,6 +7,7 @@ import contextlib
 import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import FrameType
 
 import uvicorn
@@ -15,6 +16,7 @@ from ctxval._util.representation import call
 from ctxval.errors import InputError
 from ctxval.web.access import Access, new_token
 from ctxval.web.app import application
+from ctxval.web.connections import Connection, Waiting
 from ctxval.web.desk import Desk
 from ctxval.web.security import Hosts, is_loopback
 from ctxval.web.served import OpenCampaign
@@ -57,10 +59,6 @@ def serve(
         reopen: opens the campaign in a child process; it must be picklable.
         address: where the page is served.
         on_start: called with the address of the page and its token, if it has one, before the first request.
-
-    Raises:
-        CtxvalError: if the campaign cannot be opened.
-        InputError: if the address cannot be used.
     """
     with contextlib.closing(listening(address.host, address.port)) as listener:
         port = listener.getsockname()[1]
@@ -69,13 +67,14 @@ def serve(
         service = CampaignService(Desk(open_campaign), reopen)
         config = uvicorn.Config(
             application(service, access, hosts),
-            log_level="warning",
+            log_level="error",  # whoever sends nonsense must not fill the terminal
             access_log=False,  # an address may contain the token
             server_header=False,
             proxy_headers=False,
             limit_concurrency=_CONNECTIONS,
             timeout_graceful_shutdown=5,
             lifespan="on",
+            http=partial(Connection, Waiting()),  # type: ignore[arg-type]
             ws="none",
         )
         on_start(page_address(address.host, port), token)
@@ -102,11 +101,7 @@ class _Server(uvicorn.Server):
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that listens at an address.
-
-    Raises:
-        InputError: if the address cannot be used, for example because another program uses it.
-    """
+    """Return a socket that listens at an address."""
     if not 0 <= port <= 65535:
         raise InputError(f"the port must be from 0 to 65535, got {port}.")
     try:

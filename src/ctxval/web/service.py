@@ -9,7 +9,6 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from ctxval._util.representation import call, counted
 from ctxval.campaign.telling import ToldResult
 from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError, InputError
@@ -157,11 +156,7 @@ class CampaignService:
     # What operators do
 
     def choose(self, request: TaskRequest) -> None:
-        """Start to choose the next task.
-
-        Raises:
-            InputError: if a task is being chosen, or if another trial was opened since the operator looked.
-        """
+        """Start to choose the next task."""
         if self.background.choosing is not None:
             raise InputError("a task is already being chosen.")
         if request.trials is not None and request.trials != len(self.snapshot.trials):
@@ -173,16 +168,7 @@ class CampaignService:
         self._spawn(self._choose(request))
 
     async def tell(self, number: int, told: ToldResult, submission: str) -> Trial:
-        """Record the result of an open trial, once for each submitted form.
-
-        Args:
-            number: the number of the trial.
-            told: the result.
-            submission: identifies the form; a form that is sent twice is recorded once.
-
-        Raises:
-            InputError, ExecutionError, StoreError, CampaignError: as in :meth:`Desk.tell`; the trial stays as it was.
-        """
+        """Record the result of an open trial, once for each submitted form."""
         try:
             ended = await self._desk.tell(number, told)
         except InputError:
@@ -198,11 +184,7 @@ class CampaignService:
             await self._look()
 
     async def files(self, number: int) -> Files:
-        """Return the files of an open trial, after they are prepared.
-
-        Raises:
-            InputError: if the trial is not open, or its files cannot be made.
-        """
+        """Return the files of an open trial, after they are prepared."""
         if number in self._preparing:
             await asyncio.shield(self._preparing[number])
         found = self.background.files.get(number)
@@ -337,9 +319,6 @@ class CampaignService:
             else:
                 self._update(judged=ended, judgement=judgement, judgement_error=None)
         self._update(judging=None)
-
-    def __repr__(self) -> str:
-        return call(self, self.description.name, trials=counted(len(self.snapshot.trials), "trial"))
 
 
 def _same(one: Snapshot, other: Snapshot) -> bool:

@@ -29,12 +29,7 @@ _SEARCHES = {
 
 
 def why(trial: Trial, units: str) -> list[str]:
-    """Return sentences on the reason why the task of a trial was chosen, and on the prediction of its execution.
-
-    Args:
-        trial: the trial; its note may have any content.
-        units: the units of the distance.
-    """
+    """Return sentences on the reason why the task of a trial was chosen, and on the prediction of its execution."""
     note = trial.note or {}
     found = [_reason(trial, note, units)]
     if isinstance(note.get("why"), str) and note.get("how") != "initial":

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.representation import record
 from ctxval.certificates.bounds import at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
@@ -32,9 +31,6 @@ class Entry:
     term: str
     standard: str
     content: str
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 class AppendixSection:

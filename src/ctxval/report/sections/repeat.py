@@ -13,6 +13,8 @@ from typing import Any
 
 from markupsafe import Markup
 
+from ctxval.certificates import RESOLUTION
+from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.trial import Trial
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.markup import code, heading, joined, number, paragraph, table
@@ -20,6 +22,10 @@ from ctxval.version import VERSION
 
 _WORST = 5
 _PACKAGES = ("numpy", "scipy")
+_SAME = (
+    "The same command makes the same choices with the same versions of the libraries on the same kind of processor. "
+    "The option thinking of the search auto must then be a number, fast or thorough: balanced measures times."
+)
 _FILE = (
     "The experiment is described in a file. The store keeps its content, but not its name, so its name is assumed here."
 )
@@ -34,9 +40,7 @@ class RepeatSection:
         """Return the command, the seed, the versions, the digests and a snippet for each of the worst tasks."""
         command = command_of(context)
         parts = [
-            paragraph("The same command with the same versions makes the same choices.")
-            if command
-            else paragraph("No command made this store, so there is none that repeats it."),
+            paragraph(_SAME) if command else paragraph("No command made this store, so there is none that repeats it."),
             code(command, "Command that repeats the campaign") if command else Markup(""),
             paragraph(_FILE) if command and not context.settings.get("experiment") else Markup(""),
             table("What identifies this campaign", ("Name", "Value"), identity(context).items(), class_="facts"),
@@ -100,19 +104,35 @@ def command_of(context: ReportContext) -> str:
         return ""
     named = settings.get("experiment")
     words = ["ctxval", "run", str(named) if named else f"{settings.get('name') or 'experiment'}.toml"]
-    search = settings.get("search")
+    search, certificate, options = (_mapping(settings.get(name)) for name in ("search", "certificate", "options"))
     given = {
-        "--search": search.get("name") if isinstance(search, Mapping) else None,
+        "--search": search.get("name"),
         "--seed": settings.get("seed"),
         "--budget": settings.get("budget") or context.budget,
         "--threshold": settings.get("threshold"),
+        "--confidence": _unless(CONFIDENCE, settings.get("confidence")),
+        "--resolution": _unless(RESOLUTION, certificate.get("resolution")),
     }
     for option, value in given.items():
         words += [option, str(value)] if value is not None else []
-    options = settings.get("options")
-    for name, value in options.items() if isinstance(options, Mapping) else ():
+    flags = {
+        "--until-decided": settings.get("until_decided"),
+        "--audited": settings.get("audited"),
+        "--stochastic": certificate.get("stochastic"),
+    }
+    words += [flag for flag, wanted in flags.items() if wanted is True]
+    for name, value in options.items():
         words += ["--option", f"{name}={value}"]
     return shlex.join(words)
+
+
+def _unless(default: float, value: Any) -> Any:
+    return None if value == default else value
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    """Return a table of the settings; an empty one for anything else, because a store may hold anything."""
+    return value if isinstance(value, Mapping) else {}
 
 
 def _snippets(context: ReportContext, trial: Trial) -> list[Markup]:

@@ -1,14 +1,18 @@
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ctxval.errors import InputError
-from ctxval.searches import Annealing, Random, Search, by_name
-from ctxval.searches.annealing import reflected
+from ctxval.searches import Random, Search
 from ctxval.testing import check_search
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from annealing import Annealing, reflected
 
 Function = Callable[[np.ndarray], float]
 
@@ -31,7 +35,7 @@ def run(search: Search, function: Function, budget: int, dimension: int, seed: i
 
 @pytest.mark.parametrize("dimension", [1, 4])
 def test_it_keeps_the_contract_of_a_search(dimension: int) -> None:
-    check_search(by_name("annealing"), dimension=dimension, budget=25)
+    check_search(Annealing(), dimension=dimension, budget=25)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -115,18 +119,3 @@ def test_it_never_walks_to_a_failed_point() -> None:
 
 def test_points_are_folded_at_the_faces() -> None:
     np.testing.assert_allclose(reflected(np.array([-0.2, 0.4, 1.3, 2.1, -1.5])), [0.2, 0.4, 0.7, 0.1, 0.5])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"temperature": 0.0}, "temperature and move must be positive"),
-        ({"move": -0.1}, "temperature and move must be positive"),
-        ({"cooling": 0.0}, r"cooling must be in \(0, 1\]"),
-        ({"cooling": 1.1}, r"cooling must be in \(0, 1\]"),
-        ({"restart": 1.5}, r"restart in \[0, 1\]"),
-    ],
-)
-def test_options_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        Annealing(**options)

@@ -1,19 +1,22 @@
-"""Simulated annealing (Kirkpatrick, Gelatt and Vecchi 1983), a baseline for many executions."""
+(
+    """Simulated annealing (Kirkpatrick, Gelatt and Vecchi 1983) as a user's own search.
+
+``Campaign(validation, search=Annealing())`` uses it.
+"""
+    ""
+)
 
 from __future__ import annotations
 
 import numpy as np
 
-from ctxval._util.arrays import Array
-from ctxval._util.registry import part
-from ctxval.errors import InputError
+from ctxval import Array
 from ctxval.searches.base import SequentialSearch
 
 _SMALLEST_MOVE = 0.1
 """Smallest size of the moves, which shrink with the temperature, as a share of their first size."""
 
 
-@part("annealing")
 class Annealing(SequentialSearch):
     """A Metropolis walk through the unit cube, at a temperature that falls geometrically.
 
@@ -29,17 +32,11 @@ class Annealing(SequentialSearch):
             root of the temperature.
         restart: probability of a uniform draw instead of a move.
 
-    Raises:
-        InputError: if temperature or move is not positive, cooling is not in (0, 1], or restart is not in [0, 1].
     """
 
     def __init__(
         self, temperature: float = 0.1, cooling: float = 0.98, move: float = 0.2, restart: float = 0.05
     ) -> None:
-        if not (0 < temperature < np.inf and 0 < move < np.inf):
-            raise InputError(f"temperature and move must be positive numbers, got {temperature!r} and {move!r}.")
-        if not (0 < cooling <= 1 and 0 <= restart <= 1):
-            raise InputError(f"cooling must be in (0, 1] and restart in [0, 1], got {cooling!r} and {restart!r}.")
         self.temperature = temperature
         self.cooling = cooling
         self.move = move

@@ -1,0 +1,169 @@
+"""Arguments of public functions and constructors, checked against their annotations before the body runs.
+
+``@checked`` decorates a function or a class; ``@part`` includes it. Every constructor refuses a wrong value in the same
+words, so no body repeats the check. An annotation that only type checkers can resolve checks nothing.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import reprlib
+import sys
+import types
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+import numpy as np
+
+from ctxval.errors import InputError, UnknownNameError
+
+Checkable = TypeVar("Checkable", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Must:
+    """The range of a number, in an annotation ``Annotated[float, Must(...)]``.
+
+    Attributes:
+        be: what the number must be, for the message.
+        hold: whether a number is in the range.
+    """
+
+    be: str
+    hold: Callable[[Any], bool]
+
+
+PositiveInt = Annotated[int, Must("a positive integer", lambda value: 1 <= value < 2**53)]
+NonNegativeInt = Annotated[int, Must("an integer >= 0", lambda value: value >= 0)]
+PositiveFloat = Annotated[float, Must("a positive number", lambda value: 0 < value < np.inf)]
+NonNegativeFloat = Annotated[float, Must("a finite number >= 0", lambda value: 0 <= value < np.inf)]
+FiniteFloat = Annotated[float, Must("a finite number", lambda value: abs(value) < np.inf)]
+Seconds = Annotated[float, Must("a positive number of seconds", lambda value: 0 < value < np.inf)]
+TimeLimit = Annotated[float, Must("a positive number of seconds, or infinity", lambda value: value > 0)]
+Norm = Annotated[float, Must("1, 2 or inf", lambda value: value in (1, 2, np.inf))]
+Probability = Annotated[float, Must("strictly between 0 and 1", lambda value: 0 < value < 1)]
+
+_NONE = "None"
+
+_SHOWN = reprlib.Repr()
+_SHOWN.maxstring = _SHOWN.maxother = 200
+
+_PLAIN: dict[Any, tuple[str, tuple[type, ...]]] = {
+    bool: ("True or False", (bool, np.bool_)),
+    int: ("an integer", (int, np.integer)),
+    float: ("a number", (int, float, np.integer, np.floating)),
+    str: ("a text", (str,)),
+}
+
+
+def checked(made: Checkable) -> Checkable:
+    """Check the arguments of a function, or of a class's own constructor, whenever it is called.
+
+    A value that is the default is not checked.
+    """
+    function: Any = vars(made).get("__init__") if isinstance(made, type) else made
+    if function is None:
+        return made  # the constructor is that of a base class
+    signature = inspect.signature(function)
+
+    @functools.cache
+    def annotations() -> dict[str, Any]:
+        return dict(_resolved(function, made))
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError:
+            return function(*args, **kwargs)  # raises Python's own error
+        for name, value in given.items():
+            if name in annotations() and value is not signature.parameters[name].default:
+                require(name, annotations()[name], value)
+        return function(*args, **kwargs)
+
+    if not isinstance(made, type):
+        return call  # type: ignore[return-value]
+    setattr(made, "__init__", call)  # noqa: B010
+    return made
+
+
+def require(name: str, annotation: Any, value: Any) -> Any:
+    """Return a value that is what an annotation says."""
+    if get_origin(annotation) is Literal and isinstance(value, str) and value not in get_args(annotation):
+        raise UnknownNameError.among(name, value, get_args(annotation))
+    wanted = _missed(annotation, value)
+    if wanted:
+        raise InputError(f"{name} must be {wanted}, got {_SHOWN.repr(value)}.")
+    return value
+
+
+def _resolved(function: Any, made: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the annotations of parameters; those of the fields of a dataclass are read where the field is defined."""
+    variadic = {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
+    plain = {name for name, one in inspect.signature(function).parameters.items() if one.kind not in variadic}
+    for name, annotation in function.__annotations__.items():
+        homes = [cls for cls in getattr(made, "__mro__", ()) if name in vars(cls).get("__annotations__", {})]
+        place = vars(sys.modules[homes[0].__module__]) if homes else function.__globals__
+        try:
+            if name in plain:
+                yield name, eval(annotation, dict(place)) if isinstance(annotation, str) else annotation
+        except (NameError, AttributeError, TypeError):
+            continue
+
+
+def _missed(annotation: Any, value: Any) -> str:
+    """Return what a value must be; empty if it is that, or if nothing is known of the annotation."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        base, must = arguments[0], arguments[1]
+        return must.be if _missed(base, value) or not must.hold(value) else ""
+    if annotation in _PLAIN:
+        wanted, kinds = _PLAIN[annotation]
+        confused = isinstance(value, bool | np.bool_) and annotation in (int, float)
+        beyond = annotation is float and isinstance(value, int) and abs(value) > sys.float_info.max
+        return wanted if confused or beyond or not isinstance(value, kinds) or value != value else ""
+    if origin in (Union, types.UnionType):
+        missed = [_missed(one, value) for one in arguments]
+        given = [text for text in missed if text != _NONE]  # nobody needs to be told of None
+        return " or ".join(dict.fromkeys(given)) if all(missed) else ""
+    if origin is Literal:
+        return "" if isinstance(value, str) and value in arguments else f"one of {', '.join(map(repr, arguments))}"
+    if annotation in (None, types.NoneType):
+        return "" if value is None else _NONE
+    if origin is Callable:
+        return "" if callable(value) else "a function"
+    cls = origin or annotation
+    unknown = not isinstance(cls, type) or cls is object or cls.__module__.startswith("numpy")
+    return "" if unknown else _missed_class(cls, arguments, value)
+
+
+def _missed_class(cls: type, arguments: tuple[Any, ...], value: Any) -> str:
+    """Return what a value must be to be of a class, with the right items if it is a collection."""
+    if issubclass(cls, Mapping):
+        if not isinstance(value, Mapping):
+            return "a table of names and values"
+        of_items = ((key, _missed(arguments[1], item)) for key, item in value.items()) if arguments else ()
+        return next((f"a table of which each value is {be}, also {key!r}" for key, be in of_items if be), "")
+    if cls in (list, tuple) or cls.__name__ == "Sequence":
+        if isinstance(value, str | bytes | Mapping) or not (hasattr(value, "__len__") and hasattr(value, "__iter__")):
+            return "a list"
+        kinds = arguments if cls is tuple and ... not in arguments else (arguments or (Any,))[:1] * len(value)
+        if len(kinds) != len(value):
+            return f"a list of {len(kinds)} values"
+        missed = next(filter(None, map(_missed, kinds, value)), "")
+        return missed and f"a list of which each item is {missed}"
+    try:
+        if isinstance(value, cls):
+            return ""
+    except TypeError:  # a protocol that cannot be checked
+        return ""
+    public = {name: method for name, method in vars(cls).items() if not name.startswith("_") or name == "__call__"}
+    methods = [
+        f"{name}({', '.join([*inspect.signature(method).parameters][1:])})"
+        for name, method in public.items()
+        if getattr(cls, "_is_protocol", False) and inspect.isfunction(method)
+    ]
+    article = "an" if cls.__name__[0] in "AEIO" else "a"
+    return f"{article} {cls.__name__}{' with ' if methods else ''}{' and '.join(methods)}"

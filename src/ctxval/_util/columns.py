@@ -1,0 +1,115 @@
+"""Columns of tables: which one is meant, which one has the times, and what stands for a missing value in them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.texts import enumerated
+from ctxval._util.units import conversion, named_unit
+from ctxval.errors import InputError
+
+TIMES = ("t", "time", "times", "timestamp")
+"""Names of columns of times, the first of which is taken: a state may be called ``time`` too."""
+
+EPISODES = (
+    *("episode", "episode_index", "episode_id", "run", "run_index", "run_id", "trial", "trial_index", "trial_id"),
+)
+"""Names of columns that number the recordings in one table."""
+
+FAR = 3.0
+"""Largest ratio between the median time of two samples and a time step to which they are interpolated."""
+
+_LIMITS = (32767.0, -32768.0, 65535.0, 2147483647.0, -2147483648.0, 4294967295.0)
+_EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+"""Smallest times since 1970, after 1973, in units in which no recording has such a length."""
+
+
+def require_distinct(source: str, names: Sequence[str]) -> None:
+    """Refuse a table with two columns of one name, also if they differ in their units."""
+    plain = [named_unit(name)[0] if name.endswith(("]", ")")) else name for name in names if name]
+    name, count = max(Counter(plain).items(), key=lambda pair: pair[1], default=("", 0))
+    if count > 1:
+        raise InputError(f"{source} has two columns {name[:60]!r}: each name must be there once.")
+
+
+def column_of(source: str, names: Sequence[str], field: str) -> tuple[str, str] | None:
+    """Return the column that a field means, and its unit; None if there is none.
+
+    A field is the name of a column with or without its unit, or with a unit in brackets that the column does not state.
+    """
+    plain, unit, weak = named_unit(field)
+    if field in names:
+        return field, "" if weak else unit
+    if field.endswith(("]", ")")) and unit:
+        column = column_of(source, names, plain)
+        return None if column is None or column[1] not in ("", unit) else (column[0], unit)
+    matching = [name for name in names if named_unit(name)[0] == field]
+    if len(matching) > 1:
+        raise InputError(f"{source} has several columns for {field}: {enumerated(matching, 5)}; name one of them.")
+    return (matching[0], named_unit(matching[0])[1]) if matching else None
+
+
+def time_column(source: str, names: Sequence[str]) -> tuple[str, str] | None:
+    """Return the column of the times and its unit, empty if it states none; None if there is no such column."""
+    plain = {name: named_unit(name)[0] for name in names}
+    for time in TIMES:
+        matching = [name for name, own in plain.items() if time in (own, own.casefold() if time != "t" else "")]
+        if time in matching or len(matching) == 1:
+            column = time if time in matching else matching[0]
+            return column, named_unit(column)[1]
+        if matching:
+            raise InputError(f"{source} has several columns of times, {enumerated(matching, 5)}; name one of them.")
+    return None
+
+
+def in_seconds(source: str, times: Array, unit: str) -> Array:
+    """Return times in seconds; times since 1970 without a unit are recognised by their size."""
+    if not unit and len(times):
+        middle = float(np.median(times))
+        unit = next((name for least, name in _EPOCHS if middle > least), "s")
+    try:
+        return np.asarray(times * conversion(unit or "s", "s"))
+    except InputError:
+        raise InputError(
+            f"{source}: the unit of its times must be s, ms, us, ns, min or h, got {unit[:40]!r}."
+        ) from None
+
+
+def unit_advice(period: float, dt: float) -> str:
+    """Return the sentence that times probably have another unit; empty if their period does not suggest one."""
+    for factor, unit in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")):
+        if 1 / FAR < period / dt / factor < FAR:
+            return (
+                f"if the times are in {unit}, name their column t [{unit}], or give time_unit = {unit!r} in a mapping"
+            )
+        if 1 / FAR < period * factor / dt < FAR:
+            return f"the times seem to be in s although they are stated in {unit}"
+    return ""
+
+
+def sentinels(values: Array) -> list[float]:
+    """Return the values that stand for a missing one, such as -999, -9999 or 1e9, and are far outside all others."""
+    found, rest = list[float](), np.asarray(values[np.isfinite(values)])
+    while len(rest):
+        low, high = float(rest.min()), float(rest.max())
+        largest = low if abs(low) > abs(high) else high
+        others = rest[rest != largest]
+        if not len(others) or not _stands_for_missing(largest):
+            break
+        ranges = 2 * float(np.ptp(others))
+        if min(abs(largest - float(others.min())), abs(largest - float(others.max()))) <= ranges:
+            break
+        found.append(largest)
+        rest = others
+    return found
+
+
+def _stands_for_missing(value: float) -> bool:
+    size = abs(value)
+    nines = size >= 99 and set(f"{size:.15g}".replace(".", "")) == {"9"}
+    power_of_ten = size >= 1e6 and size == float(f"1e{round(np.log10(size))}")
+    return nines or power_of_ten or value in _LIMITS or size > 1e30

@@ -1,0 +1,150 @@
+"""The recording of one execution in a file, read here or in a confined process."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.columns import sentinels
+from ctxval._util.confinement import MOST_MEMORY
+from ctxval._util.temporary import temporary_folder
+from ctxval.core.labels import labels_of
+from ctxval.core.trajectory import COMPLETE, Trajectory
+from ctxval.data import LogMapping, is_log, read_recordings
+from ctxval.errors import ExecutionError, InputError
+from ctxval.systems.supervised import run_supervised
+
+_PROGRAM = Path(__file__).absolute().with_name("recording_process.py")
+
+REFUSED = 3
+"""Exit status of the confined process if the file cannot be used; its output is the reason."""
+
+_SECONDS, _SECONDS_OF_UPLOAD = 3600, 60
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingFile:
+    """A file with the recording of one execution: CSV with named columns, NPZ, or a log of another kind.
+
+    Attributes:
+        path: the file.
+        states, inputs: the names and units of the columns.
+        times: the times of the task, ``(H + 1,)``.
+        npz: whether it is an NPZ file; None if the suffix decides.
+        resample: interpolate the recording to the times of the task.
+        mapping: which fields of a log are states and inputs; None if the file has the names of the experiment.
+        uploaded: whether somebody sent the file, who may not learn what a file contains.
+    """
+
+    path: Path
+    states: dict[str, str]
+    inputs: dict[str, str]
+    times: Array
+    npz: bool | None = None
+    resample: bool = False
+    mapping: LogMapping | None = None
+    uploaded: bool = False
+
+    @property
+    def foreign(self) -> bool:
+        """Whether libraries in C read the file, or a stranger may have made it."""
+        return self.uploaded or is_log(self.path)
+
+    def read(self) -> Trajectory:
+        """Return the recording."""
+        path = self.path
+        if is_log(path) or (self.mapping is not None and self.npz is not True and path.is_file()):
+            logged = self._logged()
+            return logged.resampled(self.times) if self.resample else logged
+        require_file(path)
+        if path.suffix == ".npz" if self.npz is None else self.npz:
+            recording = Trajectory.from_npz(path)
+        else:
+            recording = Trajectory.from_csv(path, states=labels_of(self.states), inputs=labels_of(self.inputs))
+            if self.inputs and not recording.inputs.shape[-1]:
+                raise InputError(f"{path} must have the columns of the inputs, {', '.join(self.inputs)}.")
+        if recording.states.ndim != 2:
+            raise InputError(f"{path} must be one recording, got a batch of shape {recording.states.shape}.")
+        self._require_finite(recording)
+        return recording.resampled(self.times) if self.resample else recording
+
+    def _logged(self) -> Trajectory:
+        """Return the only recording in a log, at the time step of the task."""
+        found = read_recordings(
+            [self.path],
+            self.mapping,
+            states=self.states,
+            inputs=self.inputs,
+            dt=float(self.times[1] - self.times[0]),
+        )
+        if len(found.runs) > 1 or found.breaks:
+            why = f"; it was split: {found.breaks[0]}" if found.breaks else ""
+            raise InputError(f"{self.path} must be one recording without gaps, and has {len(found.runs)}{why}.")
+        return found.runs[0].trajectory
+
+    def _require_finite(self, recording: Trajectory) -> None:
+        """Refuse a complete recording with a number that is missing, infinite or a mark; the message says where."""
+        if recording.ended != COMPLETE:
+            return  # the reason why it ended is reported instead
+        for names, values in ((list(self.states), recording.states), (list(self.inputs), recording.inputs)):
+            wrong = np.argwhere(~np.isfinite(values[:, : len(names)]))
+            if len(wrong):
+                row, column = wrong[0]
+                raise InputError(
+                    f"{self.path} is not finite: {names[column]} is {values[row, column]} at "
+                    f"{recording.times[row]:g} s. If the execution has no usable recording, report it with --failed."
+                )
+            for name, column in zip(names, values.T, strict=False):
+                if marks := sentinels(column):
+                    row = int(np.argmax(column == marks[0]))
+                    raise InputError(
+                        f"{self.path}: {name} is {marks[0]:g} at {recording.times[row]:g} s, far from all other "
+                        "values, which stands for a missing one. If the execution has no usable recording, report it "
+                        "with --failed."
+                    )
+
+    def read_confined(self) -> Trajectory:
+        """Return the recording as a process without rights reads it; see :mod:`ctxval._util.confinement`."""
+        seconds = _SECONDS_OF_UPLOAD if self.uploaded else _SECONDS
+        with temporary_folder() as folder:
+            (folder / "request").write_bytes(pickle.dumps((self, seconds)))
+            with (folder / "answer").open("w+b") as answer, open(os.devnull, "wb") as nothing:
+                command = [sys.executable, "-P", str(_PROGRAM), str(folder)]
+                try:
+                    status = run_supervised(command, None, answer, nothing, 2 * seconds)
+                except ExecutionError as error:
+                    raise InputError(f"{self.path} cannot be read: {error}.") from error
+                answer.seek(0)
+                content = answer.read()
+        if status == 0:
+            return Trajectory.from_npz(content)
+        if status != REFUSED:
+            raise InputError(f"{self.path} cannot be read within {seconds} s and {MOST_MEMORY} bytes of memory.")
+        sentence = content.decode(errors="replace")
+        raise InputError(self._withheld(sentence) if self.uploaded else sentence)
+
+    def _withheld(self, sentence: str) -> str:
+        """Return where an uploaded file is wrong and what would be right, without anything that is in the file."""
+        place = re.search(r", line \d{1,9}", sentence)
+        needed = ", ".join(labels_of({"t": "s", **self.states, **self.inputs}))
+        return (
+            f"{self.path}{'' if place is None else place[0]}: it is not a recording of this trial. The columns or "
+            f"fields {needed} are needed, with a finite number for each time from 0 to {self.times[-1]:g} s."
+        )
+
+
+def require_file(path: Path) -> None:
+    """Refuse a path that is not a readable file, with a clearer message than that of a reader."""
+    try:
+        found, folder = path.is_file(), path.is_dir()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    if not found:
+        raise InputError(f"{path} cannot be read: it is a folder." if folder else f"there is no file {path}.")

@@ -1,0 +1,205 @@
+"""Logs of messages on topics, each of which has times of its own."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import call
+from ctxval._util.units import named_unit
+from ctxval.data.log import Clock, Log, Signal
+from ctxval.errors import InputError
+
+_MOST_MEMORY = 2**30
+"""Largest size of the numbers of a log in bytes; each message needs :data:`_OBJECT` bytes more."""
+
+_OBJECT = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Message:
+    """One message of a topic.
+
+    Attributes:
+        topic: its topic.
+        logged, published: when it was recorded and sent, nanoseconds.
+        content: its decoded fields: a mapping, or an object with an attribute for each field.
+    """
+
+    topic: str
+    logged: int
+    published: int
+    content: Any
+
+    def __repr__(self) -> str:
+        return call(self, self.topic, logged=self.logged)
+
+
+class TopicLog(Log):
+    """A log of messages on topics; a field is ``/topic.field.part[2]``."""
+
+    @abstractmethod
+    def topics(self) -> tuple[str, ...]:
+        """Return the names of the topics."""
+
+    @abstractmethod
+    def messages(self, topics: Iterable[str]) -> Iterator[Message]:
+        """Yield the messages of some topics in the order of their log times.
+
+        Raises:
+            InputError: if a message cannot be decoded.
+        """
+
+    def fields(self) -> tuple[str, ...]:
+        """Return the names of the fields that hold numbers in the first message of each topic."""
+        left, found = set(self.topics()), list[str]()
+        for topic in self.topics():
+            try:
+                first = next(iter(self.messages([topic])), None)
+            except InputError:
+                continue  # the topic has another encoding
+            left.discard(topic)
+            found += [] if first is None else [f"{topic}.{path}" for path in _leaves(first.content)]
+        return tuple(found)
+
+    def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
+        """Return fields over time; see :meth:`Log.signals`."""
+        split = {field: self._split(field) for field in fields}
+        stamps: dict[str, list[dict[str, int | None]]] = {topic: [] for topic, _ in split.values()}
+        values: dict[str, list[Array]] = {field: [] for field in fields}
+        size = 0
+        for message in self.messages(stamps):
+            number = len(stamps[message.topic])
+            stamps[message.topic].append(
+                {"log": message.logged, "publish": message.published, "header": _header(message.content)}
+            )
+            for field, (topic, path) in split.items():
+                if topic == message.topic:
+                    values[field].append(self._value(message, number, path))
+                    size += _OBJECT + values[field][-1].nbytes
+            if size > _MOST_MEMORY:
+                raise InputError(f"{self.source} has too many numbers: {_MOST_MEMORY} bytes of memory may be used.")
+        for topic, unsorted in stamps.items():
+            order = sorted(range(len(unsorted)), key=[stamp["log"] or 0 for stamp in unsorted].__getitem__)
+            stamps[topic] = [unsorted[k] for k in order]
+            values |= {field: [values[field][k] for k in order] for field, (of, _) in split.items() if of == topic}
+        chosen = ("header" if _plausible(stamps) else "log") if clock.stamp == "auto" else clock.stamp
+        times = {topic: [stamp[chosen] for stamp in own] for topic, own in stamps.items()}
+        for topic, own in times.items():
+            if None in own:
+                raise InputError(
+                    f"{self.source}, message {own.index(None)} of {topic}: it has no header.stamp or timestamp."
+                )
+        origin = min((min(own) for own in times.values() if own), default=0)  # type: ignore[type-var]
+        return {
+            field: self._signal(field, times[topic], values[field], origin, chosen)  # type: ignore[arg-type]
+            for field, (topic, _) in split.items()
+        }
+
+    def _signal(self, field: str, times: list[int], values: list[Array], origin: int, clock: str) -> Signal:
+        if not times:
+            raise InputError(f"{self.source} has no message with the field {field!r}.")
+        widths = [len(value) for value in values]
+        if len(set(widths)) > 1:
+            row = next(i for i, width in enumerate(widths) if width != widths[0])
+            raise InputError(
+                f"{self.source}, message {row} of {field}: it must have {widths[0]} numbers, got {widths[row]}."
+            )
+        seconds = np.array([1e-9 * (time - origin) for time in times])
+        _, unit, weak = named_unit(field)
+        stated = "" if weak else unit
+        return Signal(seconds, np.array(values).reshape(len(times), -1), 0, "message", stated, clock)
+
+    def _split(self, field: str) -> tuple[str, tuple[str | int, ...]]:
+        for topic in sorted(self.topics(), key=len, reverse=True):
+            if field.startswith(f"{topic}."):
+                return topic, _path(field[len(topic) + 1 :])
+        raise self.missing(field)
+
+    def _value(self, message: Message, number: int, path: tuple[str | int, ...]) -> Array:
+        found = _resolved(message.content, path)
+        try:
+            if found is None or isinstance(found, str | bytes):
+                raise TypeError
+            return np.asarray(found, dtype=np.float64).reshape(-1)
+        except (TypeError, ValueError):
+            shown = "nothing" if found is None else repr(found)[:60]
+            raise InputError(
+                f"{self.source}, message {number} of {message.topic}: {_joined(path)} must be a number or a list of "
+                f"numbers, got {shown}."
+            ) from None
+
+
+def _header(content: Any) -> int | None:
+    """Return the ``header.stamp`` or the ``timestamp`` in a message, nanoseconds; None if there is none."""
+    stamp = _first(content, ("header", "stamp"), ("timestamp",))
+    whole, part = _first(stamp, ("sec",), ("seconds",)), _first(stamp, ("nanosec",), ("nsec",), ("nanos",))
+    return None if whole is None or part is None else int(whole) * 10**9 + int(part)
+
+
+def _plausible(stamps: Mapping[str, Sequence[Mapping[str, int | None]]]) -> bool:
+    """Return whether all messages have stamps that increase on each topic and agree with the log times up to 1 s.
+
+    The stamps may be those of another clock, such as that of a simulator, if it is the same one for all topics.
+    """
+    late = list[int]()
+    for own in stamps.values():
+        headers = [stamp["header"] for stamp in own]
+        if None in headers or any(b <= a for a, b in pairwise(headers)):  # type: ignore[operator]
+            return False
+        late += [stamp["log"] - stamp["header"] for stamp in own]  # type: ignore[operator]
+    return bool(late) and max(late) - min(late) <= 10**9
+
+
+def _path(text: str) -> tuple[str | int, ...]:
+    """Return the steps of a path such as ``pose.position[2].x``."""
+    steps: list[str | int] = []
+    for part in text.split("."):
+        name, *indices = part.replace("]", "").split("[")
+        steps += [name, *(int(index) if index.isdigit() else index for index in indices)]
+    return tuple(step for step in steps if step != "")
+
+
+def _joined(path: Sequence[str | int]) -> str:
+    return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path).removeprefix(".")
+
+
+def _resolved(content: Any, path: Sequence[str | int]) -> Any:
+    """Return a part of a message; None if there is none."""
+    for step in path:
+        if isinstance(step, int):
+            content = content[step] if hasattr(content, "__getitem__") and step < len(content) else None
+        elif isinstance(content, Mapping):
+            content = content.get(step)
+        else:
+            # Only fields that the message's class declares: attributes of Python are not data.
+            content = getattr(content, step, None) if step in getattr(type(content), "__slots__", ()) else None
+        if content is None:
+            return None
+    return content
+
+
+def _first(content: Any, *paths: Sequence[str | int]) -> Any:
+    """Return the first part of a message that exists; None if there is none."""
+    return next((found for path in paths if (found := _resolved(content, path)) is not None), None)
+
+
+def _leaves(content: Any, before: str = "", depth: int = 6) -> Iterator[str]:
+    """Yield the paths of all numbers in a message."""
+    if isinstance(content, bool | int | float | np.number):
+        yield before
+    elif depth and isinstance(content, Mapping):
+        for name, part in content.items():
+            yield from _leaves(part, f"{before}.{name}".removeprefix("."), depth - 1)
+    elif depth and isinstance(content, list | tuple | np.ndarray):
+        for index, part in enumerate(content[:16]):
+            yield from _leaves(part, f"{before}[{index}]", depth - 1)
+    elif depth and not isinstance(content, str | bytes):
+        for name in getattr(type(content), "__slots__", ()):
+            yield from _leaves(getattr(content, name), f"{before}.{name}".removeprefix("."), depth - 1)

@@ -1,0 +1,35 @@
+"""Pages of studies are what the stored results give, and say with which sources these were measured."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+import compare_page
+import search_page
+import study_main_job
+import study_refine
+from peers import page as peers_page
+
+
+@pytest.mark.parametrize(
+    ("module", "text"),
+    [
+        (compare_page, compare_page.page),
+        (search_page, search_page.text),
+        (study_main_job, study_main_job.text),
+        (study_refine, study_refine.page),
+        (peers_page, peers_page.text),
+    ],
+    ids=["comparison", "searches", "main-job", "refinement", "benchmarks"],
+)
+def test_a_page_is_what_the_stored_results_give(module: Any, text: Callable[[], str]) -> None:
+    page = module.PAGE.read_text()
+    assert page == text()
+    assert "Results measured" in page

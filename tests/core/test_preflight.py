@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import make_validation
+from ctxval import Campaign, Task, Validation, distances, searches
+from ctxval.core.labels import Labels
+from ctxval.core.preflight import CostWarning, DistanceWarning, start_offset
+from ctxval.distances import AtCrossing, AtTimes, CrossingTime, FinalState, GoalError, RelativeDeviation, TrackingError
+from ctxval.errors import DistanceError, InputError, UnknownNameError
+
+
+@pytest.mark.parametrize(
+    "distance",
+    [
+        FinalState(components=[5]),
+        FinalState(angles=[7]),
+        FinalState(weights=[1.0] * 7),
+        FinalState(components=["position"]),
+        AtTimes(times=[99.0]),
+        AtCrossing(state=9),
+        CrossingTime(state="speed"),
+        RelativeDeviation(least=[1.0] * 7),
+        lambda model, system, task: np.nan,
+        lambda model, system, task: -1.0,
+        lambda model, system, task: np.zeros(3),
+        lambda model, system, task: 1 / 0,
+    ],
+    ids=lambda distance: getattr(distance, "__name__", None) or repr(distance),
+)
+@pytest.mark.parametrize("how", ["run", "ask", "audit"])
+def test_a_distance_that_cannot_be_used_costs_nothing(distance: Any, how: str) -> None:
+    campaign = Campaign(make_validation().with_distance(distance), search=searches.Random())
+    calls = {"run": lambda: campaign.run(2), "ask": campaign.ask, "audit": lambda: campaign.audit(2)}
+    for _ in range(2):
+        with pytest.raises(DistanceError):
+            calls[how]()
+    assert campaign.trials == ()
+
+
+def test_a_distance_of_a_trajectory_with_itself_that_is_not_0_is_a_warning() -> None:
+    def shifted(model: Any, system: Any, task: Task) -> Any:
+        return np.abs(system.final_state - model.final_state).sum(axis=-1) + 0.1
+
+    campaign = Campaign(make_validation().with_distance(shifted), search=searches.Random())
+    with pytest.warns(DistanceWarning, match="and itself is 0.1, not 0"):
+        campaign.run(1)
+    assert len(campaign.trials) == 1
+    for to_task in (GoalError(), TrackingError()):
+        Campaign(make_validation().with_distance(to_task), search=searches.Random()).run(1)  # no warning
+
+
+@pytest.mark.parametrize("name", list(distances.REGISTRY.built_in))
+def test_every_distance_takes_states_by_name(name: str) -> None:
+    n = len(make_validation().plan([0.5]).task.initial_state)
+    labels = Labels(tuple(f"state {i} [rad]" for i in range(n)))
+    required: dict[str, Any] = {"AtTimes": {"times": [0.1]}, "RelativeDeviation": {"least": [0.1]}}.get(name, {})
+    cls = distances.REGISTRY[name]
+    options = [option for option in ("components", "angles", "state") if option in cls.__dataclass_fields__]
+    assert options
+    for option in options:
+        by_name, by_index = (0 if option == "state" else (0,)), ("state 0" if option == "state" else ["state 0"])
+        validation = make_validation().with_labels(labels)
+        named = validation.with_distance(cls(**required, **{option: by_index})).distance
+        indexed = cls(**required, **{option: by_name})
+        assert named == indexed
+        assert named.describe() == indexed.describe() if hasattr(named, "describe") else True
+        with pytest.raises(UnknownNameError, match="did you mean 'state 0'"):
+            validation.with_distance(cls(**required, **{option: "stat 0" if option == "state" else ["stat 0"]}))
+
+
+def test_names_given_before_the_labels_are_resolved_with_them() -> None:
+    unnamed = make_validation().with_distance(FinalState(components=["angle"]))
+    n = len(unnamed.plan([0.5]).task.initial_state)
+    labelled = unnamed.with_labels(Labels(("angle", *(f"x{i}" for i in range(1, n)))))
+    assert labelled.distance == FinalState(components=(0,))
+
+
+def long(horizon: int, **options: Any) -> Validation:
+    short = make_validation()
+    state = short.plan([0.5]).task.initial_state
+
+    def task(p: Any) -> Task:
+        return Task(state, goal=np.zeros(len(state)), horizon=horizon, dt=0.1)
+
+    return Validation(**{**vars(short), "task": task, **options})
+
+
+def test_a_horizon_that_is_too_long_is_refused_with_its_cost() -> None:
+    with pytest.raises(
+        InputError, match=r"horizon of 10000000 needs about .* GB of memory and .* s of CPU time.*longest=10000000"
+    ):
+        Campaign(long(10**7)).ask()
+    with pytest.raises(InputError, match="at most 20 steps are permitted"):
+        long(21, longest=20).plan([0.5])
+    assert long(20, longest=20).plan([0.5]).task.horizon == 20
+
+
+def test_the_cost_of_a_long_horizon_is_stated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ctxval.core.preflight._LONG", 50)
+    validation = long(60)
+    with pytest.warns(CostWarning, match="each plan with a horizon of 60 needs about"):
+        validation.plan([0.5])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        validation.plan([0.5])
+
+
+def test_the_offset_of_a_start_is_measured_as_the_distance_measures_states() -> None:
+    validation = make_validation()
+    plan = validation.plan([0.5])
+    moved = plan.model_trajectory.copy()
+    moved.states[0, 0] += 0.5
+    weights = [2.0, *[1.0] * (moved.states.shape[-1] - 1)]
+    offset = start_offset(validation.with_distance(FinalState(weights=weights)), [0.5], moved)
+    assert (offset.size, offset.text) == (pytest.approx(1.0), "0.5 in x0")
+    alone = start_offset(validation.with_distance(lambda m, s, t: 0.0), [0.5], moved)
+    assert alone.size == pytest.approx(0.5)
