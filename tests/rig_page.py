@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import contextlib
 import http.client
 import json
 import os
@@ -103,7 +104,9 @@ class Server:
             for name, value in given.items():
                 if value is not None:
                     connection.putheader(name, value)
-            connection.endheaders(body, encode_chunked=chunked)
+            # A server may answer and close before it has the whole body.
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                connection.endheaders(body, encode_chunked=chunked)
             answer = connection.getresponse()
             return Response(answer.status, dict(answer.getheaders()), answer.read())
         finally:
