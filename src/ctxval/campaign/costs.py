@@ -18,7 +18,7 @@ from ctxval.core.rollout import rollout
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
-from ctxval.learning.prediction import predict_distance
+from ctxval.learning import DynamicsStudy
 from ctxval.searches import Auto, Costs, Prediction
 from ctxval.searches.auto import FAST
 
@@ -62,7 +62,7 @@ class ThinkingCosts:
         loop = _cpu_seconds(lambda: rollout(parts.model.step, controller, task))
         made_up = [(validation.space.to_unit(point), _unlike(validation.plan(point))) for point in points]
         begun = _cpu_now()
-        prediction = predict_distance(validation, made_up)
+        prediction = DynamicsStudy(validation).predict(made_up)
         if prediction is None:
             return cls(design, loop)
         learning = _cpu_now() - begun

@@ -13,7 +13,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
-from ctxval.campaign.history import executed_trials
+from ctxval.campaign.history import executed_trials, for_known_values
 from ctxval.certificates.dynamics import MOST_DRAWS, bound_of
 from ctxval.certificates.dynamics_diagnostics import DENSE, PREDICTIONS, doubt_of, jumps
 from ctxval.certificates.dynamics_evidence import (
@@ -28,7 +28,10 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, Trial
 from ctxval.core.validation import Validation
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
+from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
+from ctxval.learning.worst_case import WorstCase
+from ctxval.searches import Prediction
 from ctxval.storage.store import Store
 
 PREDICTION = "prediction"
@@ -75,9 +78,16 @@ class CampaignDynamics:
         self.failure: str | None = None
         self._learned: dict[tuple[int, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]] = {}
 
+    @property
+    def planner(self) -> LoopPlanner:
+        """Designs controllers and runs closed loops."""
+        return self._study.planner
+
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials teach; None if they teach nothing."""
         executed, others = executed_trials(self._store, trials), () if alone else self.elsewhere()
+        if not self._study.is_current:
+            self._study, self._learned = DynamicsStudy(self._study.validation, self._study.seed), {}
         # The recordings are kept with what they taught, so that their identities stay theirs.
         key = (*(trial.number for trial, _ in executed), -1, *map(id, others))
         if key not in self._learned:
@@ -86,6 +96,13 @@ class CampaignDynamics:
             self._learned[key] = others, *self._learn(executed, others)
         _, found, self.failure = self._learned[key]
         return found
+
+    def prediction(self, trials: Sequence[Trial]) -> Prediction | None:
+        """Return the distance predicted from the executed trajectories, for a search; None if there is none."""
+        executed = executed_trials(self._store, trials)
+        pairs = [(trial.unit_point, trajectory) for trial, trajectory in executed]
+        found = self._study.prediction_of(self.learned(trials), pairs)
+        return None if found is None else for_known_values(found, trials, [trial for trial, _ in executed])
 
     def predict(self, trials: Sequence[Trial], point: Array, *, alone: bool = False) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task from completed trials; None if nothing can be predicted.
@@ -102,29 +119,43 @@ class CampaignDynamics:
         except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
             return None
 
+    def screening(self, trials: Sequence[Trial]) -> DynamicsEvidence | None:
+        """Return quick evidence of a few draws, whose bound is too low and whose diagnostics lack expensive ones."""
+        with stage("searching the learned dynamics", self._study.search.screening_loops, "closed loops"):
+            learned = self.learned(trials)
+            return None if learned is None else self._guarded(lambda: self._evidence(learned, trials, learned.screened))
+
     def evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
         """Return what the learned dynamics say about d*; None if nothing can be learned."""
         draws = min(MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
         with stage("searching the learned dynamics", self._study.search.expected_loops(draws), "closed loops"):
             learned = self.learned(trials)
-            return None if learned is None else self._evidence_or_none(learned, trials, draws, confidence)
+            return None if learned is None else self._guarded(lambda: self._whole(learned, trials, draws, confidence))
 
-    def _evidence_or_none(
-        self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int, confidence: float
-    ) -> DynamicsEvidence | None:
+    def _guarded(self, function: Callable[[], DynamicsEvidence]) -> DynamicsEvidence | None:
         try:
-            found = self._evidence(learned, trials, draws)
-            best = max((trial.distance or 0.0 for trial in trials), default=0.0)
-            bound = bound_of(found, best, confidence)
-            # Many closed loops, which only matter to a bound that nothing else withdraws.
-            return found if doubt_of(found, best, bound) else _with_jumps(found, learned, bound)
+            return function()
         except Exception as error:  # the user's parts, at states that no execution has reached, must not end a campaign
             self.failure = reason_of(error)
             return None
 
-    def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int) -> DynamicsEvidence:
-        worst, names = learned.worst_case_of(draws), self._study.validation.space.names
-        untried = learned.untried_parameter
+    def _whole(
+        self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int, confidence: float
+    ) -> DynamicsEvidence:
+        found = self._evidence(learned, trials, learned.worst_case_of(draws))
+        found = replace(
+            found,
+            noise=learned.posterior.noise,
+            groups=len(found.maxima) // len(learned.posterior.components),
+            without_model=learned.posterior.covariances.without_model,
+        )
+        best = max((trial.distance or 0.0 for trial in trials), default=0.0)
+        bound = bound_of(found, best, confidence)
+        # Many closed loops, which only matter to a bound that nothing else withdraws.
+        return found if doubt_of(found, best, bound) else _with_jumps(found, learned, bound)
+
+    def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase) -> DynamicsEvidence:
+        names, untried = self._study.validation.space.names, learned.untried_parameter
         return DynamicsEvidence(
             worst.maxima,
             worst.points,
@@ -133,13 +164,11 @@ class CampaignDynamics:
             worst.evaluations,
             len(learned.executed),
             worst.left_out,
-            learned.posterior.noise,
+            0.0,
             self._checked(trials),
             _coverage(learned.coverage, self._coordinates(learned)),
-            groups=len(worst.maxima) // len(learned.posterior.components),
             unplanned=worst.unplanned,
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
-            without_model=learned.posterior.without_model,
             sharpness=worst.sharpness,
             dense=worst.points.shape[1] <= DENSE and self._study.planner.batched,
         )

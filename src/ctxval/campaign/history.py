@@ -10,7 +10,6 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
-from ctxval.learning.prediction import DistancePredictor
 from ctxval.searches import Prediction
 from ctxval.storage.store import Store
 
@@ -39,15 +38,13 @@ def executed_trials(store: Store, trials: Sequence[Trial]) -> list[tuple[Trial, 
     return [(trial, found[trial.number]) for trial in completed if trial.number in found]
 
 
-def predict_from(predictor: DistancePredictor, store: Store, trials: Sequence[Trial]) -> Prediction | None:
-    """Return the distance predicted from the executed trajectories; None if no prediction is possible."""
-    executed = executed_trials(store, trials)
-    prediction = predictor.predict([(trial.unit_point, trajectory) for trial, trajectory in executed])
+def for_known_values(prediction: Prediction, trials: Sequence[Trial], executed: Sequence[Trial]) -> Prediction:
+    """Return a prediction learned from executed trials, with one row for each known value of a search."""
     known = [trial for trial in history_of(trials) if trial.distance is not None]
-    if prediction is None or [trial.number for trial in known] == [trial.number for trial, _ in executed]:
+    if [trial.number for trial in known] == [trial.number for trial in executed]:
         return prediction
     # A distance without a recording is a value that the search knows, but there is no trajectory for it.
-    row_of = {trial.number: row for row, (trial, _) in enumerate(executed)}
+    row_of = {trial.number: row for row, trial in enumerate(executed)}
     rows = np.array([row_of.get(trial.number, -1) for trial in known], dtype=np.intp)
     return _by_known_value(prediction, np.array([trial.unit_point for trial in known]), rows)
 

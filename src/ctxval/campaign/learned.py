@@ -9,14 +9,11 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.campaign.dynamics import CampaignDynamics
-from ctxval.campaign.history import predict_from
 from ctxval.certificates import DynamicsEvidence
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
-from ctxval.learning import DistancePredictor
 from ctxval.searches import Prediction
-from ctxval.storage.store import Store
 
 _TASKS = 0x7461
 """Identifies the random stream of tasks that are only predicted; it is none of the streams of trials."""
@@ -28,20 +25,14 @@ class LearnedFromTrials:
 
     Attributes:
         validation: the map p -> d(p).
-        store: the store of the trajectories.
         trials: all trials of the campaign.
         study: what the trajectories teach of the dynamics.
     """
 
     validation: Validation
-    store: Store
     trials: Sequence[Trial]
     study: CampaignDynamics
-    _predictor: DistancePredictor = field(init=False)
     _predictions: dict[int, Prediction | None] = field(default_factory=dict, init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_predictor", DistancePredictor(self.validation))
 
     def expected(self, points: Array, before: int) -> Array:
         """Return predicted distances ``(m,)`` at points ``(m, d)``, learned from the trials with smaller numbers.
@@ -66,5 +57,5 @@ class LearnedFromTrials:
         """Return the prediction from the trials with smaller numbers; it is computed once."""
         if before not in self._predictions:
             earlier = [trial for trial in self.trials if trial.number < before]
-            self._predictions[before] = predict_from(self._predictor, self.store, earlier)
+            self._predictions[before] = self.study.prediction(earlier)
         return self._predictions[before]

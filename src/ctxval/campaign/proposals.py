@@ -15,16 +15,12 @@ from ctxval._util.progress import stage
 from ctxval._util.texts import enumerated, shortened
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.costs import costs_of
-from ctxval.campaign.dynamics import AUDIT, PREDICTION
-from ctxval.campaign.history import predict_from
+from ctxval.campaign.dynamics import AUDIT, PREDICTION, CampaignDynamics
 from ctxval.campaign.steadiness import Steadiness
 from ctxval.core.trial import CONVERGED, UNSTEADY, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
-from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.prediction import DistancePredictor
 from ctxval.searches import BaseSearch, SequentialSearch
-from ctxval.storage.store import Store
 
 _MOVED = 0x6D6F
 """Identifies the random stream of moves away from tasks that are not steady."""
@@ -36,24 +32,22 @@ class Proposals:
     Args:
         validation: the map p -> d(p).
         search: chooses points of the unit cube.
-        store: the store of the trajectories.
+        dynamics: predicts distances from the executed trajectories.
     """
 
-    def __init__(self, validation: Validation, search: BaseSearch, store: Store) -> None:
-        self._validation, self._search, self._store = validation, search, store
-        self._predictor = DistancePredictor(validation)
-        self._planner = LoopPlanner(validation)
+    def __init__(self, validation: Validation, search: BaseSearch, dynamics: CampaignDynamics) -> None:
+        self._validation, self._search, self._dynamics = validation, search, dynamics
 
     def next(self, trials: Sequence[Trial], rejected: int = 0) -> tuple[Array, dict[str, Any] | None]:
         """Return the search's next point ``(d,)`` and its note."""
-        steady = Steadiness(self._planner)
+        steady = Steadiness(self._dynamics.planner)
         if not self._search.uses_prediction:
             return self._executable(self._asked(), trials, steady, rejected)
         with stage("choosing a task", unit="designs"):
-            prediction = predict_from(self._predictor, self._store, trials)
+            prediction = self._dynamics.prediction(trials)
             if prediction is not None:
                 expected = prediction.expected
-                steady = Steadiness(self._planner, lambda points: expected(points)[0])
+                steady = Steadiness(self._dynamics.planner, lambda points: expected(points)[0])
                 costs = partial(costs_of, prediction, self._validation, trials)
                 prediction = replace(prediction, costs=costs, steady=steady)
             self._search.use_prediction(prediction)
@@ -64,7 +58,7 @@ class Proposals:
         assert choice.unit_point is not None
         if choice.parameters is not None or choice.origin == "iid":
             return choice.unit_point, choice.note
-        steady, point, rejected = Steadiness(self._planner), choice.unit_point, choice.rejected
+        steady, point, rejected = Steadiness(self._dynamics.planner), choice.unit_point, choice.rejected
         if rejected is None:
             point, rejected = self._steady(point, trials, steady), steady.rejected
         return self._validation.space.rounded(point), _with_rejected(choice.note, rejected)

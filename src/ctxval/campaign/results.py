@@ -139,7 +139,7 @@ class CampaignResults:
         """What a certificate needs besides the trials: the task space, the search, changes, and what M predicts."""
         with self.store.snapshot():
             known = Provenance.of(self.store.description(), self.store.history())
-        learned = LearnedFromTrials(self.validation, self.store, self.trials, self._recorder.dynamics)
+        learned = LearnedFromTrials(self.validation, self.trials, self._recorder.dynamics)
         offsets = [(self.start_offset(trial), trial.number) for trial in self.completed]
         start = max(((o.size, f"{o.text} (trial {n})") for o, n in offsets if o is not None), default=None)
         return replace(known, space=self.validation.space, learned=learned, start=start)

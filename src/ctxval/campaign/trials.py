@@ -66,7 +66,7 @@ class TrialRecorder:
         self.dynamics = CampaignDynamics(validation, store, seed, description)
         self.predicts = False
         self._goals_of_model = GoalsOfModel(validation)
-        self._proposals = Proposals(validation, self.search, store)
+        self._proposals = Proposals(validation, self.search, self.dynamics)
         self._seed = seed
         self._distance_tried = False
         self._executing: set[int] = set()
@@ -158,7 +158,7 @@ class TrialRecorder:
         elsewhere = self.dynamics.elsewhere
         self.dynamics = CampaignDynamics(validation, self.store, self._seed, description)
         self.dynamics.elsewhere = elsewhere
-        self._proposals = Proposals(validation, self.search, self.store)
+        self._proposals = Proposals(validation, self.search, self.dynamics)
         self.replay()
 
     # Opening

@@ -21,18 +21,27 @@ from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, St
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.covering import RESOLUTION
-from ctxval.certificates.dynamics import Dynamics, certify_dynamics
-from ctxval.certificates.dynamics_diagnostics import AUDITED, FEWEST, held, uncovered, untested, untried_parameter
+from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
+from ctxval.certificates.dynamics_diagnostics import (
+    AUDITED,
+    FEWEST,
+    doubt_of,
+    held,
+    uncovered,
+    untested,
+    untried_parameter,
+)
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.verdict import counterexample
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
-from ctxval.learning.closed_loops import LoopPlanner
 
 _FAILING = 6
 """Number of the last predictions, of which at least half must hold."""
 _PATIENCE = 16
 """Number of executions after which ``auto`` uses the posterior bound if the dynamics have not decided."""
+_SAME = 1e-6
+"""Largest difference in each coordinate between tasks that lead to the same states."""
 _EXPLORE = 3
 """Every so many executions, the task that leads farthest from the records is executed in any case."""
 
@@ -82,17 +91,18 @@ class UntilDecided:
         evidence = self._evidence(trials)
         if evidence is None or self._fails(evidence):
             return self._by_distance(trials)
-        if self._decides(trials, evidence):
-            return self._audit(evidence) if self.audited else None
+        if self._may_decide(trials, evidence):
+            evidence = self.recorder.dynamics.evidence(trials, self.options.confidence)
+            if evidence is None:
+                return self._by_distance(trials)
+            if self._decides(trials, evidence):
+                return self._audit(evidence) if self.audited else None
         if isinstance(self.options.kind, Automatic) and self.recorder.executions >= _PATIENCE:
             return self._by_distance(trials)
         known = _points(trials, self._dimension)
         best = max((trial.distance or 0.0 for trial in trials), default=0.0)
         learned = self.recorder.dynamics.learned(trials)
-        if learned is None:
-            steady = Steadiness(LoopPlanner(self.recorder.validation))
-        else:  # its planner knows already whether designs take batches
-            steady = Steadiness(learned.study.planner, learned.expected)
+        steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
         point = next_task(evidence, known, best, self.threshold, self.options.confidence, steady)
         # The results decide when the campaign ends, so the number of independent draws is not planned.
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
@@ -102,10 +112,10 @@ class UntilDecided:
         return self.recorder.validation.space.dimension
 
     def _evidence(self, trials: Sequence[Trial]) -> DynamicsEvidence | None:
-        """Return what the learned dynamics say; None if the certificate does not use them."""
+        """Return what a few draws of the learned dynamics say; None if the certificate does not use them."""
         if not self.predicts or any(trial.state == "failed" for trial in trials):
             return None
-        return self.recorder.dynamics.evidence(trials, self.options.confidence)
+        return self.recorder.dynamics.screening(trials)
 
     def _fails(self, evidence: DynamicsEvidence) -> bool:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
@@ -115,10 +125,16 @@ class UntilDecided:
         bound = min(evidence.upper(self.options.confidence), self.threshold)
         return len(last) == _FAILING and 2 * sum(held(one, bound) for one in last) < _FAILING
 
+    def _may_decide(self, trials: Sequence[Trial], screened: DynamicsEvidence) -> bool:
+        """Return whether the whole evidence may decide: nothing that a few draws show leaves the verdict open."""
+        if sum(trial.state != "open" for trial in trials) < FEWEST:
+            return False
+        best = max((trial.distance or 0.0 for trial in trials), default=0.0)
+        bound = bound_of(screened, best, self.options.confidence)
+        return bound <= self.threshold and doubt_of(screened, best, bound) is None
+
     def _decides(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> bool:
         ended = [trial for trial in trials if trial.state != "open"]
-        if len(ended) < FEWEST:
-            return False
         try:
             found = certify_dynamics(Sample.of(ended), evidence, self.options.confidence)
         except CertificateError:
@@ -208,9 +224,13 @@ def next_task(
         candidates = [largest, highest, farthest]
     else:
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]
-    points = np.concatenate(candidates)
-    new = (point for point in points if not len(known) or np.abs(known - point).max(axis=1).min() > NEAR)
-    return next(filter(steady, new), None)
+
+    def is_new(point: Array) -> bool:
+        # Next to an executed task, the closed loop may still lead elsewhere: a start may jump between tasks.
+        least = _SAME if np.array_equal(point, evidence.coverage.task) else NEAR
+        return not len(known) or bool(np.abs(known - point).max(axis=1).min() > least)
+
+    return next((point for point in np.concatenate(candidates) if is_new(point) and steady(point)), None)
 
 
 def _points(trials: Sequence[Trial], dimension: int) -> Array:

@@ -10,7 +10,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval.comparison.candidates import Candidate
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning import DistancePredictor
+from ctxval.learning import DynamicsStudy
 from ctxval.searches import Prediction
 
 _POOL = (400, 48)
@@ -43,7 +43,7 @@ class Predictions:
     def __init__(self, candidate: Candidate, seed: int) -> None:
         self.candidate, self._seed = candidate, seed
         self._space = candidate.campaign.validation.space
-        self._predictor = DistancePredictor(candidate.campaign.validation)
+        self._study = DynamicsStudy(candidate.campaign.validation, seed)
         self._batched = bool(getattr(candidate.campaign.validation.synthesizer, "batched", False))
         self._last: tuple[tuple[int, ...], Prediction | None] | None = None
 
@@ -91,7 +91,7 @@ class Predictions:
         key = tuple(id(trajectory) for _, trajectory in known)
         if self._last is None or self._last[0] != key:
             try:
-                found = self._predictor.predict(list(known))
+                found = self._study.predict(list(known))
             except Exception:  # the user's parts, at states that no execution has reached, must not end a comparison
                 found = None
             self._last = key, found

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
+from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from ctxval.learning.dynamics_posterior import DynamicsDraws
 
 _TASKS = 512
 """Largest number of tasks whose controllers are designed in one call."""
+_REMEMBERED = 64_000_000
+"""Largest size of the plans that are kept, in bytes, approximately."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +61,9 @@ class Loops:
 class LoopPlanner:
     """Designs controllers for points of the unit cube, and runs drawn systems in closed loop with them.
 
+    The latest plans are kept. Tasks that are planned together are kept together, because a controller of a batch need
+    not have parts; they are found again if the same points are asked for in the same order.
+
     Args:
         validation: the map p -> d(p); S is never executed.
     """
@@ -65,6 +71,8 @@ class LoopPlanner:
     def __init__(self, validation: Validation) -> None:
         self.validation = validation
         self._together: bool | None = None
+        self._kept: OrderedDict[bytes, tuple[list[PlannedTasks], int]] = OrderedDict()
+        self._size = 0
 
     @functools.cached_property
     def batched(self) -> bool:
@@ -87,8 +95,30 @@ class LoopPlanner:
             together: largest number of tasks that are planned in one call, if the synthesizer takes batches.
         """
         size = together if self.batched else 1
-        rows = np.arange(len(points))
-        return [one for first in range(0, len(points), size) for one in self._planned(points, rows[first:][:size])]
+        return [
+            replace(one, rows=first + one.rows)
+            for first in range(0, len(points), size)
+            for one in self._remembered(points[first : first + size])
+        ]
+
+    def has(self, point: Array) -> bool:
+        """Return whether the plan of one task ``(d,)`` is kept."""
+        return point.tobytes() in self._kept
+
+    def _remembered(self, points: Array) -> list[PlannedTasks]:
+        """Return the plans of points that are planned together; their rows count from 0."""
+        key = points.tobytes()
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            advance(len(points))  # as if they were planned
+            return self._kept[key][0]
+        planned = list(self._planned(points, np.arange(len(points))))
+        size = sum(map(_size, planned)) + len(key)
+        self._kept[key] = planned, size
+        self._size += size
+        while self._size > _REMEMBERED:
+            self._size -= self._kept.popitem(last=False)[1][1]
+        return planned
 
     def _planned(self, points: Array, rows: Rows) -> Iterator[PlannedTasks]:
         """Yield the plans of some rows. A batch that fails is halved; one task is then planned without batch axis."""
@@ -134,7 +164,7 @@ class LoopPlanner:
         found = np.full(S * q, np.nan)
         for one in self.plan(points.reshape(S * q, d), together=S * q):
             own = int(one.rows[0]) // q
-            step: Step = _OwnStep(draws, q, one.rows) if one.task.batch_shape else draws[own].step
+            step: Step = _OwnStep(draws, q, one.rows) if one.task.batch_shape else draws.model_of(own).step
             found[one.rows] = self.compared(one, rollout(step, one.controller, one.task))
             advance(len(one.rows))
         return found.reshape(S, q)
@@ -147,7 +177,7 @@ class LoopPlanner:
             together = rollout(step, planned.controller, Task(start, horizon=task.horizon, dt=task.dt))
             loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
         else:
-            loops = [rollout(draws[s].step, planned.controller, task) for s in range(S)]
+            loops = [rollout(draws.model_of(s).step, planned.controller, task) for s in range(S)]
         advance(S * len(planned.rows))
         states, inputs = np.stack([one.states for one in loops]), np.stack([one.inputs for one in loops])
         shape = (S, len(planned.rows))
@@ -235,6 +265,12 @@ class _OwnStep:
     def _needed(self) -> DynamicsDraws:
         """The draws with tasks in this batch."""
         return self.draws.between(self._first, int(self.rows[-1]) // self.tasks + 1)
+
+
+def _size(planned: PlannedTasks) -> int:
+    """Return the approximate size of a plan in bytes, with gains as large as those of a linear feedback."""
+    states, inputs = planned.promised.states, planned.promised.inputs
+    return 2 * (states.nbytes + inputs.nbytes) + int(states.shape[-1]) * inputs.nbytes
 
 
 def _without_divergence(loops: Trajectory, finite: Mask) -> Trajectory:

@@ -1,15 +1,17 @@
 """The posterior of the dynamics: ``S(x, u) = M(x, u) + r(x, u)`` with a Gaussian process of unknown hyperparameters.
 
-Functions r_s are drawn from it; each makes a model ``M + r_s``. A draw is exact at pivots, which are state-input pairs
-that the closed loops of the tasks visit, and is interpolated between them. So it is a sum of covariances with centres
-that all draws of one set of hyperparameters share, and thousands of closed loops on it are cheap.
+Its mean, for the most probable hyperparameters, predicts; its variance is the doubt of a prediction; and functions r_s
+are drawn from it, each of which makes a model ``M + r_s``. A draw is exact at pivots, which are state-input pairs that
+the closed loops of the tasks visit, and is interpolated between them. So all of these are sums of covariances with
+centres, and thousands of closed loops on them are cheap.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+import functools
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
@@ -24,11 +26,11 @@ from ctxval.gp.subset import pivoted_cholesky, pivoted_rows
 from ctxval.learning.hyperparameters import (
     FAMILIES,
     SMOOTHER_FAMILIES,
+    HyperparameterPosterior,
     Hyperparameters,
-    draw_hyperparameters,
     learning_rows,
 )
-from ctxval.learning.kernel_expansion import KernelExpansion
+from ctxval.learning.kernel_expansion import KernelExpansion, weights_without
 from ctxval.learning.recorded import affordable_centres
 from ctxval.learning.residual_data import ResidualData, residual_data
 from ctxval.learning.without_model import smoother_than
@@ -41,6 +43,14 @@ _ROUNDING = 1e-13
 """Posterior variances below this share of the prior variance are rounding errors."""
 _CENTRES = (150, 400)
 """Least and largest number of centres."""
+_REACH = 5.0
+"""Residuals of the mean are limited to this many times the largest one recorded."""
+_STEPS_SAMPLED = 12
+"""Number of steps of a predicted trajectory from which its unfamiliarity is computed."""
+_REPLACING = (600, 100)
+"""Number of other transitions from which replacements of those that are left out are chosen, and of replacements."""
+_ROUGH_CENTRES, _ROUGHLY = 64, 0.03
+"""Least number of centres of a rough mean, and its largest error as a share of the residuals that it predicts."""
 _LARGEST = 1e6
 """Standardised pairs are limited to this magnitude, so that a loop that diverges stays finite in its residual."""
 
@@ -56,6 +66,7 @@ class PosteriorSettings:
         centres: largest number of transitions that each process is conditioned on.
         pivots: largest number of pairs at which a draw is exact.
         families: smoothness and growth of each family of covariances.
+        of_steps: whether the system may be learned without M, if M is rougher than the system.
     """
 
     hyperparameters: int = 20
@@ -64,6 +75,7 @@ class PosteriorSettings:
     centres: int = 400
     pivots: int = 100
     families: tuple[tuple[float, float], ...] = FAMILIES
+    of_steps: bool = True
 
     @classmethod
     def for_horizon(cls, horizon: int) -> PosteriorSettings:
@@ -96,16 +108,13 @@ class Component:
     amplitudes: Array
 
     @classmethod
-    def conditioned(
-        cls, hyperparameters: Hyperparameters, Z: Array, Y: Array, centres: int, rng: np.random.Generator
-    ) -> Component:
-        """Return the process conditioned on well-spread pairs, with amplitudes drawn from their posterior."""
-        kernel, theta, noise = hyperparameters.kernel, hyperparameters.theta, hyperparameters.noise
-        rows = pivoted_rows(kernel, theta, Z, centres, least=_PIVOT * noise)
-        factor = factorise(kernel(theta, Z[rows], Z[rows]), tenfold(noise))
-        weights = factor.solve(Y[rows])
-        squares = (Y[rows] * weights).sum(axis=0)
-        return cls(hyperparameters, Z[rows], factor, weights, squares, _amplitudes(squares, len(rows), rng))
+    def conditioned(cls, hyperparameters: Hyperparameters, Z: Array, Y: Array, rng: np.random.Generator) -> Component:
+        """Return the process conditioned on pairs ``(M, k)``, with amplitudes drawn from their posterior."""
+        kernel, theta = hyperparameters.kernel, hyperparameters.theta
+        factor = factorise(kernel(theta, Z, Z), tenfold(hyperparameters.noise))
+        weights = factor.solve(Y)
+        squares = (Y * weights).sum(axis=0)
+        return cls(hyperparameters, Z, factor, weights, squares, _amplitudes(squares, len(Z), rng))
 
     def again(self, rng: np.random.Generator) -> Component:
         """Return the same process with other amplitudes."""
@@ -127,19 +136,9 @@ class Component:
 
     def _halved(self, Z: Array) -> tuple[Array, Array]:
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
-        half = self.factor.whiten(kernel(theta, self.centres, Z))
+        # For many pairs, a product with the inverse factor is several times as fast as substitution.
+        half = self.factor.whiten_many(kernel(theta, Z, self.centres).T)
         return half, np.maximum(kernel.diagonal(theta, Z) - (half**2).sum(axis=0), 0.0)
-
-    def draw(self, relevant: Array, count: int, pivots: int, rng: np.random.Generator) -> tuple[KernelExpansion, float]:
-        """Return draws that are exact at pivots, and the share of the variance that they leave out elsewhere.
-
-        Args:
-            relevant: pairs ``(R, k)`` that closed loops visit; the pivots are chosen from them.
-            count: number of draws.
-            pivots: largest number of pivots.
-            rng: the source of the draws.
-        """
-        return _drawn([self], relevant, count, pivots, rng)
 
     def pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
         """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""
@@ -166,7 +165,15 @@ def _amplitudes(squares: Array, count: int, rng: np.random.Generator) -> Array:
 def _drawn(
     alike: Sequence[Component], relevant: Array, count: int, pivots: int, rng: np.random.Generator
 ) -> tuple[KernelExpansion, float]:
-    """Return ``count`` draws of each of some components that differ in their amplitudes only; see Component.draw."""
+    """Return ``count`` draws of each of some components, and the share of the variance that they leave out elsewhere.
+
+    Args:
+        alike: components that differ in their amplitudes only.
+        relevant: pairs ``(R, k)`` that closed loops visit; the pivots, at which draws are exact, are chosen from them.
+        count: number of draws.
+        pivots: largest number of pivots.
+        rng: the source of the draws.
+    """
     own = alike[0]
     chosen, L, left_out = own.pivots(relevant, pivots)
     if not len(chosen):
@@ -183,43 +190,215 @@ def _drawn(
 
 
 @dataclass(frozen=True, eq=False)
+class LearnedCovariances:
+    """The posterior of the hyperparameters, learned from the transitions of some executions.
+
+    Attributes:
+        model: the model to which residuals are added: M, or a linear one.
+        without_model: whether it is a linear one, because M is rougher than the system.
+        scale: the units of the standardised pairs to which the hyperparameters belong, shape ``(n + m,)``.
+        posterior: the posterior of the hyperparameters.
+        settings: numbers on which accuracy and cost depend.
+        seed: seed of the draws.
+    """
+
+    model: Model
+    without_model: bool
+    scale: Array
+    posterior: HyperparameterPosterior
+    settings: PosteriorSettings
+    seed: tuple[int, ...]
+
+    @functools.cached_property
+    def drawn(self) -> list[Hyperparameters]:
+        """The draws of the hyperparameters; the first one is their mode."""
+        rng = np.random.default_rng(self.seed)
+        with single_threaded():
+            return [self.posterior.mode, *self.posterior.draw(self.settings.hyperparameters - 1, rng)]
+
+    def __repr__(self) -> str:
+        return call(self, self.model)
+
+
+@dataclass(frozen=True, eq=False)
 class DynamicsPosterior:
     """The posterior of the dynamics of S, given recorded transitions.
 
     Attributes:
-        model: the model to which residuals are added: M, or a linear one.
+        covariances: the model to which residuals are added, and the posterior of the hyperparameters.
         data: the standardised residuals.
-        components: posteriors of the learned states, one for each draw of the hyperparameters; the first one has the
-            most probable hyperparameters.
-        settings: its settings.
-        without_model: whether residuals are added to a linear model, because M is rougher than the system.
     """
 
-    model: Model
+    covariances: LearnedCovariances
     data: ResidualData
-    components: tuple[Component, ...]
-    settings: PosteriorSettings = field(default_factory=PosteriorSettings)
-    without_model: bool = False
 
     @property
-    def mean(self) -> DynamicsDraws:
-        """The model M plus the posterior mean of r for the most probable hyperparameters, as one draw."""
-        return DynamicsDraws(self.model, self.data, (self.components[0].mean,), (0.0,))
+    def model(self) -> Model:
+        """The model to which residuals are added."""
+        return self.covariances.model
 
-    def draw(self, relevant: Array, rng: np.random.Generator, functions: int | None = None) -> DynamicsDraws:
+    @property
+    def settings(self) -> PosteriorSettings:
+        """Numbers on which accuracy and cost depend."""
+        return self.covariances.settings
+
+    @functools.cached_property
+    def most_probable(self) -> Component:
+        """The posterior of the learned states for the mode of the hyperparameters."""
+        return self._component(0)
+
+    @functools.cached_property
+    def components(self) -> tuple[Component, ...]:
+        """The posteriors of the learned states for each draw of the hyperparameters, the mode first.
+
+        Hyperparameters whose covariance matrix is not positive definite are left out.
+        """
+        found, drawn = [self.most_probable], self.covariances.drawn
+        last = drawn[0]
+        for row, one in enumerate(drawn[1:], 1):
+            if one is last:
+                found.append(found[-1].again(self._rng(row)))
+                continue
+            with contextlib.suppress(InputError):
+                found.append(self._component(row))
+                last = one
+        return tuple(found)
+
+    @functools.cached_property
+    def rows(self) -> Rows:
+        """The transitions that it is conditioned on; each has the largest variance given those before it.
+
+        They represent the others for the most probable hyperparameters, and are the same for all hyperparameters.
+        """
+        most = self._rescaled(self.covariances.posterior.mode)
+        with single_threaded():
+            return pivoted_rows(
+                most.kernel, most.theta, self.data.pairs, self.settings.centres, least=_PIVOT * most.noise
+            )
+
+    def _component(self, row: int) -> Component:
+        with single_threaded():
+            drawn = self.covariances.drawn[row] if row else self.covariances.posterior.mode
+            return Component.conditioned(self._rescaled(drawn), *self._known(self.rows), self._rng(row))
+
+    def _rescaled(self, drawn: Hyperparameters) -> Hyperparameters:
+        """Return hyperparameters in the units of these data."""
+        theta = drawn.theta.copy()
+        theta[:-2] += np.log(self.covariances.scale / self.data.scale)
+        return replace(drawn, theta=theta)
+
+    def _known(self, rows: Rows) -> tuple[Array, Array]:
+        """Return the pairs and the residuals of the learned states of some transitions."""
+        return self.data.pairs[rows], self.data.outputs[rows][:, self.data.learned]
+
+    def _rng(self, row: int) -> np.random.Generator:
+        return np.random.default_rng([*self.covariances.seed, len(self.data.pairs), row])
+
+    # The mean
+
+    @functools.cached_property
+    def mean(self) -> DynamicsDraws:
+        """The model plus the posterior mean of r for the most probable hyperparameters, as one draw."""
+        return self._limited(self.most_probable.mean)
+
+    @functools.cached_property
+    def rough_mean(self) -> DynamicsDraws:
+        """The same with fewer centres if those predict the others well; it is cheaper to evaluate."""
+        rough = self.with_few_centres(_ROUGH_CENTRES, _ROUGHLY)
+        return self.mean if len(rough.centres) == len(self.rows) else self._limited(rough)
+
+    def with_few_centres(self, least: int, error: float) -> KernelExpansion:
+        """Return the mean of r conditioned on as few of the transitions as predict the others well.
+
+        Args:
+            least: number of transitions that are tried first; then twice as many are, and so on.
+            error: largest error, as a share of the residuals at the others.
+        """
+        most, (Z, Y) = self.most_probable, self._known(self.rows)
+        while least < len(Z):
+            with single_threaded():
+                fewer = Component.conditioned(most.hyperparameters, Z[:least], Y[:least], self._rng(0)).mean
+                errors = fewer(Z[None, least:])[0] - Y[least:]
+            if (errors**2).mean() <= error**2 * (Y[least:] ** 2).mean():
+                return fewer
+            least *= 2
+        return most.mean
+
+    def means_without(self, left_out: Sequence[Collection[int]]) -> DynamicsDraws:
+        """Return means without some executions, as one draw for each; the hyperparameters do not change.
+
+        Args:
+            left_out: for each of the means, the executions that it does not know.
+        """
+        most, unused = self.most_probable.hyperparameters, np.setdiff1d(np.arange(len(self.data.pairs)), self.rows)
+        some = unused[np.linspace(0, max(0, len(unused) - 1), min(_REPLACING[0], len(unused))).astype(int)]
+        with single_threaded():
+            least = _PIVOT * most.noise
+            spare = pivoted_rows(most.kernel, most.theta, self.data.pairs[some], _REPLACING[1], least=least)
+            rows = np.concatenate([self.rows, some[spare]])
+            Z, Y = self._known(rows)
+            gone = np.array([np.isin(self.data.sources[rows], list(without)) for without in left_out])
+            weights = weights_without(most.kernel(most.theta, Z, Z), most.noise, Y, gone)
+        return self._limited(KernelExpansion(most, Z, weights))
+
+    @property
+    def limit(self) -> Array:
+        """The largest standardised residual that the mean returns, in magnitude, shape ``(n,)``."""
+        return np.asarray(_REACH * np.abs(self.data.outputs).max(axis=0))
+
+    def _limited(self, mean: KernelExpansion) -> DynamicsDraws:
+        return DynamicsDraws(self.model, self.data, (mean,), (0.0,), self.limit[self.data.learned])
+
+    def unfamiliarity(self, states: Array, inputs: Array) -> Array:
+        """Return the standard deviation of r along trajectories, as a share of a typical step, ``(q,)``.
+
+        Args:
+            states, inputs: shapes ``(q, H + 1, n)`` and ``(q, H, m)``.
+        """
+        horizon, data, most = inputs.shape[1], self.data, self.most_probable
+        at = np.linspace(0, horizon - 1, min(_STEPS_SAMPLED, horizon)).astype(int)
+        Z = _bounded(data.standardised(states[:, at], inputs[:, at]))
+        variance = most.variance(Z.reshape(-1, Z.shape[-1])).reshape(Z.shape[:2]).mean(axis=1)
+        sizes = (data.sizes / data.steps)[data.learned] ** 2 * most.squares / len(most.centres)
+        return np.asarray(np.sqrt(variance * sizes.mean()))
+
+    # Draws
+
+    def draw(
+        self,
+        relevant: Array,
+        rng: np.random.Generator,
+        functions: int | None = None,
+        hyperparameters: int | None = None,
+    ) -> DynamicsDraws:
         """Return draws of the dynamics.
 
         Args:
             relevant: standardised pairs ``(R, k)`` that closed loops visit.
             rng: the source of the draws.
             functions: number of functions for each draw of the hyperparameters; that of the settings if None.
+            hyperparameters: number of draws of the hyperparameters that are used; all if None.
         """
         count = self.settings.functions if functions is None else functions
         with single_threaded():
             # Adjacent components of the same hyperparameters share their pivots and are evaluated together.
-            groups = [list(group) for _, group in groupby(self.components, lambda one: id(one.hyperparameters))]
+            components = self._some_components(hyperparameters)
+            groups = [list(group) for _, group in groupby(components, lambda one: id(one.factor))]
             drawn = [_drawn(group, relevant, count, self.settings.pivots, rng) for group in groups]
-        return DynamicsDraws(self.model, self.data, *(tuple(part) for part in zip(*drawn, strict=True)))
+        expansions, left_out = zip(*drawn, strict=True)
+        return DynamicsDraws(self.model, self.data, expansions, left_out)
+
+    def _some_components(self, count: int | None) -> Sequence[Component]:
+        """Return the components of about so many draws of the hyperparameters, evenly spread; all if None."""
+        if count is None or "components" in self.__dict__:
+            every = 1 if count is None else max(1, len(self.components) // count)
+            return self.components[::every]
+        rows = np.unique(np.linspace(1, len(self.covariances.drawn) - 1, count - 1).astype(int)).tolist()
+        found = [self.most_probable]
+        for row in rows:
+            with contextlib.suppress(InputError):
+                found.append(self._component(row))
+        return found
 
     @property
     def noise(self) -> float:
@@ -230,7 +409,7 @@ class DynamicsPosterior:
         return float(np.median([(one.noise**2).max() for one in self.components]))
 
     def __repr__(self) -> str:
-        return call(self, self.model, components=len(self.components), data=self.data)
+        return call(self, self.model, data=self.data)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,12 +421,14 @@ class DynamicsDraws:
         data: constants that standardise pairs and residuals.
         expansions: functions r_s, in groups that share their centres.
         left_out: share of the posterior variance that the draws of each group leave out between pivots.
+        limit: the largest standardised residual of each learned state, in magnitude; None if there is no limit.
     """
 
     model: Model
     data: ResidualData
     expansions: tuple[KernelExpansion, ...]
     left_out: tuple[float, ...]
+    limit: Array | None = None
 
     def __len__(self) -> int:
         return sum(len(one.weights) for one in self.expansions)
@@ -255,36 +436,47 @@ class DynamicsDraws:
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
         with np.errstate(all="ignore"):
-            z = self.data.standardised(x, u)
-            np.maximum(z, -_LARGEST, out=z)
-            np.minimum(z, _LARGEST, out=z)
-            z[np.isnan(z)] = 0.0
+            z = _bounded(self.data.standardised(x, u))
             residuals, learned, first = np.zeros_like(x), self.data.learned, 0
             for one in self.expansions:
                 last = first + len(one.weights)
                 residuals[first:last, :, learned] = one(z[first:last])
                 first = last
+            if self.limit is not None:
+                residuals[..., learned] = np.clip(residuals[..., learned], -self.limit, self.limit)
             return self.model.step(x, u) + residuals * self.data.units
 
     def between(self, first: int, last: int) -> DynamicsDraws:
         """Return the draws from ``first`` up to and without ``last``."""
         groups, left_out, start = [], [], 0
         for one, left in zip(self.expansions, self.left_out, strict=True):
-            own = one.weights[max(first - start, 0) : max(last - start, 0)]
-            if len(own):
-                groups.append(KernelExpansion(one.hyperparameters, one.centres, own))
-                left_out.append(left)
+            own = slice(max(first - start, 0), max(last - start, 0))
             start += len(one.weights)
-        return DynamicsDraws(self.model, self.data, tuple(groups), tuple(left_out))
+            if len(one.weights[own]):
+                groups.append(one[own])
+                left_out.append(left)
+        return replace(self, expansions=tuple(groups), left_out=tuple(left_out))
 
-    def __getitem__(self, index: int) -> DrawnModel:
-        """Return one draw as a model."""
+    def __getitem__(self, index: int) -> DynamicsDraws:
+        """Return one draw."""
         if not 0 <= index < len(self):
             raise IndexError(f"there are {len(self)} draws.")
-        return DrawnModel(self.between(index, index + 1))
+        return self.between(index, index + 1)
+
+    def model_of(self, index: int) -> DrawnModel:
+        """Return one draw as a model."""
+        return DrawnModel(self[index])
 
     def __repr__(self) -> str:
         return call(self, self.model, draws=len(self))
+
+
+def _bounded(z: Array) -> Array:
+    """Return standardised pairs within limits, in the same array; NaN becomes 0."""
+    np.maximum(z, -_LARGEST, out=z)
+    np.minimum(z, _LARGEST, out=z)
+    z[np.isnan(z)] = 0.0
+    return z
 
 
 class DrawnModel:
@@ -302,14 +494,14 @@ class DrawnModel:
         return np.asarray(self._draws.step(rows_of(x)[None], rows_of(u)[None]).reshape(x.shape))
 
 
-def learn_posterior(
+def learn_covariances(
     model: Model,
     transitions: Transitions,
     sources: Rows,
-    rng: np.random.Generator,
+    seed: tuple[int, ...] = (0,),
     settings: PosteriorSettings | None = None,
-) -> DynamicsPosterior | None:
-    """Return the posterior of the dynamics given recorded transitions.
+) -> LearnedCovariances | None:
+    """Return the posterior of the hyperparameters given recorded transitions.
 
     Returns None if fewer than two transitions are usable, or if M explains all of them. If M is rougher than S, the
     residuals are those of a linear model (:mod:`ctxval.learning.without_model`).
@@ -318,7 +510,7 @@ def learn_posterior(
         model: the model M.
         transitions: N transitions of the system.
         sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
-        rng: the source of the draws of the hyperparameters.
+        seed: seed of the draws.
         settings: numbers on which accuracy and cost depend; the defaults if None.
     """
     chosen = PosteriorSettings() if settings is None else settings
@@ -328,26 +520,40 @@ def learn_posterior(
     with single_threaded():
         smoother = None
         with contextlib.suppress(InputError, np.linalg.LinAlgError):  # numbers too large for a linear model
-            smoother = smoother_than(data, chosen.learned_from)
+            smoother = smoother_than(data, chosen.learned_from) if chosen.of_steps else None
         if smoother is not None:
             model, data = smoother
             chosen = chosen.without_model()
         Z, Y = data.pairs, data.outputs[:, data.learned]
         rows = learning_rows(Z, data.inputs, chosen.learned_from)
-        drawn = draw_hyperparameters(Z[rows], Y[rows], data.inputs, chosen.hyperparameters, rng, chosen.families)
-        components = tuple(_conditioned(drawn, Z, Y, chosen.centres, rng))
-    return DynamicsPosterior(model, data, components, chosen, smoother is not None)
+        found = HyperparameterPosterior.given(Z[rows], Y[rows], data.inputs, chosen.families)
+    return LearnedCovariances(model, smoother is not None, data.scale, found, chosen, seed)
 
 
-def _conditioned(
-    drawn: Sequence[Hyperparameters], Z: Array, Y: Array, centres: int, rng: np.random.Generator
-) -> list[Component]:
-    """Return the processes of those hyperparameters whose covariance matrix is positive definite."""
-    found: list[Component] = []
-    for one in drawn:
-        if found and found[-1].hyperparameters is one:
-            found.append(found[-1].again(rng))
-            continue
-        with contextlib.suppress(InputError):
-            found.append(Component.conditioned(one, Z, Y, centres, rng))
-    return found
+def condition(covariances: LearnedCovariances, transitions: Transitions, sources: Rows) -> DynamicsPosterior | None:
+    """Return the posterior of the dynamics given recorded transitions, and hyperparameters learned from some of them.
+
+    Returns None if fewer than two transitions are usable, or if the model explains all of them.
+
+    Args:
+        covariances: the posterior of the hyperparameters.
+        transitions, sources: as in :func:`learn_covariances`.
+    """
+    data = residual_data(covariances.model, transitions, sources)
+    return None if data is None else DynamicsPosterior(covariances, data)
+
+
+def learn_posterior(
+    model: Model,
+    transitions: Transitions,
+    sources: Rows,
+    seed: tuple[int, ...] = (0,),
+    settings: PosteriorSettings | None = None,
+) -> DynamicsPosterior | None:
+    """Return the posterior of the dynamics, with hyperparameters that are learned from the same transitions.
+
+    Args:
+        model, transitions, sources, seed, settings: as in :func:`learn_covariances`.
+    """
+    found = learn_covariances(model, transitions, sources, seed, settings)
+    return None if found is None else condition(found, transitions, sources)

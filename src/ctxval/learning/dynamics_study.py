@@ -3,28 +3,46 @@
 from __future__ import annotations
 
 import functools
+import time
+from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.boxes import moves_to_bounds
+from ctxval._util.describe import describe
 from ctxval._util.representation import call
-from ctxval.core.trajectory import Trajectory
+from ctxval.core.distance import ComposedDistance
+from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, coverage
-from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
+from ctxval.learning.dynamics_posterior import (
+    DynamicsPosterior,
+    LearnedCovariances,
+    PosteriorSettings,
+    condition,
+    learn_covariances,
+)
+from ctxval.learning.error_vectors import ErrorVectors, Executed
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
+from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
+from ctxval.learning.vector import predict_composed
 from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings, loop_pairs
 from ctxval.models.corrected import before_refinement
+from ctxval.searches import Prediction
 
 _PROBED = 8
 """Number of tasks at which each task parameter is moved, to see whether it changes the closed loops of M."""
 _WEAK = 0.02
 """A change of the loops by less than this many standard deviations of states and inputs is no change."""
+_SLOW = 0.02
+"""Seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores."""
+_REMEMBERED = 8
+"""Number of sets of executions whose covariances are kept."""
 _PAIRS = 300
 """Largest number of pairs from which the pivots of a single task are chosen."""
 
@@ -32,7 +50,7 @@ _PAIRS = 300
 class DynamicsStudy:
     """Learns the dynamics of one experiment from growing sets of executions.
 
-    Everything is a function of the executions and the seed. The controllers of the pool are designed once.
+    Everything is a function of the executions and the seed. Controllers that are designed are kept.
 
     Args:
         validation: the map p -> d(p); S is never executed.
@@ -42,6 +60,23 @@ class DynamicsStudy:
     def __init__(self, validation: Validation, seed: int = 0) -> None:
         self.validation, self.seed = validation, seed
         self.planner = LoopPlanner(validation)
+        self._errors = ErrorVectors(self.planner)
+        self._covariances: OrderedDict[bytes, LearnedCovariances | None] = OrderedDict()
+        self._parts: tuple[str, bytes] | None = None
+
+    @property
+    def is_current(self) -> bool:
+        """Whether M and the synthesizer are as they were; fitting M again in place would change what is kept."""
+        return self._parts is None or self._parts == self._state_of_parts()
+
+    def _state_of_parts(self) -> tuple[str, bytes]:
+        """Return the description of M and the synthesizer, and some steps of M, which a description may not show."""
+        parts, steps = self.validation, b""
+        if self._loops is not None:
+            middle = self._loops.horizon // 2
+            pairs = self._loops.states[..., middle, :], self._loops.inputs[..., middle, :]
+            steps = np.asarray(parts.model.step(*pairs)).tobytes()
+        return repr(describe([parts.model, parts.synthesizer])), steps
 
     @functools.cached_property
     def search(self) -> WorstCaseSearch:
@@ -52,7 +87,10 @@ class DynamicsStudy:
     @functools.cached_property
     def _loops(self) -> Trajectory | None:
         with single_threaded():
-            return closed_loops_on_model(self.validation)
+            started = time.perf_counter()
+            found = closed_loops_on_model(self.validation)
+            self._slow = found is not None and not found.batch_shape and time.perf_counter() - started > _SLOW
+            return found
 
     @functools.cached_property
     def unseen_parameters(self) -> tuple[int, ...]:
@@ -78,9 +116,7 @@ class DynamicsStudy:
                     effects[j] = max(effects[j], float(np.nanmax(np.abs(high - low) / size)))
         return tuple(np.flatnonzero(effects < _WEAK).tolist())
 
-    def learn(
-        self, executed: Sequence[tuple[Array, Trajectory]], logged: Sequence[Trajectory] = ()
-    ) -> LearnedDynamics | None:
+    def learn(self, executed: Executed, logged: Sequence[Trajectory] = ()) -> LearnedDynamics | None:
         """Return what executions teach, and other recordings of the system.
 
         Returns None if there are no recorded transitions, if M explains them, or if no task can be planned.
@@ -89,19 +125,69 @@ class DynamicsStudy:
             executed: points of the unit cube ``(d,)`` with the system's trajectories there.
             logged: recordings with the same time step that belong to no task.
         """
-        if self._loops is None:
-            return None
-        trajectories = [trajectory for _, trajectory in executed]
-        recorded = recorded_transitions(self.validation.model, trajectories, self._loops, logged)
-        if recorded is None:
-            return None
-        rng = np.random.default_rng([self.seed, len(executed), 0])
-        settings = PosteriorSettings.for_horizon(self._loops.horizon)
-        posterior = learn_posterior(before_refinement(self.validation.model), *recorded, rng, settings)
-        if posterior is None or not posterior.components:
+        if self._parts is None:
+            self._parts = self._state_of_parts()
+        some = _scheduled(len(executed))
+        covariances = self._learned_covariances(executed[:some], logged)
+        if covariances is None and some < len(executed):
+            # If nothing could be learned when it was scheduled, it is learned now.
+            covariances = self._learned_covariances(executed, logged)
+        recorded = self._recorded(executed, logged)
+        posterior = None if covariances is None or recorded is None else condition(covariances, *recorded)
+        if posterior is None:
             return None
         points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)
         return LearnedDynamics(self, posterior, points)
+
+    def _learned_covariances(self, executed: Executed, logged: Sequence[Trajectory]) -> LearnedCovariances | None:
+        """Return the covariances learned from some executions; the latest ones are kept."""
+        together = [*(one for _, one in executed), *logged]
+        key = b"".join(part.tobytes() for one in together for part in (one.states, one.inputs))
+        if key not in self._covariances:
+            recorded = self._recorded(executed, logged)
+            if recorded is None or self._loops is None:
+                return None
+            model, seed = before_refinement(self.validation.model), (self.seed, len(executed), 0)
+            settings = PosteriorSettings.for_horizon(self._loops.horizon)
+            self._covariances[key] = learn_covariances(model, *recorded, seed, settings)
+            while len(self._covariances) > _REMEMBERED:
+                self._covariances.popitem(last=False)
+        return self._covariances[key]
+
+    def _recorded(self, executed: Executed, logged: Sequence[Trajectory]) -> tuple[Transitions, Rows] | None:
+        if self._loops is None:
+            return None
+        return recorded_transitions(self.validation.model, [one for _, one in executed], self._loops, logged)
+
+    def predict(self, executed: Executed) -> Prediction | None:
+        """Return the distances that executions predict, for a search; S is never executed.
+
+        Returns None if nothing can be learned.
+
+        If the distance is composed of a short vector, such as the error of the final state, a second prediction models
+        the vector as a function of p, because an error that is no function of state and input may still be a function
+        of p. The first prediction offers the second one as ``otherwise``. If there is no first prediction, the second
+        one is returned instead.
+
+        Args:
+            executed: points of the unit cube ``(d,)`` with the system's trajectories there.
+        """
+        return self.prediction_of(self.learn(executed), executed)
+
+    def prediction_of(self, learned: LearnedDynamics | None, executed: Executed) -> Prediction | None:
+        """Return :meth:`predict` for what was learned from these executions, and possibly from other recordings."""
+        with single_threaded():
+            if learned is None:
+                return self._predict_vectors(executed)
+            found = predict_distance(self.planner, learned.posterior, learned.executed, self._slow)
+            return replace(found, otherwise=lambda: self._predict_vectors(executed))
+
+    def _predict_vectors(self, executed: Executed) -> Prediction | None:
+        """Return the prediction from the vectors of which distances are composed; None if they are not known."""
+        distance, vectors = self.validation.distance, self._errors.of(executed)
+        if vectors is None or not isinstance(distance, ComposedDistance):
+            return None
+        return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)
 
     def __repr__(self) -> str:
         return call(self, self.validation, seed=self.seed)
@@ -134,12 +220,20 @@ class LearnedDynamics:
         """The largest distance over all tasks, for each of the usual number of draws."""
         return self.worst_case_of(self.posterior.settings.functions * len(self.posterior.components))
 
+    @functools.cached_property
+    def screened(self) -> WorstCase:
+        """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""
+        search = self.study.search
+        of_mean = search.on_mean(self.posterior, self.executed, self._rng(4), globally=False)
+        return search.screened(self.posterior, of_mean, self.executed, self._rng(5))
+
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
         functions = max(self.posterior.settings.functions, -(-draws // len(self.posterior.components)))
         if functions not in self._worst_cases:
-            found = self.study.search.maxima(self.posterior, self.executed, self._rng(1), functions)
-            self._worst_cases[functions] = found
+            search, known, rng = self.study.search, self.executed, self._rng(1)
+            of_mean = search.on_mean(self.posterior, known, rng)
+            self._worst_cases[functions] = search.maxima(self.posterior, of_mean, known, rng, functions)
         return self._worst_cases[functions]
 
     @functools.cached_property
@@ -188,6 +282,17 @@ class LearnedDynamics:
 
     def __repr__(self) -> str:
         return call(self, self.posterior, executed=len(self.executed))
+
+
+def _scheduled(count: int) -> int:
+    """Return the largest number of executions, up to ``count``, at which hyperparameters are learned.
+
+    These are 0 to 4, 6, 8, 12, 16, 24 and so on, two in each doubling.
+    """
+    step = 1
+    while count >= 4 * step:
+        step *= 2
+    return count - count % step
 
 
 def _widest_gap(values: Array) -> tuple[float, float]:

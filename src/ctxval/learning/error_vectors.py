@@ -12,16 +12,15 @@ from ctxval._util.progress import advance
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning.plan_memory import PlanMemory
+from ctxval.learning.closed_loops import LoopPlanner
 
 Executed = Sequence[tuple[Array, Trajectory]]
 """Points of the unit cube ``(d,)`` with the system's trajectories there."""
 
 
-def executions_of(executed: Executed, points: Iterable[Array]) -> list[list[int]]:
-    """Return the numbers of the executions of each of some points ``(d,)``."""
-    known = np.array([point for point, _ in executed])
-    return [np.flatnonzero((known.reshape(-1, len(point)) == point).all(axis=1)).tolist() for point in points]
+def executions_of(executed: Array, points: Iterable[Array]) -> list[list[int]]:
+    """Return the rows of executed points ``(n, d)`` at each of some points ``(d,)``."""
+    return [np.flatnonzero((executed.reshape(-1, len(point)) == point).all(axis=1)).tolist() for point in points]
 
 
 class ErrorVectors:
@@ -30,12 +29,12 @@ class ErrorVectors:
     A vector is kept as long as its trajectory is.
 
     Args:
-        plans: designs controllers, and keeps the latest ones.
+        planner: designs controllers.
     """
 
-    def __init__(self, plans: PlanMemory) -> None:
-        self.validation = plans.planner.validation
-        self._plans = plans
+    def __init__(self, planner: LoopPlanner) -> None:
+        self.validation = planner.validation
+        self._planner = planner
         self._known: WeakKeyDictionary[Trajectory, Array] = WeakKeyDictionary()
 
     def of(self, executed: Executed) -> Array | None:
@@ -63,9 +62,9 @@ class ErrorVectors:
 
     def _planned(self, point: Array) -> tuple[Task, Trajectory]:
         """Return a task and the trajectory of M, without batch axes."""
-        if self._plans.planner.batched:
+        if self._planner.batched:
             plan = self.validation.plan(self.validation.space.from_unit(point))
             advance()
             return plan.task, plan.model_trajectory
-        (planned,) = self._plans.plan(point[None])
+        (planned,) = self._planner.plan(point[None])
         return planned.task, planned.promised

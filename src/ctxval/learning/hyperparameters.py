@@ -8,6 +8,7 @@ there are weighted by the ratio of the densities, with weights truncated as by I
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -74,57 +75,86 @@ class _Mode:
     Attributes:
         kernel: the family.
         height: the log posterior there.
-        mode: the (theta, log noise) of the mode.
-        scale: matrix ``(D, D)`` that maps standard normal draws to draws around the mode.
+        place: the (theta, log noise) of the mode.
+        Z, Y: standardised pairs and residuals.
     """
 
     kernel: ResidualKernel
     height: float
-    mode: Array
-    scale: Array
+    place: Array
+    Z: Array
+    Y: Array
+
+    @functools.cached_property
+    def scale(self) -> Array:
+        """A root ``(D, D)`` of the inverse of the curvature of the log posterior, by differences of its gradient."""
+        low, high = _box(self.kernel, self.Z.shape[1])
+        curvature = np.empty((len(self.place), len(self.place)))
+        for i, step in enumerate(np.eye(len(self.place)) * _STEP):
+            up, down = np.minimum(self.place + step, high), np.maximum(self.place - step, low)
+            slopes = _gradient_or_zero(self.kernel, up, self.Z, self.Y)
+            slopes -= _gradient_or_zero(self.kernel, down, self.Z, self.Y)
+            curvature[i] = -slopes / (up - down)[i]
+        values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
+        return np.asarray(vectors / np.sqrt(np.maximum(values, _LEAST_CURVATURE)))
 
     def proposals(self, count: int, rng: np.random.Generator) -> Array:
         """Return draws ``(count, D)`` of a t distribution around the mode."""
-        normal = rng.standard_normal((count, len(self.mode)))
-        return self.mode + normal / np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM) @ self.scale.T
+        normal = rng.standard_normal((count, len(self.place)))
+        return self.place + normal / np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM) @ self.scale.T
 
     def log_density(self, draws: Array) -> Array:
         """Return the logarithms of the density ``(count,)`` of this t distribution."""
-        D = len(self.mode)
+        D = len(self.place)
         constant = gammaln((_FREEDOM + D) / 2) - gammaln(_FREEDOM / 2) - 0.5 * D * np.log(_FREEDOM * np.pi)
-        squares = (np.linalg.solve(self.scale, (draws - self.mode).T) ** 2).sum(axis=0)
+        squares = (np.linalg.solve(self.scale, (draws - self.place).T) ** 2).sum(axis=0)
         log_volume = np.linalg.slogdet(self.scale)[1]
         return np.asarray(constant - log_volume - 0.5 * (_FREEDOM + D) * np.log1p(squares / _FREEDOM))
 
 
-def draw_hyperparameters(
-    Z: Array, Y: Array, inputs: int, count: int, rng: np.random.Generator, families: Sequence[tuple[float, float]]
-) -> list[Hyperparameters]:
-    """Return draws from the posterior; the first one is the mode of the most probable family.
+@dataclass(frozen=True, eq=False)
+class HyperparameterPosterior:
+    """The posterior of the hyperparameters, given standardised residuals.
 
-    Args:
-        Z: standardised pairs ``(N, k)``.
-        Y: standardised residuals ``(N, n)``.
-        inputs: the number of inputs of the system.
-        count: the number of draws.
-        rng: the source of the draws.
-        families: smoothness and growth of each covariance.
+    Attributes:
+        families: the modes of each family of covariances.
     """
-    found, weights, modes = [], [], []
-    for nu, growth in families:
-        kernel = ResidualKernel(nu, growth, inputs)
-        of_family = _modes_of(kernel, Z, Y)
-        drawn = np.concatenate([mode.proposals(_PROPOSALS // len(of_family), rng) for mode in of_family])
-        # All modes of a family make one proposal distribution: the mixture of theirs in equal parts.
-        density = logsumexp([mode.log_density(drawn) for mode in of_family], axis=0) - np.log(len(of_family))
-        found += [(kernel, theta) for theta in drawn]
-        weights.append(np.array([_log_posterior_or_none(kernel, theta, Z, Y) for theta in drawn]) - density)
-        modes += of_family
-    best = max(modes, key=lambda mode: mode.height)
-    chosen = _resampled(np.concatenate(weights), count - 1, rng)
-    # A pair that is drawn again is the same object, so that what follows from it is computed once.
-    drawn_pairs = {row: _of(*found[row]) for row in chosen.tolist()}
-    return [_of(best.kernel, best.mode), *(drawn_pairs[row] for row in chosen.tolist())]
+
+    families: tuple[tuple[_Mode, ...], ...]
+
+    @classmethod
+    def given(cls, Z: Array, Y: Array, inputs: int, families: Sequence[tuple[float, float]]) -> HyperparameterPosterior:
+        """Return the posterior.
+
+        Args:
+            Z: standardised pairs ``(N, k)``.
+            Y: standardised residuals ``(N, n)``.
+            inputs: the number of inputs of the system.
+            families: smoothness and growth of each covariance.
+        """
+        return cls(tuple(_modes_of(ResidualKernel(nu, growth, inputs), Z, Y) for nu, growth in families))
+
+    @functools.cached_property
+    def mode(self) -> Hyperparameters:
+        """The mode of the most probable family."""
+        best = max((mode for family in self.families for mode in family), key=lambda mode: mode.height)
+        return _of(best.kernel, best.place)
+
+    def draw(self, count: int, rng: np.random.Generator) -> list[Hyperparameters]:
+        """Return ``count`` draws; hyperparameters that are drawn again are the same object, and follow each other."""
+        found, weights = [], []
+        for family in self.families:
+            drawn = np.concatenate([mode.proposals(_PROPOSALS // len(family), rng) for mode in family])
+            # All modes of a family make one proposal distribution: the mixture of theirs in equal parts.
+            density = logsumexp([mode.log_density(drawn) for mode in family], axis=0) - np.log(len(family))
+            first = family[0]
+            found += [(first.kernel, place) for place in drawn]
+            heights = [_log_posterior_or_none(first.kernel, place, first.Z, first.Y) for place in drawn]
+            weights.append(np.array(heights) - density)
+        chosen = _resampled(np.concatenate(weights), count, rng).tolist()
+        # What follows from the same object is computed once.
+        drawn_rows = {row: _of(*found[row]) for row in chosen}
+        return [drawn_rows[row] for row in chosen]
 
 
 def draw_prior(dimension: int, inputs: int, rng: np.random.Generator) -> Hyperparameters:
@@ -204,11 +234,11 @@ def _box(kernel: ResidualKernel, dimension: int) -> tuple[Array, Array]:
     return low, high
 
 
-def _modes_of(kernel: ResidualKernel, Z: Array, Y: Array) -> list[_Mode]:
+def _modes_of(kernel: ResidualKernel, Z: Array, Y: Array) -> tuple[_Mode, ...]:
     """Return the modes of a family, the highest first: one with little noise, one with much, or one that is both."""
-    (height, mode), (lower, other) = found = _climbed(kernel, Z, Y)
-    relevant = height - lower < _LOWEST and np.abs(mode - other).max() > _SAME
-    return [_Mode(kernel, *one, _scale_at(kernel, one[1], Z, Y)) for one in (found if relevant else found[:1])]
+    (height, place), (lower, other) = found = _climbed(kernel, Z, Y)
+    relevant = height - lower < _LOWEST and np.abs(place - other).max() > _SAME
+    return tuple(_Mode(kernel, *one, Z, Y) for one in (found if relevant else found[:1]))
 
 
 def _climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Array]]:
@@ -222,18 +252,6 @@ def _climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Ar
         )
         found.append((log_posterior(kernel, mode, Z, Y)[0], mode))
     return sorted(found, key=lambda one: -one[0])
-
-
-def _scale_at(kernel: ResidualKernel, mode: Array, Z: Array, Y: Array) -> Array:
-    """Return a root of the inverse of the curvature of the log posterior, by differences of its gradient."""
-    low, high = _box(kernel, Z.shape[1])
-    curvature = np.empty((len(mode), len(mode)))
-    for i, step in enumerate(np.eye(len(mode)) * _STEP):
-        up, down = np.minimum(mode + step, high), np.maximum(mode - step, low)
-        slopes = _gradient_or_zero(kernel, up, Z, Y) - _gradient_or_zero(kernel, down, Z, Y)
-        curvature[i] = -slopes / (up - down)[i]
-    values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
-    return np.asarray(vectors / np.sqrt(np.maximum(values, _LEAST_CURVATURE)))
 
 
 def _gradient_or_zero(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array) -> Array:

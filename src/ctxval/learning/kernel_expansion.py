@@ -8,11 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Mask, Rows
+from ctxval.gp.cholesky import factorise, tenfold
 from ctxval.learning.hyperparameters import Hyperparameters
 
 _CACHED = 20_000
 """Number of covariances that are computed together, so that intermediate results stay in the processor's cache."""
+_MISFIT = 1e-6
+"""Largest error of standardised residuals at centres that rounding may cause."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,79 +34,110 @@ class KernelExpansion:
 
     def __call__(self, z: Array) -> Array:
         """Return the values ``(S, q, n)`` of each function at arguments of its own, ``(S, q, k)``."""
-        constants, slopes = self._linear
-        values = np.matmul(z, slopes) + constants[:, None, :]
-        largest = max(1, _CACHED // len(self.centres))
-        for functions, rows in _blocks(z.shape[0], z.shape[1], largest):
-            values[functions, rows] += np.matmul(self._matern(z[functions, rows]), self.weights[functions])
+        S, q, k = z.shape
+        # The squared distance to a centre is linear in an argument, its squared entries and 1.
+        extended = np.empty((S, q, 2 * k + 1))
+        extended[..., :k] = z
+        np.multiply(z, z, out=extended[..., k:-1])
+        extended[..., -1] = 1.0
+        values = np.matmul(extended, self._linear)
+        for block in _blocks(S, q, max(1, _CACHED // len(self.centres))):
+            some = extended[block]
+            covariances = self._matern(some.reshape(-1, 2 * k + 1)).reshape(*some.shape[:2], -1)
+            values[block] += np.matmul(covariances, self.weights[block[0]])
         return np.asarray(values)
 
     def repeated(self, count: int) -> KernelExpansion:
         """Return the only function of this expansion, ``count`` times."""
         return replace(self, weights=np.repeat(self.weights, count, axis=0))
 
+    def __getitem__(self, rows: slice | Rows) -> KernelExpansion:
+        """Return some of the functions."""
+        return replace(self, weights=self.weights[rows])
+
     @functools.cached_property
-    def _linear(self) -> tuple[Array, Array]:
-        """The constants ``(S, n)`` and the slopes ``(S, k, n)`` of the linear part."""
+    def _linear(self) -> Array:
+        """The factors of an extended argument in the linear part, shape ``(S, 2 k + 1, n)``."""
         constant, slope = np.exp(self.hyperparameters.theta[-2:])
-        return constant * self.weights.sum(axis=1), slope * np.matmul(self.centres.T, self.weights)
+        slopes = slope * np.matmul(self.centres.T, self.weights)
+        constants = constant * self.weights.sum(axis=1, keepdims=True)
+        return np.concatenate([slopes, np.zeros_like(slopes), constants], axis=1)
 
     @functools.cached_property
-    def _scales(self) -> Array:
-        """Factors of z in which the argument of the Matern function has unit length."""
-        return np.asarray(np.sqrt(2 * self.hyperparameters.kernel.nu) / np.exp(self.hyperparameters.theta[:-2]))
+    def _squared(self) -> Array:
+        """The factors of an extended argument in the squared arguments of the Matern function, ``(2 k + 1, M)``."""
+        inverse = 2 * self.hyperparameters.kernel.nu / np.exp(2 * self.hyperparameters.theta[:-2])
+        scaled = -2 * inverse * self.centres
+        squares = (inverse * self.centres**2).sum(axis=1)
+        return np.stack([*scaled.T, *np.repeat(inverse[:, None], len(self.centres), axis=1), squares])
 
     @functools.cached_property
-    def _scaled(self) -> tuple[Array, Array]:
-        """``-2 centres'`` and the squared norms of the centres, both scaled."""
-        scaled = self.centres * self._scales
-        return np.ascontiguousarray(-2 * scaled.T), (scaled**2).sum(axis=1)
+    def _growth(self) -> Array:
+        """The same in the growth with the inputs."""
+        kernel, (M, k) = self.hyperparameters.kernel, self.centres.shape
+        factors = np.zeros((2 * k + 1, M))
+        factors[k - kernel.inputs : k] = kernel.growth * self.centres[:, k - kernel.inputs :].T
+        factors[-1] = 1.0
+        return factors
 
-    def _matern(self, z: Array) -> Array:
-        """Return the Matern part of the covariances ``(..., q, M)`` of arguments ``(..., q, k)``."""
+    def _matern(self, extended: Array) -> Array:
+        """Return the Matern part of the covariances ``(q, M)`` of extended arguments ``(q, 2 k + 1)``."""
         kernel = self.hyperparameters.kernel
-        factors, squares = self._scaled
-        own = z * self._scales
-        r2 = own @ factors
-        r2 += squares
-        r2 += (own**2).sum(axis=-1)[..., None]
-        np.maximum(r2, 0.0, out=r2)
+        r2 = extended @ self._squared
+        np.abs(r2, out=r2)  # rounding errors around zero
         r = np.sqrt(r2)
-        # The same array holds the squares, the polynomial's quadratic term, and then the decay.
+        # The same array holds the squares, and then the polynomial.
         polynomial = _polynomial(kernel.nu, r, r2)
-        decay = np.exp(np.negative(r, out=r), out=r2)
+        np.negative(r, out=r)
+        decay = np.exp(r, out=r)
         decay *= polynomial
         if kernel.growth:
-            first = z.shape[-1] - kernel.inputs
-            growth = z[..., first:] @ (kernel.growth * self.centres[:, first:].T)
-            growth += 1
-            decay *= growth
+            decay *= extended @ self._growth
         return np.asarray(decay)
 
 
 def _polynomial(nu: float, r: Array, r2: Array) -> Array:
     """Return the polynomial of the Matern function of scaled distances and their squares, which are overwritten."""
     if nu == 1.5:
-        return np.asarray(np.add(r, 1))
+        return np.asarray(np.add(r, 1, out=r2))
     if nu == 2.5:
         r2 *= 1 / 3
-        polynomial = np.add(r, r2)
-    else:
-        polynomial = np.multiply(r, 1 / 105)
-        polynomial += 2 / 21
-        polynomial *= r
-        polynomial += 3 / 7
-        polynomial *= r2
-        polynomial += r
-    polynomial += 1
-    return np.asarray(polynomial)
+        r2 += r
+        r2 += 1
+        return r2
+    polynomial = np.multiply(r, 1 / 105)
+    polynomial += 2 / 21
+    polynomial *= r
+    polynomial += 3 / 7
+    r2 *= polynomial
+    r2 += r
+    r2 += 1
+    return r2
 
 
 def _blocks(functions: int, arguments: int, largest: int) -> Iterator[tuple[slice, slice]]:
-    """Yield blocks of functions and arguments that are evaluated together, no more than ``largest`` arguments."""
-    if functions * arguments <= largest:
-        yield slice(None), slice(None)
-        return
-    for one in range(functions):
-        for first in range(0, arguments, largest):
-            yield slice(one, one + 1), slice(first, first + largest)
+    """Yield blocks of functions and arguments that are evaluated together, about ``largest`` arguments in all."""
+    together = max(1, largest // max(1, arguments))
+    for function in range(0, functions, together):
+        for argument in range(0, arguments, largest):
+            yield slice(function, function + together), slice(argument, argument + largest)
+
+
+def weights_without(covariance: Array, noise: float, outputs: Array, gone: Mask) -> Array:
+    """Return the weights ``(k, M, n)`` of k processes, each without the data that are gone for it, ``(k, M)``.
+
+    Leaving out a block of data changes the weights of the others by a linear map, as leaving out one observation does
+    (Rasmussen and Williams 2006, Sec. 5.4.2). Weights that rounding errors have spoilt are computed directly.
+    """
+    factor = factorise(covariance, tenfold(noise))
+    added = float((factor.L[-1] ** 2).sum() - covariance[-1, -1])
+    inverse, known = factor.inverse(), factor.solve(outputs)
+    found = np.repeat(known[None], len(gone), axis=0)
+    for own, without in zip(found, gone, strict=True):
+        rows, kept = np.flatnonzero(without), np.flatnonzero(~without)
+        own -= inverse[:, rows] @ np.linalg.solve(inverse[np.ix_(rows, rows)], known[rows])
+        own[rows] = 0.0
+        misfit = covariance[kept] @ own + added * own[kept] - outputs[kept]
+        if not np.abs(misfit).max(initial=0.0) < _MISFIT:
+            own[kept] = factorise(covariance[np.ix_(kept, kept)], tenfold(noise)).solve(outputs[kept])
+    return found

@@ -15,18 +15,13 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.progress import advance
 from ctxval._util.representation import call
-from ctxval.core.model import Model
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.dynamics import Residual, ResidualsWithout, learn_covariance
+from ctxval.learning.dynamics_posterior import DrawnModel, DynamicsDraws
+from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.error_vectors import Executed, executions_of
-from ctxval.learning.recorded import affordable_centres, closed_loops_on_model, recorded_transitions
-from ctxval.models.corrected import before_refinement
-
-_CENTRES = (100, 300)
-"""Least and largest number of transitions that the residual is conditioned on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,48 +52,23 @@ def replay_executed(validation: Validation, executed: Executed, wanted: Sequence
         wanted: points of the unit cube ``(d,)`` of the tasks.
     """
     with single_threaded():
-        corrected = _corrected(validation, executed)
-        if corrected is None:
-            return [_replayed(validation, None, point) for point in wanted]
-        without = corrected[1].without(executions_of(executed, wanted))
-        rows = np.arange(len(wanted))
-        models = [_OneCorrected(corrected[0], without[rows[k : k + 1]]) for k in range(len(wanted))]
+        without = _means_without(validation, executed, wanted)
+        models = (None if without is None else without.model_of(k) for k in range(len(wanted)))
         return [_replayed(validation, model, point) for model, point in zip(models, wanted, strict=True)]
 
 
-def _corrected(validation: Validation, executed: Executed) -> tuple[Model, Residual] | None:
-    """Return the corrected model from all executions; None if nothing can be learned."""
+def _means_without(validation: Validation, executed: Executed, wanted: Sequence[Array]) -> DynamicsDraws | None:
+    """Return the corrected model for each task, as one draw; None if nothing can be learned."""
     try:
-        loops = closed_loops_on_model(validation)
-        if loops is None:
+        learned = DynamicsStudy(validation).learn(executed)
+        if learned is None:
             return None
-        recorded = recorded_transitions(validation.model, [trajectory for _, trajectory in executed], loops)
-        centres = affordable_centres(loops.horizon, *_CENTRES)
-        model = before_refinement(validation.model)
-        learned = None if recorded is None else learn_covariance(model, *recorded, centres)
-        return None if learned is None else (learned.model, learned.residual)
+        return learned.posterior.means_without(executions_of(learned.executed, wanted))
     except Exception:  # the user's own parts, at states that no execution has reached
         return None
 
 
-@dataclass(frozen=True)
-class _OneCorrected:
-    """The corrected model of one task.
-
-    Attributes:
-        model: the model to which the residual is added.
-        residual: the residual that does not know the executions of this task, as a batch of one.
-    """
-
-    model: Model
-    residual: ResidualsWithout
-
-    def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(n,), (m,) -> (n,)``."""
-        return np.asarray(self.model.step(x, u) + self.residual(x[None], u[None])[0])
-
-
-def _replayed(validation: Validation, model: _OneCorrected | None, point: Array) -> Replay | None:
+def _replayed(validation: Validation, model: DrawnModel | None, point: Array) -> Replay | None:
     advance()
     space = validation.space
     try:

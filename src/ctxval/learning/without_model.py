@@ -2,8 +2,7 @@
 
 The residual ``S - M`` is as rough as the rougher one of S and M. The kinks of a network, or the waves of a Gaussian
 process between its data, make it rough although S is smooth. Such a residual takes many executions to learn, and S
-itself only few. The data decide: both models explain the same recorded transitions, with some probability density. The
-search ``auto``, which needs a mean and no draws, compares errors instead (:func:`~.dynamics.learn_covariance`).
+itself only few. The data decide: both models explain the same recorded transitions, with some probability density.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
-from ctxval.learning.dynamics import Identity
 from ctxval.learning.hyperparameters import highest_log_posterior, learning_rows
 from ctxval.learning.residual_data import NEGLIGIBLE, ResidualData, residual_data
 from ctxval.models.linear import Linear
@@ -47,6 +45,14 @@ def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] 
         if other is not None and len(other.pairs) == len(data.pairs):
             return (linear, other) if _log_density(other, rows) > needed else None
     return None
+
+
+class Identity:
+    """The model ``x_next = x``; its residual is the step of the system."""
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the state itself."""
+        return x
 
 
 def _log_density(data: ResidualData, rows: Rows) -> float:

@@ -1,10 +1,10 @@
 """The largest distance over all tasks, for each draw of the dynamics.
 
-First the distance on the posterior mean is searched globally, from a pool of tasks whose controllers are designed once
-for a whole campaign. Its elites, the tasks with known distances and some random tasks are then run on all draws.
-Around the best of these, each draw is searched on its own: coordinates are moved to bounds, one at a time and all that
-help together, and points are moved at random by ever smaller steps. Between these rounds each draw tries the best tasks
-of the others.
+First the distance on the posterior mean is searched, from a pool of tasks whose controllers are designed once for a
+whole campaign. Its elites, the tasks with known distances and some random tasks are then run on draws. For a screening
+that is all, with few draws. Otherwise each draw is searched on its own around the best of these: coordinates are moved
+to bounds, one at a time and all that help together, and points are moved at random by ever smaller steps. Between these
+rounds each draw tries the best tasks of the others.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.boxes import moves_to_bounds, separated_rows
+from ctxval.gp.ascent import Ascent
 from ctxval.gp.global_search import search_globally
 from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks
 from ctxval.learning.dynamics_posterior import DynamicsDraws, DynamicsPosterior
@@ -36,6 +37,8 @@ _SAME = 0.02
 """Least distance of two of them, as a share of the cube's diagonal."""
 _NEARBY = 1e-3
 """Largest change of each coordinate to a task that is nearly the same."""
+_SCREENED = (8, 1500)
+"""Number of draws of the hyperparameters in a screening, and of tasks in its search on the mean."""
 _DEEPER = 4
 """Factor of the number of tasks in a deeper search."""
 _APART = 0.15
@@ -80,6 +83,21 @@ class WorstCaseSettings:
             return cls(pool=64, evaluations=256, elites=6, shared=12, moves=2, rounds=0, peaks=1, nearby=8)
         evaluations = _EVALUATIONS[min(dimension, len(_EVALUATIONS)) - 1]
         return cls(pool=min(1024, evaluations // 4), evaluations=evaluations)
+
+
+@dataclass(frozen=True, eq=False)
+class WorstOfMean:
+    """The largest distance on the posterior mean.
+
+    Attributes:
+        highest: the largest distance.
+        elites: tasks with large distances, points ``(e, d)``, the largest first.
+        evaluations: number of closed loops that were compared.
+    """
+
+    highest: float
+    elites: Array
+    evaluations: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +149,13 @@ class WorstCaseSearch:
         own, all_draws = self.settings, self.settings.elites + self.settings.shared + _SHOWN
         moves = own.rounds * (2 * self.dimension + own.moves + 1)
         return 2 * own.evaluations + all_draws + draws * (all_draws + 2 * moves)
+
+    @property
+    def screening_loops(self) -> int:
+        """About how many closed loops a screening runs."""
+        own = self.settings
+        shared = own.elites + own.shared
+        return 2 * own.pool + min(_SCREENED[1], own.evaluations) + (1 + _SCREENED[0]) * shared
 
     @functools.cached_property
     def pool(self) -> Array:
@@ -189,44 +214,91 @@ class WorstCaseSearch:
         planned = sum(int(np.sum(one.promised.finite)) for one in self.plans)
         return 1 - planned / len(self.pool)
 
-    def maxima(
-        self, posterior: DynamicsPosterior, known: Array, rng: np.random.Generator, functions: int | None = None
-    ) -> WorstCase:
-        """Return the largest distances of draws from a posterior.
+    def on_mean(
+        self, posterior: DynamicsPosterior, known: Array, rng: np.random.Generator, *, globally: bool = True
+    ) -> WorstOfMean:
+        """Return the largest distance on the posterior mean.
 
         Args:
             posterior: the posterior of the dynamics.
             known: tasks to look at in any case, such as those of earlier maxima, points ``(k, d)``.
+            rng: the source of the tasks that are tried.
+            globally: whether large distances on a small share of the tasks are looked for.
+        """
+        mean, settings = posterior.mean, self.settings
+        distance = functools.partial(self._distances, mean)
+        with single_threaded():
+            of_pool = _finite(self.planner.distances(mean, self.plans, len(self.pool)))[0]
+            starts = np.concatenate([known, self.pool[np.argsort(-of_pool, kind="stable")[: settings.elites * 4]]])
+            if not globally:
+                budget = min(_SCREENED[1], settings.evaluations)
+                ascent = Ascent(distance, np.zeros(self.dimension), np.ones(self.dimension), budget)
+                points, values = ascent.run(starts[: len(known) + _SHOWN], rng)
+                apart = separated_rows(points, _APART * np.sqrt(self.dimension), settings.elites)
+                return WorstOfMean(float(values[0]), points[apart], len(self.pool) + len(points))
+            evaluations = max(len(starts) + 50, settings.evaluations - len(self.pool))
+            found = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
+        elites = np.concatenate([found.points[:1], found.elites[: settings.elites]])
+        return WorstOfMean(float(found.values[0]), elites, len(self.pool) + found.evaluations)
+
+    def screened(
+        self, posterior: DynamicsPosterior, of_mean: WorstOfMean, known: Array, rng: np.random.Generator
+    ) -> WorstCase:
+        """Return the largest distances of a few draws over the elites, known tasks and random ones: a lower bound.
+
+        Args:
+            posterior, known: as in :meth:`on_mean`.
+            of_mean: the largest distance on the posterior mean.
+            rng: the source of the draws.
+        """
+        with single_threaded():
+            tasks = self._shared_tasks(of_mean, known, rng)
+            draws = posterior.draw(self._relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
+            values = _finite(self.planner.distances(draws, self.planner.plan(tasks), len(tasks)))
+        best = values.argmax(axis=1)
+        return self._worst_case(of_mean, draws, values.max(axis=1), tasks[best], len(tasks), 0.0)
+
+    def maxima(
+        self,
+        posterior: DynamicsPosterior,
+        of_mean: WorstOfMean,
+        known: Array,
+        rng: np.random.Generator,
+        functions: int | None = None,
+    ) -> WorstCase:
+        """Return the largest distances of draws from a posterior.
+
+        Args:
+            posterior, known: as in :meth:`on_mean`.
+            of_mean: the largest distance on the posterior mean, searched globally.
             rng: the source of the draws and of the moves.
             functions: number of functions for each draw of the hyperparameters; that of the settings if None.
         """
         with single_threaded():
-            of_mean, elites, evaluations = self._search_mean(posterior.mean, known, rng)
-            tasks = np.concatenate([elites, known, self.pool[rng.permutation(len(self.pool))[: self.settings.shared]]])
+            tasks = self._shared_tasks(of_mean, known, rng)
             draws = posterior.draw(self._relevant(posterior, tasks, rng), rng, functions)
-            points, maxima, more = self._search_draws(draws, tasks, rng)
-            sharpness = self._sharpness(posterior.mean, elites, rng)
+            points, maxima, loops = self._search_draws(draws, tasks, rng)
+            sharpness = self._sharpness(posterior.mean, of_mean.elites, rng)
+        return self._worst_case(of_mean, draws, maxima, points, loops, sharpness)
+
+    def _shared_tasks(self, of_mean: WorstOfMean, known: Array, rng: np.random.Generator) -> Array:
+        """Return the tasks that all draws are run on: elites, known tasks and random ones."""
+        random = self.pool[rng.permutation(len(self.pool))[: self.settings.shared]]
+        return np.concatenate([of_mean.elites, known, random])
+
+    def _worst_case(
+        self, of_mean: WorstOfMean, draws: DynamicsDraws, maxima: Array, points: Array, loops: int, sharpness: float
+    ) -> WorstCase:
         return WorstCase(
             np.where(maxima >= _DIVERGED, np.inf, maxima),
             points,
-            of_mean,
-            elites,
-            evaluations + len(draws) * more,
+            of_mean.highest,
+            of_mean.elites,
+            of_mean.evaluations + len(draws) * loops,
             max(draws.left_out),
             self._unplanned,
             sharpness,
         )
-
-    def _search_mean(self, mean: DynamicsDraws, known: Array, rng: np.random.Generator) -> tuple[float, Array, int]:
-        """Return the largest distance on the posterior mean, tasks with large distances, and the number of loops."""
-        of_pool = _finite(self.planner.distances(mean, self.plans, len(self.pool)))[0]
-        best = self.pool[np.argsort(-of_pool, kind="stable")[: self.settings.elites * 4]]
-        evaluations = max(len(best) + len(known) + 50, self.settings.evaluations - len(self.pool))
-        starts = np.concatenate([known, best])
-        distance = functools.partial(self._distances, mean)
-        found = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
-        elites = np.concatenate([found.points[:1], found.elites[: self.settings.elites]])
-        return float(found.values[0]), elites, len(self.pool) + found.evaluations
 
     def _distances(self, mean: DynamicsDraws, points: Array) -> Array:
         """Return the distances ``(m,)`` on one draw, such as the posterior mean, as a search takes them."""

@@ -17,7 +17,7 @@ from ctxval.core.trajectory import Transitions
 from ctxval.errors import CtxvalError, InputError, ModelError, UnknownNameError
 from ctxval.fitting import FittedParameter, fit_parameters
 from ctxval.fitting.least_squares import as_bounds
-from ctxval.learning import Residual, learn_covariance
+from ctxval.learning import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
 from ctxval.refinement.held_out import HeldOut, held_out
@@ -28,6 +28,8 @@ _CENTRES = 300
 _FEWEST, _PRECISE = 24, 0.005
 """Fewer of them are kept, at least so many, if they predict the others with this relative error: design on the model is
 then faster."""
+_FAMILY = (2.5, 0.0)
+"""Smoothness and growth of the covariance of a correction."""
 _UNITS = (32, 32)
 """Numbers of units in the hidden layers of a network."""
 _NEGLIGIBLE = 1e-7
@@ -121,36 +123,40 @@ class ResidualCorrection(Method):
         return Learned(Corrected(model, whole.of_states(better), data=records.transitions), errors.kept(better), notes)
 
     def _correction(self, model: Model, records: Records) -> Correction | None:
-        found = learn_covariance(model, records.transitions, records.sources, self.centres, of_steps=False)
-        return None if found is None else correction_of(found.residual)
+        settings = PosteriorSettings(hyperparameters=1, centres=self.centres, families=(_FAMILY,), of_steps=False)
+        found = learn_posterior(model, records.transitions, records.sources, settings=settings)
+        return None if found is None else correction_of(found)
 
     def __repr__(self) -> str:
         return record(self)
 
 
-def correction_of(residual: Residual) -> Correction:
-    """Return a learned residual as a correction, with the box of the records that it was learned from."""
-    recorded = np.concatenate([residual.centres, residual.unused[0]])
-    low, high = recorded.min(axis=0), recorded.max(axis=0)
-    with single_threaded():
-        residual = residual.rough(_FEWEST, _PRECISE)
-    values = np.exp(residual.theta)
-    variance, scales, constant, slope = values[0], values[1:-2], values[-2], values[-1]
-    with single_threaded():
-        weights = residual.process.weights * residual.scale_out
-    linear = np.concatenate([slope * residual.centres.T @ weights, constant * weights.sum(axis=0, keepdims=True)])
+def correction_of(posterior: DynamicsPosterior) -> Correction:
+    """Return a learned residual as a correction, with the box of the records that it was learned from.
+
+    Args:
+        posterior: a posterior whose covariance is a Matern 5/2 one that does not grow with the inputs.
+    """
+    data, mean = posterior.data, posterior.with_few_centres(_FEWEST, _PRECISE)
+    low, high = data.pairs.min(axis=0), data.pairs.max(axis=0)
+    values = np.exp(mean.hyperparameters.theta)
+    scales, constant, slope = values[:-2], values[-2], values[-1]
+    weights = np.zeros((len(mean.centres), len(data.units)))
+    weights[:, data.learned] = mean.weights[0]
+    weights *= data.units
+    linear = np.concatenate([slope * mean.centres.T @ weights, constant * weights.sum(axis=0, keepdims=True)])
     return Correction(
-        residual.shift_in,
-        residual.scale_in,
-        residual.centres,
+        data.shift,
+        data.scale,
+        mean.centres,
         scales,
-        variance * weights,
+        weights,
         linear,
         low,
         high,
         # A coordinate that the residual does not depend on fades the correction within one more range of the records.
         np.minimum(scales, np.maximum(high - low, 1.0)),
-        residual.limit * residual.scale_out,
+        posterior.limit * data.units,
     )
 
 

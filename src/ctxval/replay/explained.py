@@ -10,7 +10,7 @@ from ctxval._util.arrays import Array, Mask, Rows, single_threaded
 from ctxval._util.representation import record
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
-from ctxval.learning import CorrectedModel, learn_covariance
+from ctxval.learning import PosteriorSettings, learn_posterior
 from ctxval.replay.steps import RecordedSteps, stepped
 
 _FOLDS = 4
@@ -141,9 +141,10 @@ def _learned(model: Model, data: _Steps, held: Mask, seed: int) -> Array:
         rows = np.sort(np.random.default_rng(seed).permutation(rows)[:_LEARNED])
     some = Transitions(data.transitions.x[rows], data.transitions.u[rows], data.transitions.x_next[rows])
     with single_threaded():
-        learned = learn_covariance(model, some, data.folds[rows], _CENTRES)
+        settings = PosteriorSettings(hyperparameters=1, centres=_CENTRES)
+        learned = learn_posterior(model, some, data.folds[rows], settings=settings)
         if learned is None:
             return np.zeros_like(data.residuals[held])
         x, u = data.transitions.x[held], data.transitions.u[held]
-        # What is learned may be the steps of the system, without M.
-        return np.asarray(CorrectedModel(learned.model, learned.residual).step(x, u) - model.step(x, u))
+        # What is learned may be a linear model of the system, without M.
+        return np.asarray(learned.mean.model_of(0).step(x, u) - model.step(x, u))
