@@ -2,7 +2,7 @@
 
 ``python benchmarks/calibrate_dynamics.py`` runs what is not stored yet. Each campaign is given a threshold of a known
 share of d*. The systems of ``dynamics_reporting.py`` were written down before any of them was run, and no threshold of
-the certificate was chosen with them. A stored line of an earlier rule than that of its system is not used.
+the certificate was chosen with them. A stored line of an earlier rule is not used.
 """
 
 from __future__ import annotations
@@ -25,9 +25,8 @@ from dynamics_reporting import REPORTING
 from dynamics_rough import ROUGH
 from dynamics_truths import truth
 
-RULE, WITHOUT_MODEL = 1, 2
-"""Versions of the rule by which campaigns are run now. The second one learns the system without a model that is rougher
-than the system, and so it is that of the systems with such a model. On all others both rules do the same."""
+RULE = 3
+"""Version of the rule by which campaigns are run now: the search and the bound share one posterior."""
 
 BUDGETS = {"reporting": 12, "rough": 12, "paper": 16, "development": 12}
 """Largest numbers of executions."""
@@ -41,9 +40,6 @@ SEEDS, FEW = 10, 5
 GROUPS = {"reporting": REPORTING, "rough": ROUGH, "paper": PAPER, "development": DEVELOPMENT}
 """Systems; the first two groups had no part in the choice of the rule."""
 
-ROUGH_MODELS = {*ROUGH, "arm-gp", "arm-fnn"}
-"""Systems whose model is rougher than the system."""
-
 
 @dataclass(frozen=True)
 class Run:
@@ -53,11 +49,6 @@ class Run:
     entry: str
     seed: int
     share: float
-
-
-def rule_of(entry: str) -> int:
-    """Return the version of the rule by which a system is run now."""
-    return WITHOUT_MODEL if entry in ROUGH_MODELS else RULE
 
 
 def wanted(group: str, seeds: int = SEEDS) -> Iterator[Run]:
@@ -79,7 +70,7 @@ def decide(one: Run) -> dict[str, Any]:
         campaign.run_until_decided(threshold, BUDGETS[one.group], certificate=options)
         verdict = campaign.verdict(threshold, certificate=options)
     return {
-        "rule": rule_of(one.entry),
+        "rule": RULE,
         **dataclasses.asdict(one),
         "answer": verdict.answer,
         "executions": campaign.executions,
@@ -121,7 +112,7 @@ STORED = JsonLines(RESULTS / "calibrate_dynamics.jsonl", ("rule", *(field.name f
 def missing(groups: list[str], seeds: int) -> list[Run]:
     """Return the campaigns that are not stored."""
     every = [one for group in groups for one in wanted(group, seeds)]
-    return [one for one in every if (rule_of(one.entry), *dataclasses.astuple(one)) not in STORED]
+    return [one for one in every if (RULE, *dataclasses.astuple(one)) not in STORED]
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibrate_dynamics import BUDGETS, FALSE, FEW, GROUPS, STORED, TRUE, rule_of, wanted
+from calibrate_dynamics import BUDGETS, FALSE, FEW, GROUPS, RULE, STORED, TRUE, wanted
 from calibration_verdicts_part import false_of, table
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import dynamics_diagnostics as rule
@@ -31,7 +31,8 @@ false, with a limit of at most 7.5 %.
 
 ### Reporting systems
 
-{run} of {planned} planned campaigns have been run.
+{run} of {planned} planned campaigns have been run, {present} of them with the posterior that the search shares; the
+others are from before.
 
 At 0.95 d*: {at_95}. At 0.99 d*: {at_99}. Of the misleading systems at 0.95 d*: {misleading_95}.
 
@@ -127,6 +128,7 @@ def by_dynamics() -> str:
     return TEXT.format(
         budget=BUDGETS["reporting"],
         budget_paper=BUDGETS["paper"],
+        present=sum(one["rule"] == RULE for one in reported),
         run=len(reported),
         planned=len(list(wanted("reporting"))),
         accurate=rule.ACCURATE,
@@ -155,7 +157,9 @@ def by_dynamics() -> str:
 
 
 def _of(group: str) -> list[Result]:
-    return [one for one in STORED.select(group=group) if one["rule"] == rule_of(one["entry"])]
+    """Return the campaigns of a group by the latest rule by which each was run."""
+    by_rule = sorted(STORED.select(group=group), key=lambda one: one["rule"])
+    return list({(one["entry"], one["seed"], one["share"]): one for one in by_rule}.values())
 
 
 def _at(results: Iterable[Result], share: float) -> list[Result]:

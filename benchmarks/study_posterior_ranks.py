@@ -172,7 +172,7 @@ def ranks(design: str, states: int, seed: int) -> dict[str, Any]:
     truth, transitions = recorded(design, validation, model, COUNTS[seed % len(COUNTS)], rng)
     started = time.process_time()
     settings = PosteriorSettings.for_horizon(HORIZON)
-    posterior = learn_posterior(model, transitions, np.zeros(len(transitions), dtype=np.intp), rng, settings)
+    posterior = learn_posterior(model, transitions, np.zeros(len(transitions), dtype=np.intp), (seed,), settings)
     seconds = time.process_time() - started
     assert posterior is not None, "the residual of this system is not negligible"
     tasks, planner = rng.random((TASKS, states)), LoopPlanner(validation)
@@ -181,7 +181,7 @@ def ranks(design: str, states: int, seed: int) -> dict[str, Any]:
     draws = posterior.draw(relevant, rng)
     one_each = range(settings.functions, len(draws), settings.functions)
     of_state = np.arange(RANKED), np.arange(RANKED) % states
-    residuals = np.array([(draws[s].step(x, u) - model.step(x, u))[of_state] for s in one_each])
+    residuals = np.array([(draws.model_of(s).step(x, u) - model.step(x, u))[of_state] for s in one_each])
     planned = planner.plan(tasks[:RANKED])
     loops = random_loops(truth.step, validation, tasks[:RANKED])
     with np.errstate(all="ignore"):

@@ -198,20 +198,6 @@ def predicted() -> learning.ExecutionPrediction:
     return found
 
 
-@functools.cache
-def covariance() -> learning.LearnedCovariance:
-    found = learning.learn_covariance(LINEAR, RECORDED, np.zeros(len(RECORDED), dtype=np.intp), 100)
-    assert found is not None
-    return found
-
-
-@functools.cache
-def residual() -> learning.Residual:
-    found = learning.learn_residual(covariance(), RECORDED, np.zeros(len(RECORDED), dtype=np.intp), 100)
-    assert found is not None
-    return found
-
-
 def evidence() -> certificates.DynamicsEvidence:
     return certificates.DynamicsEvidence(
         np.linspace(0.9, 1, 40), np.zeros((40, 2)), 0.95, np.zeros((5, 2)), 9000, 4, 0.01, 1e-6, (CHECKED,), COVERED
@@ -354,20 +340,15 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "distances.RelativeDeviation": lambda: distances.RelativeDeviation(least=[0.1, 1.0]),
     "distances.StateNorm": lambda: distances.StateNorm(2, weights=[1.0, 2.0], angles=[0]),
     "distances.WholeTrajectory": distances.WholeTrajectory,
-    "learning.DistancePredictor": lambda: learning.DistancePredictor(learned().study.validation),
-    "learning.LearnedCovariance": covariance,
-    "learning.ResidualsWithout": lambda: residual().without([{0}]),
-    "learning.CorrectedModel": lambda: learning.CorrectedModel(LINEAR, residual()),
     "learning.Coverage": lambda: learning.Coverage(LEARNED_GAP, LEARNED_GAP, None, np.zeros(11), np.ones(8), 1024),
     "learning.DynamicsDraws": lambda: learned().posterior.mean,
     "learning.DynamicsPosterior": lambda: learned().posterior,
     "learning.DynamicsStudy": lambda: learned().study,
     "learning.ExecutionPrediction": predicted,
-    "learning.Identity": learning.Identity,
     "learning.LearnedDynamics": learned,
+    "learning.PosteriorSettings": learning.PosteriorSettings,
     "learning.PredictionScore": lambda: learning.PredictionScore(1.5, 0.35, 0.98),
     "learning.Replay": lambda: learning.Replay(TASK, None, 0.5),
-    "learning.Residual": residual,
     "report.Axis": lambda: report.Axis("goal [rad]", 0.0, 3.0),
     "report.Chart": lambda: report.Chart("Distance", report.Axis("goal", 0.0, 3.0), report.Axis("distance", 0.0, 1.0)),
     "report.Finding": lambda: report.Finding("Goals of M", "good", "M reaches its goals.", {"missed": 0}),

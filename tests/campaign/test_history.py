@@ -8,9 +8,8 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, searches
-from ctxval.campaign.history import history_of, predict_from
+from ctxval.campaign.history import history_of
 from ctxval.core.trial import Trial
-from ctxval.learning import DistancePredictor
 
 
 def trial(number: int, goal: float, distance: float | None = None) -> Trial:
@@ -57,7 +56,7 @@ def test_a_prediction_is_about_the_known_values_in_the_order_of_the_search() -> 
     assert late.trial.state == "open"
     known = [t for t in history_of(campaign.trials) if t.distance is not None]
     assert [t.number for t in known] == [5, 1, 2, 3, 4]
-    found = predict_from(DistancePredictor(validation), campaign.store, campaign.trials)
+    found = campaign._recorder.dynamics.prediction(campaign.trials)
     assert found is not None
     expected = found.left_out(np.arange(5))
     np.testing.assert_allclose(expected, [t.distance for t in known], rtol=0.5)

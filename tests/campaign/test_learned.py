@@ -7,10 +7,9 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, Labels, searches
-from ctxval.campaign.history import predict_from
 from ctxval.certificates import LearnedDistance, Sample, require_learned
 from ctxval.errors import CertificateError
-from ctxval.learning import DistancePredictor, DynamicsStudy
+from ctxval.learning import DynamicsStudy
 
 POINTS = np.linspace(0.05, 0.95, 7)[:, None]
 
@@ -21,7 +20,8 @@ def test_only_earlier_trials_are_learned_from() -> None:
     learned = campaign.provenance.learned
     assert learned is not None
     assert isinstance(learned, LearnedDistance)
-    expected = predict_from(DistancePredictor(campaign.validation), campaign.store, campaign.trials[:4])
+    executed = [(t.unit_point, campaign.store.trajectory(t.number, "system")) for t in campaign.trials[:4]]
+    expected = DynamicsStudy(campaign.validation, 3).predict(executed)
     assert expected is not None
     np.testing.assert_array_equal(learned.expected(POINTS, 4), expected.expected(POINTS)[0])
     assert not np.array_equal(learned.expected(POINTS, 4), learned.expected(POINTS, 8))

@@ -13,9 +13,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Task, Trajectory, Validation, searches
 from ctxval.campaign.costs import costs_of
-from ctxval.campaign.history import predict_from
 from ctxval.core.controller import Controller
-from ctxval.learning import DistancePredictor
 from ctxval.systems import Manual
 
 
@@ -92,7 +90,7 @@ def test_the_costs_are_those_of_a_design_and_an_execution() -> None:
 
 
 def measured(campaign: Campaign) -> tuple[float, float | None]:
-    prediction = predict_from(DistancePredictor(campaign.validation), campaign.store, campaign.trials)
+    prediction = campaign._recorder.dynamics.prediction(campaign.trials)
     assert prediction is not None
     costs = costs_of(prediction, campaign.validation, campaign.trials)
     return costs.prediction, costs.evaluation

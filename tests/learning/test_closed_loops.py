@@ -9,9 +9,11 @@ import pytest
 
 from ctxval import Task, TaskSpace, Trajectory, Transitions, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
+from ctxval._util.progress import Progress, listening, stage
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.errors import DesignError
+from ctxval.learning import closed_loops
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.dynamics_posterior import DynamicsDraws, learn_posterior
 
@@ -28,7 +30,7 @@ def truth(x: Array, u: Array) -> Array:
 def make_draws() -> DynamicsDraws:
     rng = np.random.default_rng(0)
     x, u = rng.normal(size=(30, 2)), rng.normal(size=(30, 1))
-    posterior = learn_posterior(MODEL, Transitions(x, u, truth(x, u)), np.zeros(30, dtype=np.intp), rng)
+    posterior = learn_posterior(MODEL, Transitions(x, u, truth(x, u)), np.zeros(30, dtype=np.intp))
     assert posterior is not None
     return posterior.draw(2 * rng.normal(size=(80, 3)), rng)
 
@@ -83,7 +85,7 @@ def expected(validation: Validation) -> Array:
     for j, point in enumerate(POINTS):
         plan = validation.plan(validation.space.from_unit(point))
         for s in range(len(draws)):
-            loop = rollout(draws[s].step, plan.controller, plan.task)
+            loop = rollout(draws.model_of(s).step, plan.controller, plan.task)
             found[s, j] = validation.distance(plan.model_trajectory, loop, plan.task)
     return found
 
@@ -240,3 +242,62 @@ def test_tasks_on_which_the_model_diverges_have_no_distance() -> None:
     planner = LoopPlanner(make_validation(controllers.Policy(push)))
     found = planner.distances(make_draws(), planner.plan(POINTS), len(POINTS))
     np.testing.assert_array_equal(np.isnan(found), np.repeat(POINTS[None, :, 0] > 0.5, len(make_draws()), axis=0))
+
+
+# Plans that are kept
+
+
+class CountingLQR(controllers.LQR):
+    """An LQR that counts the tasks for which it designs controllers."""
+
+    designed = 0
+
+    def design(self, task: Task, model: models.Model) -> controllers.AffineFeedback:
+        self.designed += int(np.prod(task.batch_shape))
+        return super().design(task, model)
+
+
+def counting(batched: bool) -> tuple[LoopPlanner, CountingLQR]:
+    synthesizer = CountingLQR([1.0, 0.1], [0.1])
+    synthesizer.batched = batched  # type: ignore[misc]
+    return LoopPlanner(make_validation(synthesizer)), synthesizer
+
+
+def final_states(planner: LoopPlanner, points: Array) -> Array:
+    found = np.full((len(points), 2), np.nan)
+    for one in planner.plan(points, together=4):
+        found[one.rows] = one.promised.final_state
+    return found
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_tasks_that_were_planned_are_not_planned_again(batched: bool) -> None:
+    planner, synthesizer = counting(batched)
+    first = final_states(planner, POINTS)
+    designed = synthesizer.designed
+    np.testing.assert_array_equal(final_states(planner, POINTS), first)
+    assert synthesizer.designed == designed
+    if not batched:
+        np.testing.assert_array_equal(final_states(planner, POINTS[::-1]), first[::-1])
+        assert synthesizer.designed == designed
+        assert planner.has(POINTS[0])
+
+
+def test_the_oldest_plans_make_room_for_new_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    planner, synthesizer = counting(False)
+    planner.plan(POINTS[:1])
+    monkeypatch.setattr(closed_loops, "_REMEMBERED", 0)
+    planner.plan(POINTS[1:])
+    assert not planner.has(POINTS[0])
+    assert synthesizer.designed >= len(POINTS)
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_each_task_is_counted_once_whether_it_is_planned_or_kept(batched: bool) -> None:
+    planner, _ = counting(batched)
+    assert planner.batched is batched  # found out before the count, with tasks of its own
+    heard: list[Progress] = []
+    with listening(heard.append), stage("choosing a task", unit="designs"):
+        planner.plan(POINTS)
+        planner.plan(POINTS)
+    assert heard[-1].done == 2 * len(POINTS)

@@ -33,9 +33,7 @@ def learn(planner: LoopPlanner, x: Array, u: Array) -> DynamicsPosterior:
     x_next = planner.validation.model.step(x, u) + 0.02 * np.sin(x)
     settings = PosteriorSettings(hyperparameters=2, functions=1)
     sources = np.zeros(len(x), dtype=np.intp)
-    found = learn_posterior(
-        planner.validation.model, Transitions(x, u, x_next), sources, np.random.default_rng(0), settings
-    )
+    found = learn_posterior(planner.validation.model, Transitions(x, u, x_next), sources, settings=settings)
     assert found is not None
     return found
 

@@ -8,7 +8,13 @@ import pytest
 from ctxval import Transitions, models
 from ctxval._util.arrays import Array
 from ctxval.gp.cholesky import factorise
-from ctxval.learning.dynamics_posterior import Component, DynamicsPosterior, PosteriorSettings, learn_posterior
+from ctxval.learning.dynamics_posterior import (
+    Component,
+    DynamicsPosterior,
+    PosteriorSettings,
+    _drawn,
+    learn_posterior,
+)
 from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters
 from ctxval.learning.residual_kernel import ResidualKernel
 
@@ -31,7 +37,7 @@ def rough(x: Array, u: Array) -> Array:
 
 def learn(transitions: Transitions, seed: int = 0, settings: PosteriorSettings | None = None) -> DynamicsPosterior:
     sources = np.zeros(len(transitions), dtype=np.intp)
-    posterior = learn_posterior(MODEL, transitions, sources, np.random.default_rng(seed), settings)
+    posterior = learn_posterior(MODEL, transitions, sources, (seed,), settings)
     assert posterior is not None
     return posterior
 
@@ -40,7 +46,7 @@ def component(count: int = 15, family: tuple[float, float] = (2.5, 1.0), seed: i
     rng = np.random.default_rng(seed)
     own = Hyperparameters(ResidualKernel(*family, 1), THETA, NOISE)
     Z = rng.normal(size=(count, 2))
-    return Component.conditioned(own, Z, np.sin(Z @ np.array([[1.0, 0.5], [0.2, 2.0]])), 400, rng)
+    return Component.conditioned(own, Z, np.sin(Z @ np.array([[1.0, 0.5], [0.2, 2.0]])), rng)
 
 
 def exact(one: Component, Z: Array) -> tuple[Array, Array]:
@@ -74,23 +80,22 @@ def test_the_mean_passes_through_the_observations_within_the_noise() -> None:
 def test_the_amplitudes_are_draws_of_their_posterior() -> None:
     rng, one = np.random.default_rng(0), component()
     Y = one.factor.L @ one.factor.L.T @ one.weights
-    drawn = [Component.conditioned(one.hyperparameters, one.centres, Y, 400, rng).amplitudes ** -2 for _ in range(600)]
+    drawn = [Component.conditioned(one.hyperparameters, one.centres, Y, rng).amplitudes ** -2 for _ in range(600)]
     # N / (y' K^-1 y) is the mean of the precision of a normal distribution of N numbers with a flat prior.
     expected = len(Y) / (Y * one.weights).sum(axis=0)
     np.testing.assert_allclose(np.mean(drawn, axis=0) / expected, 1, atol=5 * np.sqrt(2 / 15 / 600))
 
 
 def test_transitions_that_add_nothing_are_left_out() -> None:
-    one = component()
-    twice = np.concatenate([one.centres, one.centres + 1e-9])
-    Y = np.sin(twice @ np.array([[1.0, 0.5], [0.2, 2.0]]))
-    again = Component.conditioned(one.hyperparameters, twice, Y, 400, np.random.default_rng(0))
-    assert len(again.centres) <= len(one.centres)
+    known = record(40, truth=models.Function(rough, vectorized=True))
+    posterior = learn(Transitions.joined([known, known]))
+    assert 10 < len(posterior.rows) <= 40
+    np.testing.assert_array_equal(posterior.most_probable.centres, posterior.data.pairs[posterior.rows])
 
 
 def moments(one: Component, relevant: Array, at: Array, pivots: int, count: int = 4000) -> tuple[Array, Array, float]:
     """Return mean and covariance of draws of the first output at pairs, relative to the amplitude, and what is left."""
-    expansion, left_out = one.draw(relevant, count, pivots, np.random.default_rng(5))
+    expansion, left_out = _drawn([one], relevant, count, pivots, np.random.default_rng(5))
     values = expansion(np.repeat(at[None], count, axis=0))[..., 0]
     return values.mean(axis=0), np.cov(values.T) / one.amplitudes[0] ** 2, left_out
 
@@ -143,7 +148,7 @@ def test_draws_differ_even_if_less_than_the_noise() -> None:
     rng = np.random.default_rng(0)
     own = Hyperparameters(ResidualKernel(2.5, 0.0, 1), THETA, 0.5)
     Z = rng.normal(size=(400, 2))
-    one = Component.conditioned(own, Z, np.sin(Z), 400, rng)
+    one = Component.conditioned(own, Z, np.sin(Z), rng)
     relevant = rng.uniform(-1, 1, (30, 2))
     assert one.variance(relevant).max() < 0.5
     _, covariance, left_out = moments(one, relevant, relevant, 50, 1000)
@@ -153,7 +158,7 @@ def test_draws_differ_even_if_less_than_the_noise() -> None:
 
 def test_without_pairs_to_choose_pivots_from_draws_are_the_mean() -> None:
     one = component()
-    expansion, _ = one.draw(np.empty((0, 2)), 2, 50, np.random.default_rng(0))
+    expansion, _ = _drawn([one], np.empty((0, 2)), 2, 50, np.random.default_rng(0))
     Z = np.random.default_rng(1).normal(size=(20, 2))
     np.testing.assert_allclose(expansion(np.repeat(Z[None], 2, 0)), np.repeat(one.mean(Z[None]), 2, 0), atol=1e-9)
 
@@ -161,7 +166,7 @@ def test_without_pairs_to_choose_pivots_from_draws_are_the_mean() -> None:
 def test_without_pivots_draws_are_the_mean() -> None:
     one = component()
     Z = np.random.default_rng(1).normal(size=(20, 2))
-    expansion, left_out = one.draw(Z, 3, 0, np.random.default_rng(0))
+    expansion, left_out = _drawn([one], Z, 3, 0, np.random.default_rng(0))
     np.testing.assert_allclose(expansion(np.repeat(Z[None], 3, 0)), np.repeat(one.mean(Z[None]), 3, 0), atol=1e-9)
     assert left_out == 1
 
@@ -169,7 +174,7 @@ def test_without_pivots_draws_are_the_mean() -> None:
 def test_outputs_of_a_draw_are_independent() -> None:
     one = component()
     pivot = np.array([[3.0, 3.0]])
-    expansion, _ = one.draw(pivot, 4000, 1, np.random.default_rng(0))
+    expansion, _ = _drawn([one], pivot, 4000, 1, np.random.default_rng(0))
     values = expansion(np.repeat(pivot[None], 4000, axis=0))[:, 0]
     assert abs(np.corrcoef(values.T)[0, 1]) < 5 / np.sqrt(4000)
 
@@ -184,7 +189,7 @@ def test_as_the_matern_part_vanishes_the_posterior_is_that_of_linear_regression(
     slope, noise = 1e6, 0.3
     theta = np.log([100.0, 100.0, 100.0, 100.0, 1.0, slope])
     own = Hyperparameters(ResidualKernel(2.5, 0.0, 1), theta, noise)
-    one = Component.conditioned(own, Z, Y, 400, rng)
+    one = Component.conditioned(own, Z, Y, rng)
     # The Matern part is constant up to 1e-3 here, so the constant has variance 2.
     prior = np.diag([1 / 2.0, *[1 / slope] * 4])
     features, at = np.c_[np.ones(3), Z], np.c_[np.ones(6), new]
@@ -255,7 +260,7 @@ def test_a_state_that_m_explains_stays_that_of_m() -> None:
 
 def test_a_model_without_error_has_no_posterior() -> None:
     transitions = record(30, truth=MODEL)
-    assert learn_posterior(MODEL, transitions, np.zeros(30, dtype=np.intp), np.random.default_rng(0)) is None
+    assert learn_posterior(MODEL, transitions, np.zeros(30, dtype=np.intp)) is None
 
 
 @pytest.mark.slow
@@ -278,11 +283,11 @@ def test_one_draw_is_a_model_for_one_pair_and_for_batches() -> None:
     x, u = np.random.default_rng(1).normal(size=(3, 4, 2)), np.random.default_rng(2).normal(size=(3, 4, 1))
     together = draws.step(np.repeat(x.reshape(1, 12, 2), len(draws), 0), np.repeat(u.reshape(1, 12, 1), len(draws), 0))
     for index in (0, 1, len(draws) - 1):
-        batch = draws[index].step(x, u)
+        batch = draws.model_of(index).step(x, u)
         np.testing.assert_allclose(batch.reshape(12, 2), together[index], atol=1e-9)
-        np.testing.assert_allclose(draws[index].step(x[1, 2], u[1, 2]), batch[1, 2], atol=1e-9)
+        np.testing.assert_allclose(draws.model_of(index).step(x[1, 2], u[1, 2]), batch[1, 2], atol=1e-9)
     with pytest.raises(IndexError, match=f"there are {len(draws)} draws"):
-        draws[len(draws)]
+        draws.model_of(len(draws))
 
 
 def test_a_draw_stays_finite_at_states_that_diverged() -> None:
@@ -308,12 +313,12 @@ def test_factors_are_of_the_covariance_of_the_centres() -> None:
 
 def test_components_of_equal_hyperparameters_are_drawn_as_if_alone() -> None:
     posterior = learn(record(40, truth=models.Function(rough, vectorized=True)))
-    names = [id(one.hyperparameters) for one in posterior.components]
+    names = [id(one.factor) for one in posterior.components]
     assert len(set(names)) < len(names)  # resampling repeats likely hyperparameters
     together = posterior.draw(posterior.data.pairs, np.random.default_rng(0))
     rng = np.random.default_rng(0)
     alone = [
-        one.draw(posterior.data.pairs, posterior.settings.functions, posterior.settings.pivots, rng)[0]
+        _drawn([one], posterior.data.pairs, posterior.settings.functions, posterior.settings.pivots, rng)[0]
         for one in posterior.components
     ]
     assert len(together) == sum(len(one.weights) for one in alone)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -10,8 +12,9 @@ from ctxval.errors import InputError
 from ctxval.learning.hyperparameters import (
     FAMILIES,
     NOISE,
+    HyperparameterPosterior,
+    Hyperparameters,
     _resampled,
-    draw_hyperparameters,
     draw_prior,
     learning_rows,
     log_posterior,
@@ -96,20 +99,29 @@ def test_a_covariance_that_is_not_finite_is_refused() -> None:
         log_posterior(KERNEL, PARAMETERS * np.nan, Z, Y)
 
 
-def test_the_first_draw_is_the_mode_of_the_most_probable_family() -> None:
+def test_no_draw_is_more_probable_than_the_mode() -> None:
     Z, Y = observations(25)
-    drawn = draw_hyperparameters(Z, Y, 1, 10, np.random.default_rng(0), FAMILIES)
-    density = [log_posterior(one.kernel, np.append(one.theta, np.log(one.noise)), Z, Y)[0] for one in drawn]
+    posterior = HyperparameterPosterior.given(Z, Y, 1, FAMILIES)
+    drawn = posterior.draw(10, np.random.default_rng(0))
     assert len(drawn) == 10
-    assert density[0] >= max(density) - 1e-6
-    again = draw_hyperparameters(Z, Y, 1, 3, np.random.default_rng(1), FAMILIES)
-    np.testing.assert_array_equal(again[0].theta, drawn[0].theta)
+
+    def density(one: Hyperparameters) -> float:
+        return log_posterior(one.kernel, np.append(one.theta, np.log(one.noise)), Z, Y)[0]
+
+    assert density(posterior.mode) >= max(map(density, drawn)) - 1e-6
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_draws_can_be_taken(count: int) -> None:
-    Z, Y = observations(6)
-    assert len(draw_hyperparameters(Z, Y, 1, count, np.random.default_rng(0), FAMILIES[:1])) == count
+    posterior = HyperparameterPosterior.given(*observations(6), 1, FAMILIES[:1])
+    assert len(posterior.draw(count, np.random.default_rng(0))) == count
+
+
+def test_equal_draws_are_the_same_object_and_follow_each_other() -> None:
+    drawn = HyperparameterPosterior.given(*observations(6), 1, FAMILIES[:1]).draw(60, np.random.default_rng(0))
+    names = [id(one) for one in drawn]
+    changes = sum(one != other for one, other in pairwise(names))
+    assert changes + 1 == len(set(names)) < 60
 
 
 def test_rows_are_resampled_in_proportion_to_truncated_weights() -> None:
@@ -136,11 +148,8 @@ def test_draws_have_the_moments_of_the_posterior() -> None:
     weights = np.exp(log_weights - log_weights.max())
     mean = np.average(parameters, axis=0, weights=weights)
     deviation = np.sqrt(np.average((parameters - mean) ** 2, axis=0, weights=weights))
-    drawn = [
-        np.append(one.theta, np.log(one.noise))
-        for _ in range(40)
-        for one in draw_hyperparameters(Z, Y, 1, 20, rng, [(2.5, 1.0)])[1:]
-    ]
+    posterior = HyperparameterPosterior.given(Z, Y, 1, [(2.5, 1.0)])
+    drawn = [np.append(one.theta, np.log(one.noise)) for _ in range(40) for one in posterior.draw(19, rng)]
     np.testing.assert_allclose((np.mean(drawn, axis=0) - mean) / deviation, 0, atol=0.25)
     np.testing.assert_allclose(np.std(drawn, axis=0) / deviation, 1, atol=0.25)
 

@@ -98,9 +98,9 @@ def test_an_input_that_never_varies_has_no_weight() -> None:
 
 def test_without_a_rough_model_the_system_is_learned_far_more_accurately() -> None:
     known, rng = transitions(system), np.random.default_rng(1)
-    posterior = learn_posterior(rough(system), known, np.zeros(len(known), dtype=np.intp), rng, SETTINGS)
+    posterior = learn_posterior(rough(system), known, np.zeros(len(known), dtype=np.intp), settings=SETTINGS)
     assert posterior is not None
-    assert posterior.without_model
+    assert posterior.covariances.without_model
     assert isinstance(posterior.model, models.Linear)
     x, u = rng.uniform(-1.5, 1.5, (100, 2)), rng.uniform(-0.8, 0.8, (100, 1))
     errors = posterior.mean.step(x[None], u[None])[0] - system(x, u)
@@ -109,9 +109,9 @@ def test_without_a_rough_model_the_system_is_learned_far_more_accurately() -> No
 
 def test_a_smooth_model_is_that_of_the_posterior() -> None:
     known, model = transitions(system), smooth(system)
-    posterior = learn_posterior(model, known, np.zeros(len(known), dtype=np.intp), np.random.default_rng(1), SETTINGS)
+    posterior = learn_posterior(model, known, np.zeros(len(known), dtype=np.intp), settings=SETTINGS)
     assert posterior is not None
-    assert not posterior.without_model
+    assert not posterior.covariances.without_model
     assert posterior.model is model
     assert posterior.settings == SETTINGS
 

@@ -156,6 +156,7 @@ class LoopPlanner:
         found = np.full((len(draws), tasks), np.nan)
         for one, loops in zip(planned, self.run(draws, planned), strict=True):
             found[:, one.rows] = loops.distances
+            advance(len(draws) * len(one.rows))
         return found
 
     def own_distances(self, draws: DynamicsDraws, points: Array) -> Array:
@@ -178,7 +179,6 @@ class LoopPlanner:
             loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
         else:
             loops = [rollout(draws.model_of(s).step, planned.controller, task) for s in range(S)]
-        advance(S * len(planned.rows))
         states, inputs = np.stack([one.states for one in loops]), np.stack([one.inputs for one in loops])
         shape = (S, len(planned.rows))
         return Loops(
