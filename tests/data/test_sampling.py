@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctxval.data import LogMapping, MemoryTable, Recordings, read_recordings, recordings_of
+from ctxval.data import Field, LogMapping, MemoryTable, Recordings, read_recordings, recordings_of
 from ctxval.errors import InputError
 from rig_logs import run, write_mcap_json
 
@@ -249,6 +249,15 @@ def test_marks_of_missing_values_split_a_recording_and_are_stated() -> None:
     found = recorded({"t": times, "x": x, "u": times})
     assert [one.trajectory.horizon for one in found.runs] == [6, 10]
     assert "log: x is -999 in 2 rows, far from all other values: it is taken as missing" in found.notes
+
+
+def test_a_mark_may_have_been_converted_with_its_column() -> None:
+    times = np.arange(20) / 10
+    x = 3.6 * np.where(np.arange(20) == 7, -999, np.sin(times))
+    log = MemoryTable("log", {"t": times, "x [km/h]": x, "u": times})
+    found = recordings_of([log], LogMapping({"x": Field("x", "m/s")}, {"u": Field("u")}))
+    assert [one.trajectory.horizon for one in found.runs] == [6, 11]
+    assert "log: x is -3596.4 in 1 row, far from all other values: it is taken as missing" in found.notes
 
 
 def test_only_valid_rows_count() -> None:

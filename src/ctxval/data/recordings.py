@@ -173,10 +173,10 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
         if signal.clock:
             notes.append(f"the times of messages are {_CLOCKS[signal.clock]}")
         components = names.get(one.path, [])
-        width = values.shape[1]
+        width, scale = values.shape[1], one.scale(signal.unit)
         for k in range(width):
             label = components[k] if len(components) == width else (name if width == 1 else f"{name}{k}")
-            for value in sentinels(values[:, k]):
+            for value in sentinels(values[:, k], scale):
                 rows_of_value = values[:, k] == value
                 notes.append(
                     f"{log.source}: {label} is {value:g} in {counted(int(rows_of_value.sum()), signal.word)}, far from "
@@ -189,7 +189,7 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
                     one.unit or (signal.unit if one.factor is None else ""),
                     name in mapping.inputs,
                     signal.times,
-                    one.scale(signal.unit) * values[:, k] + one.offset,
+                    scale * values[:, k] + one.offset,
                     angle=one.angle,
                     held=one.held,
                     path=one.path,
