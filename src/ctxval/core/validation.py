@@ -127,6 +127,10 @@ class Validation:
         """Return this validation with other names and units."""
         return self._with(labels=labels)
 
+    def with_longest(self, longest: int) -> Validation:
+        """Return this validation with another largest horizon that is planned."""
+        return self._with(longest=longest)
+
     def _with(self, **changed: Any) -> Validation:
         return Validation(**{**vars(self), **changed})
 
