@@ -84,6 +84,7 @@ class Validation:
         self.model = as_model(model)
         self.synthesizer = synthesizer
         self.labels = Labels() if labels is None else labels
+        self.labels.require_readable(system)
         named = getattr(distance, "with_states", None)
         self.distance: Distance = named(self.labels.state_names(system)) if callable(named) else distance
         self.start_tolerance = float(start_tolerance)
