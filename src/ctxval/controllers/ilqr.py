@@ -53,9 +53,7 @@ class ILQRSolution:
     cost: Array
     iterations: Array
     converged: Array
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @part()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 from ctxval._util.checked import checked
 from ctxval._util.representation import record
@@ -54,8 +53,7 @@ class Labels:
         """Refuse a system whose own names make a recording unreadable, if these labels do not replace them."""
         require_names(self.states or names_of(system, "states"), self.inputs or names_of(system, "inputs"))
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def require_names(states: Iterable[str], inputs: Iterable[str]) -> None:
@@ -80,8 +78,8 @@ def labels_of(named: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(f"{name} [{unit}]" if unit else name for name, unit in named.items())
 
 
-def names_of(system: object, kind: Literal["states", "inputs"]) -> dict[str, str]:
-    """Return the names and units that a system has for its states or inputs; empty if it has none."""
+def names_of(system: object, kind: str) -> dict[str, str]:
+    """Return the names and units of the ``"states"`` or ``"inputs"`` of a system; empty if it names none."""
     own = getattr(system, kind, None)
     if isinstance(own, Mapping):
         return {str(name): str(unit) for name, unit in own.items()}

@@ -121,6 +121,4 @@ class Change:
     why: str
     content: dict[str, Any]
     at: str = ""
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record

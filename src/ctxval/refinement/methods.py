@@ -124,8 +124,7 @@ class ResidualCorrection(Method):
         found = learn_covariance(model, records.transitions, records.sources, self.centres, of_steps=False)
         return None if found is None else correction_of(found.residual)
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def correction_of(residual: Residual) -> Correction:
@@ -202,8 +201,7 @@ class Refit(Method):
 
         return Learned(_usable(fitted(records), records), held_out(fitted, model, records))
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @dataclass(frozen=True, eq=False)

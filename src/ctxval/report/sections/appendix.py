@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from markupsafe import Markup
 
+from ctxval._util.representation import call
 from ctxval.certificates.bounds import at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
@@ -51,8 +52,7 @@ class AppendixSection:
             ]
         )
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    __repr__ = call
 
 
 def appendix(context: ReportContext) -> list[Entry]:

@@ -8,6 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ctxval._util.arrays import Array, Mask
+from ctxval._util.representation import call
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, Kind, colour_scale, small_charts
 from ctxval.report.context import ReportContext
@@ -46,8 +47,7 @@ class TasksSection:
             parts += [heading("Where the threshold is kept"), mapped]
         return joined(parts)
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    __repr__ = call
 
 
 def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:

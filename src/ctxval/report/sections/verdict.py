@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from markupsafe import Markup
 
-from ctxval._util.representation import counted
+from ctxval._util.representation import call, counted
 from ctxval.certificates.bounds import as_text, at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
@@ -40,8 +40,7 @@ class VerdictSection:
             ]
         )
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    __repr__ = call
 
 
 def _answer(context: ReportContext) -> str:
