@@ -180,6 +180,9 @@ def test_outputs_are_those_that_a_command_line_names() -> None:
     head = {"f/a.sqlite": b"SQLite format 3\0".ljust(68, b"\0") + bytes.fromhex("63747876"), "f/x.csv": b"t,x\n"}
     new: oracles.Digests = {**kept, "f/a.sqlite": ("file", 2), "f/a.report.html": ("file", 3), "f/saved/x": ("file", 4)}
     assert oracles.strays(kept, new, ("export", "a.sqlite", "--out", "saved"), head, Path("/p")) == []
+    beside = {**kept, "trials.csv": ("file", 6)}
+    assert oracles.strays(kept, beside, ("export", "a.sqlite", "--out", ".."), head, Path("/p")) == []
+    assert oracles.strays(kept, beside, ("export", "a.sqlite", "--out", "."), head, Path("/p")) == ["created trials.csv"]
     assert oracles.strays(kept, new, ("status", "b.sqlite"), head, Path("/p")) == [
         "created f/a.report.html",
         "changed f/a.sqlite",
