@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -118,7 +117,8 @@ def ask(
     option: PartOptions = None,
 ) -> Any:
     """Open the next trial of a system that people operate, and write its task and controller to files."""
-    _require_one_choice(parameters, draw, again, trial, until_decided)
+    if sum((bool(parameters), draw, again is not None, trial is not None, until_decided)) > 1:
+        raise InputError("--set, --draw, --again, --trial and --until-decided cannot be combined.")
     if not until_decided and (threshold is not None or budget is not None):
         raise InputError("--threshold and --budget need --until-decided.")
     if because is not None and again is None:
@@ -136,26 +136,14 @@ def ask(
             return _decided(opened, limit, as_json)
         found = asked
     else:
-        chosen = _chosen(opened, parameters, again)
+        chosen = None if again is None else parameters_of_trial(opened.campaign, again)
+        if parameters:
+            chosen = parameters_from(parameters, opened.experiment.validation.space)
         found = opened.campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
     report = _asked(opened, found, out_folder, force)
     if not as_json:
         _print_asked(report, found)
     return report
-
-
-def _require_one_choice(
-    parameters: list[str] | None, draw: bool, again: int | None, trial: int | None, until_decided: bool
-) -> None:
-    if sum((bool(parameters), draw, again is not None, trial is not None, until_decided)) > 1:
-        raise InputError("--set, --draw, --again, --trial and --until-decided cannot be combined.")
-
-
-def _chosen(opened: Opened, parameters: list[str] | None, again: int | None) -> Mapping[str, Any] | None:
-    """Return the task that the user names; None if the search is to choose it."""
-    if parameters:
-        return parameters_from(parameters, opened.experiment.validation.space)
-    return None if again is None else parameters_of_trial(opened.campaign, again)
 
 
 def _asked(opened: Opened, found: OpenTrial, out_folder: Path | None, force: bool) -> dict[str, Any]:

@@ -54,14 +54,11 @@ def _sentence(context: ReportContext) -> str:
         worst = context.worst_first[0] if context.worst_first else None
         largest = "no distance is known" if worst is None else f"the largest executed distance is {_of(context)}"
         return f"No threshold was given; {largest}."
-    reason = f"{verdict.reason[:1].upper()}{verdict.reason[1:]} {_effort(context)}"
-    return reason if verdict.rests_on is None else f"{reason} {verdict.rests_on}"
-
-
-def _effort(context: ReportContext) -> str:
     without = len(context.failed)
     lost = "each gave a distance" if not without else f"{without} of the trials have no distance"
-    return f"{context.executions} executions were spent, and {lost}."
+    effort = f"{context.executions} executions were spent, and {lost}."
+    reason = f"{verdict.reason[:1].upper()}{verdict.reason[1:]} {effort}"
+    return reason if verdict.rests_on is None else f"{reason} {verdict.rests_on}"
 
 
 def _of(context: ReportContext) -> str:
