@@ -182,7 +182,9 @@ def test_outputs_are_those_that_a_command_line_names() -> None:
     assert oracles.strays(kept, new, ("export", "a.sqlite", "--out", "saved"), head, Path("/p")) == []
     beside = {**kept, "trials.csv": ("file", 6)}
     assert oracles.strays(kept, beside, ("export", "a.sqlite", "--out", ".."), head, Path("/p")) == []
-    assert oracles.strays(kept, beside, ("export", "a.sqlite", "--out", "."), head, Path("/p")) == ["created trials.csv"]
+    assert oracles.strays(kept, beside, ("export", "a.sqlite", "--out", "."), head, Path("/p")) == [
+        "created trials.csv"
+    ]
     assert oracles.strays(kept, new, ("status", "b.sqlite"), head, Path("/p")) == [
         "created f/a.report.html",
         "changed f/a.sqlite",

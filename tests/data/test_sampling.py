@@ -260,6 +260,14 @@ def test_a_mark_may_have_been_converted_with_its_column() -> None:
     assert "log: x is -3596.4 in 1 row, far from all other values: it is taken as missing" in found.notes
 
 
+def test_values_whose_squares_are_not_finite_are_refused() -> None:
+    times = np.arange(20) / 10
+    with pytest.raises(InputError, match=r"log: x must be at most 1e\+100, got 1e\+300; leave out missing values"):
+        recorded({"t": times, "x": np.full(20, -1e300), "u": times})
+    mark = np.where(np.arange(20) == 7, 1e300, times)
+    assert len(recorded({"t": times, "x": mark, "u": times}).runs) == 2
+
+
 def test_only_valid_rows_count() -> None:
     times = np.arange(10) / 10
     status = np.array([0, 0, 0, 0, 1, 0, 0, 0, 0, 0])

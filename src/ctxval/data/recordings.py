@@ -21,6 +21,9 @@ from ctxval.data.readers import is_lerobot, read_logs
 from ctxval.data.sampling import Break, Channel, sampled
 from ctxval.errors import InputError
 
+_LARGEST = 1e100
+"""Largest size of a recorded value: squares of errors must be finite."""
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -183,6 +186,11 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
                     "all other values: it is taken as missing"
                 )
                 values[rows_of_value, k] = np.nan
+            known = np.abs(values[:, k][np.isfinite(values[:, k])])
+            if (largest := float(known.max(initial=0.0))) > _LARGEST:
+                raise InputError(
+                    f"{log.source}: {label} must be at most {_LARGEST:g}, got {largest:g}; leave out missing values."
+                )
             channels.append(
                 Channel(
                     label,
