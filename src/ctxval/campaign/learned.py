@@ -48,7 +48,10 @@ class LearnedFromTrials:
 
         They are NaN if a task cannot be predicted, or if the trials teach nothing.
         """
-        prediction = self._before(before)
+        if before not in self._predictions:
+            earlier = [trial for trial in self.trials if trial.number < before]
+            self._predictions[before] = predict_from(self._predictor, self.store, earlier)
+        prediction = self._predictions[before]
         return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
 
     def dynamics(self, confidence: float) -> DynamicsEvidence | None:
@@ -61,10 +64,3 @@ class LearnedFromTrials:
     def tasks(self, count: int, seed: int) -> Array:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
         return self.validation.space.unit_draws(count, np.random.default_rng([seed, _TASKS]))
-
-    def _before(self, before: int) -> Prediction | None:
-        """Return the prediction from the trials with smaller numbers; it is computed once."""
-        if before not in self._predictions:
-            earlier = [trial for trial in self.trials if trial.number < before]
-            self._predictions[before] = predict_from(self._predictor, self.store, earlier)
-        return self._predictions[before]

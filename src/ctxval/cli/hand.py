@@ -131,7 +131,9 @@ def ask(
         found = opened.campaign.reopen(trial)
     elif until_decided:
         limit = require_limit(opened.experiment, opened.settings, threshold, "--until-decided")
-        asked = _asked_until_decided(opened, limit, budget)
+        totals = (budget, opened.settings.budget, opened.experiment.budget)
+        total, options = next(one for one in totals if one is not None), opened.settings.certificate_options
+        asked = opened.campaign.ask_until_decided(limit, total, certificate=options, wait=_WAIT)
         if asked is None:
             return _decided(opened, limit, as_json)
         found = asked
@@ -292,13 +294,6 @@ def _opened(
     made = settings.load()
     where = settings.store_path(made.name)
     return Opened(settings, made, settings.campaign(made, where, accept_change=accept_change), where)
-
-
-def _asked_until_decided(opened: Opened, limit: float, budget: int | None) -> OpenTrial | None:
-    settings, experiment = opened.settings, opened.experiment
-    total = next(one for one in (budget, settings.budget, experiment.budget) if one is not None)
-    options = settings.certificate_options
-    return opened.campaign.ask_until_decided(limit, total, certificate=options, wait=_WAIT)
 
 
 def _decided(opened: Opened, limit: float, as_json: bool) -> tuple[dict[str, Any], int]:
