@@ -31,8 +31,8 @@ from hostile.cage import Case, carry_out  # noqa: E402
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="inputs are tried in forks")
 
-EACH = {"damaged": 25, "crafted": 25, "crafted-own": 10, "coded": 10, "no-store": 15, "told": 15, "imported": 15}
-EACH |= {"data": 3, "toml": 6, "systems": 3, "arguments": 6, "clothes": 20, "logs": 30, "outputs": 12, "secrets": 8}
+EACH = {"damaged": 10, "crafted": 15, "crafted-own": 10, "coded": 10, "no-store": 15, "told": 15, "imported": 15}
+EACH |= {"data": 3, "toml": 6, "systems": 3, "arguments": 6, "clothes": 12, "logs": 20, "outputs": 12, "secrets": 8}
 EACH |= {"served": 1}
 
 
