@@ -14,10 +14,10 @@ demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
 
 test: check
-	$(BIN)/python -m pytest --numprocesses auto
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
 quick: .venv/.test  ## everything that takes less than half a second, on all cores, for daily work
-	$(BIN)/python -m pytest -q -m "not slow" --numprocesses auto
+	$(BIN)/python -m pytest -q -m "not slow" --numprocesses auto --dist worksteal
 
 check: .venv/.test
 	$(BIN)/ruff check .

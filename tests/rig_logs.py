@@ -85,8 +85,8 @@ def write_mcap_ros2(path: Path, one: Trajectory, *, late: float | np.ndarray = 0
             writer.write_message("/joints", schema, message, log_time=logged, publish_time=stamp)
 
 
-def write_bag(path: Path, one: Trajectory, *, storage: str = "sqlite3") -> None:
-    """Write the run as a ROS 2 bag with the library rosbags, which needs no ROS."""
+def write_bag(path: Path, one: Trajectory, *, storage: str = "sqlite3", late: float | np.ndarray = 0.0) -> None:
+    """Write the run as a ROS 2 bag with the library rosbags, which needs no ROS. Log times are late, stamps are not."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -96,12 +96,12 @@ def write_bag(path: Path, one: Trajectory, *, storage: str = "sqlite3") -> None:
     plugin = StoragePlugin.SQLITE3 if storage == "sqlite3" else StoragePlugin.MCAP
     with Writer(path, version=9, storage_plugin=plugin) as writer:
         topic = writer.add_connection("/joints", joint.__msgtype__, typestore=store)
-        for k, time in enumerate(one.times):
+        for k, (time, delay) in enumerate(zip(one.times, np.broadcast_to(late, len(one.times)), strict=True)):
             stamp = 5 * 10**9 + round(1e9 * time)
             head = header(stamp=clock(sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id="")
             effort = one.inputs[k] if k < one.horizon else np.zeros(1)
             message = joint(head, ["cart"], one.states[k, :1].copy(), one.states[k, 1:].copy(), effort.copy())
-            writer.write(topic, stamp, store.serialize_cdr(message, joint.__msgtype__))
+            writer.write(topic, stamp + round(1e9 * float(delay)), store.serialize_cdr(message, joint.__msgtype__))
 
 
 def write_bag1(path: Path, one: Trajectory, *, to_mcap: bool = False) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 
 from ctxval.core.exchange import read_controller, read_task
 from ctxval.core.rollout import rollout
+from rig_cli import calling
 
 MODULE = """
 from ctxval import Experiment, Task, TaskSpace, Validation, controllers, distances, models, systems
@@ -67,9 +68,10 @@ COMMAND = [sys.executable, "-c", "from ctxval.cli import main; main()"]
 def ctxval(*arguments: str, folder: Path) -> dict[str, Any]:
     """Run a command of ctxval in a folder with the rig in it; return its JSON object."""
     (folder / "my_rig.py").write_text(MODULE)
-    command = [*COMMAND, *arguments, "--json"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode in (0, 1), done.stderr
+    sys.modules.pop("my_rig", None)  # that of another folder
+    with contextlib.chdir(folder):
+        done = calling()(*arguments, "--json")
+    assert done.exit_code in (0, 1), done.output
     report: dict[str, Any] = json.loads(done.stdout)
     return report
 

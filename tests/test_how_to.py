@@ -9,9 +9,12 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from rig_cli import calling
 
 DOCS = Path(__file__).parents[1] / "docs"
 HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
@@ -22,7 +25,7 @@ NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-s
 NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
 NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}
 NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
-PROGRAMS: dict[str, list[str]] = {"python": [], "ctxval": ["-c", "from ctxval.cli import main; main()"]}
+CTXVAL = ["-c", "from ctxval.cli import main; main()"]
 
 
 def blocks(page: Path) -> list[tuple[str, str]]:
@@ -51,28 +54,40 @@ def run_console(lines: str) -> None:
     for line in lines.splitlines():
         status = int(found[1]) if (found := re.search(r"# exit status (\d+)$", line)) else 0
         program, *arguments = shlex.split(line.removeprefix("$ ").removesuffix(" &"), comments=True)
-        command = [sys.executable, *PROGRAMS[program], *arguments]
         if line.endswith(" &"):
-            require_server(command)
-            continue
-        done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "100"})
-        assert done.returncode == status, line + done.stdout + done.stderr
+            require_server([sys.executable, *CTXVAL, *arguments])
+        elif program == "ctxval":  # in this process, which has imported everything
+            called = calling()(*arguments)
+            assert called.exit_code == status, line + called.output
+        else:
+            assert program == "python", line
+            done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
+            assert done.returncode == status, line + done.stdout + done.stderr
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder of a page, with its modules; another page may have modules of the same names."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    for name, module in [*sys.modules.items()]:
+        if (getattr(module, "__file__", None) or "").startswith(str(tmp_path)):
+            del sys.modules[name]
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("folder", "few_draws")
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_blocks_of_a_page_run(page: Path) -> None:
     for module in NEEDS.get(page.stem, []):
         pytest.importorskip(module)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
     names: dict[str, object] = {"__name__": "page"}
     for language, content in blocks(page):
         first, _, rest = content.partition("\n")
         if first.startswith("# file: "):
-            written = Path(first.removeprefix("# file: "))
-            written.write_text(rest)
-            sys.modules.pop(written.stem, None)  # another page may have a module of this name
+            Path(first.removeprefix("# file: ")).write_text(rest)
         elif language == "console":
             run_console(content)
         elif language == "text":

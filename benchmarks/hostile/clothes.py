@@ -301,29 +301,10 @@ def _bag(rng: Rng, folder: Path, number: int) -> tuple[Path, tuple[str, ...], st
         rig_logs.write_bag1(folder / "run.mcap", one, to_mcap=True)
         return folder / "run.mcap", cart, "ROS 1 in mcap"
     if kind == 3:
-        _jittered_bag(rng, folder / "bag", one)
+        rig_logs.write_bag(folder / "bag", one, late=rng.uniform(0, 0.03, len(one.times)))
         return folder / "bag", cart, "bag with late log times"
     rig_logs.write_mcap_protobuf(folder / "run.mcap", one, late=float(pick(rng, (0.0, 0.3))))
     return folder / "run.mcap", ("/joints.motion.position[0]", "/joints.motion.velocity", "/joints.effort"), "protobuf"
-
-
-def _jittered_bag(rng: Rng, path: Path, one: Trajectory) -> None:
-    """Write a bag of ROS 2 whose header stamps are exact, and whose log times are late by up to 30 ms."""
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    joint, header = store.types["sensor_msgs/msg/JointState"], store.types["std_msgs/msg/Header"]
-    clock = store.types["builtin_interfaces/msg/Time"]
-    with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        topic = writer.add_connection("/joints", joint.__msgtype__, typestore=store)
-        for k, time in enumerate(one.times):
-            stamp = 5 * 10**9 + round(1e9 * time)
-            head = header(stamp=clock(sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id="")
-            effort = one.inputs[k] if k < one.horizon else np.zeros(1)
-            message = joint(head, ["cart"], one.states[k, :1].copy(), one.states[k, 1:].copy(), effort.copy())
-            late = int(rng.integers(30_000_000))
-            writer.write(topic, stamp + late, store.serialize_cdr(message, joint.__msgtype__))
 
 
 # Commands, and their answers

@@ -201,7 +201,8 @@ def _may_be_store(head: bytes | None) -> bool:
 
 def _declared(path: str, targets: Sequence[str], named: Sequence[str], new: Sequence[str]) -> bool:
     if any(
-        path == target or path.startswith(f"{target}/") or f"{target}/".startswith(f"{path}/") for target in targets
+        target in (path, ".") or path.startswith(f"{target}/") or f"{target}/".startswith(f"{path}/")
+        for target in targets
     ):
         return True
     # A report, pictures or the files of trials stand beside what the command line names, with the same stem.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
@@ -257,7 +256,7 @@ def _report(
         flips=found,
         flipped=None if found is None else (where[found.example[0]], where[found.example[1]]),
         saturation=saturation(inputs, validation.synthesizer),
-        inputs=_input_labels(validation, list(plans.values())),
+        inputs=tuple(validation.names(0, inputs[0].shape[-1])[1]) if inputs else (),
         not_converged=tuple(one for one, ok in zip(where, told, strict=True) if ok is not None and not ok),
         designs=sum(ok is not None for ok in told),
     )
@@ -292,10 +291,3 @@ def _planned(validation: Validation, points: Array, batched: bool) -> dict[int, 
         except (DesignError, ModelError):
             continue
     return found
-
-
-def _input_labels(validation: Validation, plans: Sequence[Plan]) -> tuple[str, ...]:
-    if not plans:
-        return ()
-    one = plans[0].model_trajectory
-    return tuple(validation.names(one.states.shape[-1], one.inputs.shape[-1])[1])

@@ -66,9 +66,7 @@ class Curve:
 
     points: Array
     values: Array
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def overview(

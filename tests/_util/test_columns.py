@@ -59,6 +59,16 @@ def test_marks_far_outside_the_rest_are_noticed(mark: float) -> None:
     values[[3, 4, 20]] = mark
     assert sentinels(values) == [mark]
     assert sentinels(np.append(values, np.nan)) == [mark]
+    assert sentinels(values.astype(np.float32)) == [float(np.float32(mark))]
+
+
+def test_marks_that_were_converted_with_the_rest_are_noticed() -> None:
+    values = np.append(np.sin(np.arange(50.0)), -999.0)
+    for factor in (3.6, 1e3, 1 / 0.0254, np.rad2deg(1)):
+        assert sentinels(factor * values, 1 / factor) == [factor * -999.0]
+        assert sentinels(values, factor) == [-999.0]
+        assert sentinels(factor * values) == []
+    assert sentinels(np.append(np.zeros(50), 1e3), 1e3) == [], "a force of 1 kN is no mark, though it is 1e6 mN"
 
 
 @given(arrays(np.float64, st.integers(0, 30), elements=st.floats(-90, 90)))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -124,3 +125,20 @@ def test_the_offset_of_a_start_is_stated_and_compared_with_the_threshold() -> No
     sentence = "The start of an execution was off by 0.02 in x0 (trial 0); the threshold is"
     assert f"{sentence} 0.01" in campaign.verdict(0.01).reason
     assert sentence not in campaign.verdict(0.03).reason
+
+
+def test_the_trajectories_are_read_together_for_the_largest_offset_of_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    campaign = Campaign(make_validation(), search=searches.Random()).run(3)
+    campaign.add({"goal": 0.3}, distance=0.1)
+    offsets = [(campaign.start_offset(trial), trial.number) for trial in campaign.completed]
+    known = [(offset.size, f"{offset.text} (trial {number})") for offset, number in offsets if offset is not None]
+    assert len(known) == 3
+    reads, read = list[list[int]](), campaign.store.trajectories
+
+    def counted(numbers: Iterable[int], side: Literal["model", "system"]) -> dict[int, Trajectory]:
+        reads.append(list(numbers))
+        return read(reads[-1], side)
+
+    monkeypatch.setattr(campaign.store, "trajectories", counted)
+    assert campaign.provenance.start == max(known)
+    assert reads == [[0, 1, 2, 3]]

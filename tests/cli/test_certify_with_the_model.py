@@ -24,7 +24,7 @@ def invoke(*arguments: str) -> Result:
 def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of the pendulum with six trials of the search."""
     store = tmp_path_factory.mktemp("runs") / "pendulum.sqlite"
-    assert invoke("run", "pendulum", "--budget", "6", "--store", str(store)).exit_code == 0
+    assert invoke("run", "pendulum", "--budget", "6", "--store", str(store), "--no-report").exit_code == 0
     return store
 
 

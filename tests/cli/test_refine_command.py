@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import Result
 
 from ctxval import Store, models
 from rig_cli import Invoke, calling
@@ -72,13 +73,18 @@ thinking = "fast"
 """
 
 
+def prepare(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """Write an experiment and its module to a folder, and go there."""
+    patch.chdir(folder)
+    patch.setenv("COLUMNS", "160")
+    sys.modules.pop("refined_plant", None)
+    (folder / "refined_plant.py").write_text(PLANT)
+    (folder / "cart.toml").write_text(FILE.format(budget=20))
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "160")
-    monkeypatch.delitem(sys.modules, "refined_plant", raising=False)
-    (tmp_path / "refined_plant.py").write_text(PLANT)
-    (tmp_path / "cart.toml").write_text(FILE.format(budget=20))
+    prepare(tmp_path, monkeypatch)
     return tmp_path
 
 
@@ -117,9 +123,21 @@ def test_a_falsified_store_is_refined_until_the_model_is_validated(invoke: Invok
     assert {**again, "files": found["files"]} == found
 
 
+REFINE = ("refine", "cart.toml", "--seed", "1", "--confidence", "0.9")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
+    """What an unbroken refinement prints, and its folder."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        prepare(folder, patch)
+        return calling()(*REFINE), folder
+
+
 @pytest.mark.slow
-def test_an_experiment_is_run_first_and_the_answer_is_said(invoke: Invoke, folder: Path) -> None:
-    done = invoke("refine", "cart.toml", "--seed", "1", "--confidence", "0.9")
+def test_an_experiment_is_run_first_and_the_answer_is_said(whole: tuple[Result, Path]) -> None:
+    done, folder = whole
     assert done.exit_code == 0, done.stdout + done.stderr
     for part in ("falsified", "validated against 0.05", "under its own controllers", "0.95", "not guaranteed"):
         assert part in " ".join(done.stdout.split())
@@ -146,29 +164,22 @@ def test_a_function_of_the_user_learns_the_model(invoke: Invoke) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_refinement_loses_nothing_and_ends_as_an_unbroken_one(invoke: Invoke, folder: Path) -> None:
-    def start(target: Path) -> subprocess.Popen[bytes]:
-        target.mkdir()
-        (target / "refined_plant.py").write_text(PLANT)
-        (target / "cart.toml").write_text(FILE.format(budget=20))
-        code = "from ctxval.cli import main; main()"
-        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        return subprocess.Popen([sys.executable, "-c", code, "refine", "cart.toml"], cwd=target, **quiet)
-
-    whole = start(folder / "whole")
-    assert whole.wait(timeout=600) == 0
-    killed = start(folder / "killed")
-    stores = folder / "killed" / "runs"
+def test_a_killed_refinement_loses_nothing_and_ends_as_an_unbroken_one(
+    whole: tuple[Result, Path], invoke: Invoke, folder: Path
+) -> None:
+    code = "from ctxval.cli import main; main()"
+    quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    killed = subprocess.Popen([sys.executable, "-c", code, *REFINE], cwd=folder, **quiet)
+    stores = folder / "runs"
     deadline = time.monotonic() + 300
     while executions(stores) < 2 and killed.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
     before = trials(stores)
-    os.chdir(folder / "killed")
-    assert invoke("refine", "cart.toml").exit_code == 0
+    assert invoke(*REFINE).exit_code == 0
     after = trials(stores)
-    assert after == trials(folder / "whole" / "runs")
+    assert after == trials(whole[1] / "runs")
     assert all(one in after for one in before if one[2] == "completed")
 
 

@@ -172,6 +172,19 @@ def test_what_the_certificate_of_the_file_would_ignore_is_refused(invoke: Any) -
     assert not Path("runs").exists()
 
 
+@pytest.mark.parametrize("target", ["experiment = 'pendulum'", "name = 'cart'"])
+def test_the_file_says_the_largest_horizon_that_is_planned(invoke: Any, target: str) -> None:
+    text = target if "pendulum" in target else Path("experiment.toml").read_text()
+    for longest in (3, 10**7):
+        Path("e.toml").write_text(f"longest = {longest}\n{text}")
+        assert read_settings("e.toml", {}).load().validation.longest == longest
+    for wrong in ("0", "2.5", "true", "'3'", str(2**60)):
+        Path("e.toml").write_text(f"longest = {wrong}\n{text}")
+        assert "longest" in sentence(invoke("run", "e.toml"))
+    Path("e.toml").write_text(f"longest = 3\n{text}")
+    assert "at most 3 steps are permitted: longest =" in sentence(invoke("run", "e.toml"))
+
+
 @pytest.mark.slow
 def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: Any) -> None:
     scenario = ('kind = "auto"', 'kind = "scenario"\nvolume = 0.5')

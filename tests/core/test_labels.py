@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from conftest import make_validation
-from ctxval import Experiment, Labels, distances, systems
+from ctxval import Experiment, Labels, Validation, distances, systems
 from ctxval.core.labels import labels_of
 from ctxval.errors import InputError
 
@@ -74,3 +74,19 @@ def test_names_that_make_a_recording_unreadable_are_refused_where_they_are_decla
             systems.Manual(states=named[0], inputs=named[1], dt=0.1)
         with pytest.raises(InputError, match=message):
             systems.Subprocess("true", timeout=1.0, states=named[0], inputs=named[1])
+        given = vars(make_validation())
+        for kind in (list, tuple, dict):
+            own = {name: kind(names) for name, names in zip(("states", "inputs"), named, strict=True)}
+            system = SimpleNamespace(execute=given["system"].execute, **own)
+            with pytest.raises(InputError, match=message):
+                Validation(**{**given, "system": system})
+            assert Validation(**{**given, "system": system, "labels": Labels(("a",), ("b",))}).system is system
+
+
+def test_an_index_is_part_of_a_name() -> None:
+    system = SimpleNamespace(states=["q[1]", "q[2]", "der(q[1])"], inputs=["u[1]"])
+    validation = make_validation()
+    Validation(**{**vars(validation), "system": SimpleNamespace(execute=validation.system.execute, **vars(system))})
+    assert Labels().names(system, 3, 1) == ({"q[1]": "", "q[2]": "", "der(q[1])": ""}, {"u[1]": ""})
+    assert Labels(("q[1] [rad]", "q[2][m]")).names(None, 2, 0)[0] == {"q[1]": "rad", "q[2]": "m"}
+    assert Labels(("q[1]", "q[2]")).state_names(None) == ("q[1]", "q[2]")

@@ -273,6 +273,15 @@ def test_csv_columns_are_found_by_name_and_others_left_alone(tmp_path: Path) -> 
     assert again.times.tolist() == [0, 1]
 
 
+def test_csv_keeps_names_with_an_index(tmp_path: Path) -> None:
+    run = Trajectory(0.1 * np.arange(3), np.arange(6.0).reshape(3, 2), np.ones((2, 1)))
+    for units in ("", " [m]"):
+        names = [f"q[1]{units}", f"q[2]{units}"]
+        run.to_csv(tmp_path / "run.csv", states=names, inputs=["u[1]"])
+        again = Trajectory.from_csv(tmp_path / "run.csv", states=names, inputs=["u[1]"])
+        np.testing.assert_array_equal(again.states, run.states)
+
+
 def test_a_batch_is_refused_as_csv(batch: Trajectory, tmp_path: Path) -> None:
     with pytest.raises(ShapeError, match=r"one trajectory, got a batch of shape \(5,\)"):
         batch.to_csv(tmp_path / "batch.csv")

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctxval import Experiment, Plan, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, systems
-from ctxval.campaign.by_hand import read_recording
+from ctxval.campaign.recording_file import RecordingFile
 from ctxval.data import LogMapping
 from ctxval.errors import InputError
 from rig_logs import write_bag, write_bag1
@@ -218,6 +218,12 @@ def written(folder: Path, worn: Clothes) -> tuple[Path, LogMapping | None, bool]
     return folder / "run.mat", mapping, False
 
 
+def read(path: Path, mapping: LogMapping | None) -> Trajectory:
+    """Read a recording in this process; tests of ``RecordingFile`` show that a confined process reads the same."""
+    made, plan = experiment()
+    return RecordingFile(path, *made.names(2, 1), plan.task.times, mapping=mapping).read()
+
+
 @pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(worn=clothes())
@@ -228,7 +234,7 @@ def test_the_same_recording_in_other_clothes_has_the_same_distance(
     made, plan = experiment()
     if refused:
         with pytest.raises(InputError, match=r"two columns|several columns|twice|must have \d+ cells"):
-            read_recording(path, made, plan, mapping=mapping)
+            read(path, mapping)
         return
-    found = made.validation.accept(plan, read_recording(path, made, plan, mapping=mapping)).distance
+    found = made.validation.accept(plan, read(path, mapping)).distance
     assert found == pytest.approx(recorded()[1], rel=1e-9)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctxval.data import LogMapping, MemoryTable, Recordings, read_recordings, recordings_of
+from ctxval.data import Field, LogMapping, MemoryTable, Recordings, read_recordings, recordings_of
 from ctxval.errors import InputError
 from rig_logs import run, write_mcap_json
 
@@ -249,6 +249,23 @@ def test_marks_of_missing_values_split_a_recording_and_are_stated() -> None:
     found = recorded({"t": times, "x": x, "u": times})
     assert [one.trajectory.horizon for one in found.runs] == [6, 10]
     assert "log: x is -999 in 2 rows, far from all other values: it is taken as missing" in found.notes
+
+
+def test_a_mark_may_have_been_converted_with_its_column() -> None:
+    times = np.arange(20) / 10
+    x = 3.6 * np.where(np.arange(20) == 7, -999, np.sin(times))
+    log = MemoryTable("log", {"t": times, "x [km/h]": x, "u": times})
+    found = recordings_of([log], LogMapping({"x": Field("x", "m/s")}, {"u": Field("u")}))
+    assert [one.trajectory.horizon for one in found.runs] == [6, 11]
+    assert "log: x is -3596.4 in 1 row, far from all other values: it is taken as missing" in found.notes
+
+
+def test_values_whose_squares_are_not_finite_are_refused() -> None:
+    times = np.arange(20) / 10
+    with pytest.raises(InputError, match=r"log: x must be at most 1e\+100, got 1e\+300; leave out missing values"):
+        recorded({"t": times, "x": np.full(20, -1e300), "u": times})
+    mark = np.where(np.arange(20) == 7, 1e300, times)
+    assert len(recorded({"t": times, "x": mark, "u": times}).runs) == 2
 
 
 def test_only_valid_rows_count() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sqlite3
 import subprocess
 import sys
 import time
@@ -26,8 +28,14 @@ RIG = Path(__file__).parents[1] / "rig_refine.py"
 
 
 @pytest.fixture(scope="module")
-def found() -> Refinement:
-    return refined()
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The store of the refinement that most tests look at."""
+    return tmp_path_factory.mktemp("refined") / "a.sqlite"
+
+
+@pytest.fixture(scope="module")
+def found(store: Path) -> Refinement:
+    return refined(store)
 
 
 @pytest.mark.slow
@@ -74,7 +82,7 @@ def test_the_shares_of_the_rounds_sum_up_to_alpha() -> None:
 @pytest.mark.slow
 def test_a_fit_that_memorises_is_not_validated() -> None:
     """Its distance is zero on each task that it has seen, which is no evidence on any other task."""
-    found = refined(method=memory)
+    found = refine(campaign(), THRESHOLD, 4, method=memory)
     assert found.answer != "validated"
     assert len(found.rounds) > 1
     goals = np.linspace(0.5, 2.0, 20)[:, None]
@@ -139,13 +147,12 @@ def test_a_model_that_was_refined_before_is_learned_again_from_the_first_one() -
 
 
 @pytest.mark.slow
-def test_a_refinement_is_resumed_from_its_files_with_the_same_choices(tmp_path: Path) -> None:
-    whole = refined(tmp_path / "a.sqlite")
-    assert (tmp_path / "a.round-1.npz").exists()
-    assert (tmp_path / "a.round-1.sqlite").exists()
-    again = refined(tmp_path / "a.sqlite")
-    assert again.executions == whole.executions
-    assert json.loads(again.to_json()) == json.loads(whole.to_json())
+def test_a_refinement_is_resumed_from_its_files_with_the_same_choices(found: Refinement, store: Path) -> None:
+    assert store.with_name("a.round-1.npz").exists()
+    assert store.with_name("a.round-1.sqlite").exists()
+    again = refined(store)
+    assert again.executions == found.executions
+    assert json.loads(again.to_json()) == json.loads(found.to_json())
 
 
 def content(store: Path) -> list[tuple[Any, ...]]:
@@ -157,25 +164,35 @@ def content(store: Path) -> list[tuple[Any, ...]]:
     return rows
 
 
+def executions(store: Path) -> int:
+    """Return how many executions the stores of all rounds have, without waiting for their locks."""
+    found = 0
+    for path in store.parent.glob(f"{store.stem}*.sqlite"):
+        with contextlib.suppress(sqlite3.Error):
+            reading = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+            with contextlib.closing(reading):
+                found += reading.execute("SELECT COUNT(*) FROM trials WHERE state = 'completed'").fetchone()[0]
+    return found
+
+
 @pytest.mark.slow
-def test_a_killed_refinement_resumes_with_the_same_choices(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_a_killed_refinement_resumes_with_the_same_choices(
+    found: Refinement, store: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     kills = max(2, request.config.getoption("--kills") // 5)
-    whole = tmp_path / "whole.sqlite"
-    began = time.perf_counter()
-    process = start(whole)
-    assert process.wait(timeout=600) == 0
-    duration = time.perf_counter() - began
-    expected = content(whole)
-    rng = np.random.default_rng(7)
+    expected, rng = content(store), np.random.default_rng(7)
     for number in range(kills):
-        store = tmp_path / f"{number}.sqlite"
-        process = start(store)
-        time.sleep(float(rng.uniform(0.05, 0.9)) * duration)
+        killed = tmp_path / f"{number}.sqlite"
+        process = start(killed)
+        wanted = int(rng.integers(1, len(expected)))  # it is killed some time after so many executions
+        while executions(killed) < wanted and process.poll() is None:
+            time.sleep(0.02)
+        time.sleep(float(rng.uniform(0.0, 1.0)))
         process.kill()
         process.wait()
-        before = content(store)
-        refined(store)
-        after = content(store)
+        before = content(killed)
+        refined(killed)
+        after = content(killed)
         assert after == expected
         assert all(row in after for row in before if row[2] == "completed"), "an execution was lost"
 

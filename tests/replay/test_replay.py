@@ -14,6 +14,7 @@ from ctxval.data import LogMapping, MemoryTable, Recordings, recordings_of
 from ctxval.errors import InputError, ModelError
 from ctxval.replay import ReplayReport, replay
 from ctxval.replay.accuracy import normalised
+from ctxval.replay.steps import root_mean_square
 from ctxval.replay.untested import _informative
 from rig_logs import DT, run
 
@@ -351,3 +352,9 @@ def test_a_report_shows_itself_in_one_line() -> None:
     report = replay(WITHOUT_FRICTION, RECORDED)
     assert isinstance(report, ReplayReport)
     assert repr(report).startswith("ReplayReport(RecordedData(recordings=6, steps=720, dt=0.05, breaks=0), largest_rel")
+
+
+def test_errors_whose_squares_are_not_finite_are_left_out() -> None:
+    values = np.array([[3.0, 4.0], [1.0, -1e200], [np.inf, 1.0], [np.nan, 1.0], [3.0, 4.0]])
+    np.testing.assert_array_equal(root_mean_square(values), [3, 4])
+    assert np.isnan(root_mean_square(values[1:3])).all()

@@ -23,6 +23,8 @@ pytestmark = pytest.mark.slow
 SHORT = b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n"
 """A recording of two times."""
 
+KINDS = ("recording", "failure", "distance")
+
 NAMES = ["../../evil.csv", "..\\\\evil.csv", ".csv", "a" * 300 + ".csv", "<b>.csv", "x\x01.npz"]
 
 
@@ -351,6 +353,38 @@ def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
     ]
     assert stored[2].because == "motor <replaced>"
     assert stored[3].parameters == {"goal": 1.5}
+
+
+def test_a_wrong_result_is_replaced_with_a_reason(tmp_path: Path) -> None:
+    new_store(tmp_path)
+    recording = record(tmp_path / "a.trials" / "0", tmp_path / "run.csv").read_bytes()
+    with serving(tmp_path) as server:
+        page = server.request("GET", "/")
+        early = post(server, "/trials/0/distance", page, {"distance": "0.5", "replace": "a typing error"})
+        assert (early.status, "so none can be replaced" in problem(early)) == (422, True)
+        assert post(server, "/trials/0/distance", page, {"distance": "0.9"}).status == 303
+        assert 'href="/?replace=0#replace-0"' in server.request("GET", "/", Cookie=page.cookie).text
+        shown = server.request("GET", "/?replace=0", Cookie=page.cookie).text
+        assert [f'id="replace-{kind}-0" name="replace" required' in shown for kind in KINDS] == [True] * 3
+        assert 'id="replace-' not in server.request("GET", "/?replace=7", Cookie=page.cookie).text
+
+        blank = upload(server, 0, page, recording, replace=" ")
+        assert (blank.status, "replace needs a reason" in problem(blank)) == (422, True)
+        assert 'id="recording-0-problem"' in blank.text
+        wrong = upload(server, 0, page, SHORT, replace="the <first> run")
+        assert (wrong.status, "must have 21 times" in problem(wrong)) == (422, True)
+        assert 'value="the &lt;first&gt; run"' in wrong.text
+        for _ in range(2):  # the same form, sent twice
+            told = upload(server, 0, page, recording, replace="the <first> run", submission="one")
+            assert (told.status, told.headers["location"]) == (303, "/?told=0#message")
+        failed = post(server, "/trials/0/failure", page, {"reason": "the motor cut out", "replace": "not a run"})
+        assert failed.status == 303
+    (trial,) = trials(tmp_path)
+    assert (trial.state, trial.failure, trial.executed) == ("failed", "the motor cut out", True)
+    store = Store.existing(tmp_path / "a.sqlite")
+    assert [change.why for change in store.history()] == ["the <first> run", "not a run"]
+    assert [change.content["before"]["0"]["distance"] == 0.9 for change in store.history()] == [True, False]
+    store.close()
 
 
 @pytest.mark.parametrize(("how", "options"), [("next", ()), ("decides", ("--until-decided",))])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 from collections.abc import Iterator
+from typing import BinaryIO
 
 import pytest
 
@@ -22,12 +23,21 @@ HALVES = {
 }
 
 
-@pytest.fixture(scope="module", params=["token", "no token"])
-def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    folder = tmp_path_factory.mktemp("rig")
-    new_store(folder)
-    with serving(folder, *(["--token", TOKEN] if request.param == "token" else [])) as found:
+@pytest.fixture(scope="module")
+def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Server]]:
+    """Two servers, one of which asks for a token."""
+    with contextlib.ExitStack() as stack:
+        found = {}
+        for name, arguments in {"token": ("--token", TOKEN), "no token": ()}.items():
+            folder = tmp_path_factory.mktemp("rig")
+            new_store(folder)
+            found[name] = stack.enter_context(serving(folder, *arguments))
         yield found
+
+
+@pytest.fixture(params=["token", "no token"])
+def server(request: pytest.FixtureRequest, servers: dict[str, Server]) -> Server:
+    return servers[request.param]
 
 
 def session(server: Server) -> str:
@@ -64,23 +74,30 @@ def test_three_hundred_half_sent_requests_keep_nobody_out(server: Server, half: 
         assert server.request("GET", "/", Cookie=cookie).status == 200
 
 
-@pytest.mark.slow
-def test_a_request_that_does_not_come_ends(server: Server) -> None:
-    with contextlib.ExitStack() as stack:
-        halves = [stack.enter_context(half_sent(server, 1, HALVES[half])) for half in list(HALVES)[:3]]
-        for (one,) in halves:
-            with contextlib.suppress(ConnectionResetError):
-                while one.recv(2**16):
-                    pass
-
-
-@pytest.mark.slow
-def test_the_page_of_an_operator_stays_up_to_date_meanwhile(server: Server) -> None:
+@contextlib.contextmanager
+def opened_page(server: Server) -> Iterator[BinaryIO]:
+    """Open the page of an operator; yield what keeps it up to date."""
     cookie = session(server)
     with socket.create_connection(("127.0.0.1", server.port), timeout=30) as page, page.makefile("rb") as events:
         page.sendall(f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nCookie: {cookie}\r\n\r\n".encode())
         assert events.readline().split()[1] == b"200"
-        with half_sent(server, 300, HALVES["half a head"]):
+        yield events
+
+
+@pytest.mark.slow
+def test_requests_that_do_not_come_end_and_pages_stay_up_to_date_meanwhile(servers: dict[str, Server]) -> None:
+    with contextlib.ExitStack() as stack:
+        pages = [stack.enter_context(opened_page(server)) for server in servers.values()]
+        last = []
+        for server in servers.values():
+            stack.enter_context(half_sent(server, 180, HALVES["half a head"]))
+            for half in list(HALVES)[:3]:  # so few that none of them must make room for another one
+                last += stack.enter_context(half_sent(server, 40, HALVES[half]))
+        for one in last:
+            with contextlib.suppress(ConnectionResetError):
+                while one.recv(2**16):
+                    pass
+        for events in pages:
             assert any(line.startswith(b": the server") for line in events)
 
 

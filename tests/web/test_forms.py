@@ -58,6 +58,9 @@ def test_results_of_every_kind() -> None:
     assert result("recording", {"resample": "on", "tolerance": "0.2"}, path) == ToldResult(
         path, resample=True, start_tolerance=0.2, uploaded=True
     )
+    why = {"replace": "wrong file", "reason": "cut out", "distance": "0.5"}
+    for kind in ("failure", "distance", "recording"):
+        assert result(kind, why, path).replace == "wrong file"
 
 
 @given(st.dictionaries(st.sampled_from(["how", "seen", "trial", "parameter-0", "because", "distance"]), st.text()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 
@@ -91,14 +92,19 @@ def unit_advice(period: float, dt: float) -> str:
     return ""
 
 
-def sentinels(values: Array) -> list[float]:
-    """Return the values that stand for a missing one, such as -999, -9999 or 1e9, and are far outside all others."""
+def sentinels(values: Array, factor: float = 1.0) -> list[float]:
+    """Return the values that stand for a missing one, such as -999, -9999 or 1e9, and are far outside all others.
+
+    Args:
+        values: recorded values.
+        factor: to the unit before a conversion of the table, which converted marks such as -999 too.
+    """
     found, rest = list[float](), np.asarray(values[np.isfinite(values)])
     while len(rest):
         low, high = float(rest.min()), float(rest.max())
         largest = low if abs(low) > abs(high) else high
         others = rest[rest != largest]
-        if not len(others) or not _stands_for_missing(largest):
+        if not len(others) or not (_stands_for_missing(largest) or _all_nines(factor * largest)):
             break
         ranges = 2 * float(np.ptp(others))
         if min(abs(largest - float(others.min())), abs(largest - float(others.max()))) <= ranges:
@@ -110,6 +116,11 @@ def sentinels(values: Array) -> list[float]:
 
 def _stands_for_missing(value: float) -> bool:
     size = abs(value)
-    nines = size >= 99 and set(f"{size:.15g}".replace(".", "")) == {"9"}
-    power_of_ten = size >= 1e6 and size == float(f"1e{round(np.log10(size))}")
-    return nines or power_of_ten or value in _LIMITS or size > 1e30
+    powers = (float(f"1e{round(np.log10(size))}"),) if 1e6 <= size < np.inf else ()
+    near = any(math.isclose(value, mark, rel_tol=1e-7) for mark in (*_LIMITS, *powers))
+    return _all_nines(value) or size > 1e30 or near
+
+
+def _all_nines(value: float) -> bool:
+    """Return whether all digits are nines, also if the number was rounded to 32 bits or converted to another unit."""
+    return abs(value) >= 99 and any(set(f"{abs(value):.{digits}g}".replace(".", "")) == {"9"} for digits in (7, 15))

@@ -41,7 +41,9 @@ def describe(value: Any, depth: int = _DEPTH) -> Any:
     if depth == 0:
         return type(value).__qualname__
     if isinstance(value, np.ndarray):
-        return _of_array(value)
+        # A large array is data, and what it does is recomputed.
+        listed = value.size <= _LISTED and value.dtype.kind in "biufO"
+        return describe(value.tolist(), value.ndim + 1) if listed else {"shape": list(value.shape)}
     if inspect.isroutine(value) or isinstance(value, functools.partial | type):
         return _of_callable(value, depth)
     if not is_library(type(value)):
@@ -55,12 +57,6 @@ def describe(value: Any, depth: int = _DEPTH) -> Any:
         return [describe(item, depth - 1) for item in value]
     settings = _settings(value) if is_own(type(value)) else {}
     return {"type": type(value).__qualname__, **{str(key): describe(item, depth - 1) for key, item in settings.items()}}
-
-
-def _of_array(array: np.ndarray[Any, Any]) -> Any:
-    """Return the numbers of a small array; a large one is data, and what it does is recomputed."""
-    listed = array.size <= _LISTED and array.dtype.kind in "biufO"
-    return describe(array.tolist(), array.ndim + 1) if listed else {"shape": list(array.shape)}
 
 
 def _settings(value: Any) -> Mapping[str, Any]:

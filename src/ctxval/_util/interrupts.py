@@ -9,7 +9,7 @@ import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType, FunctionType
+from types import FrameType
 from typing import NoReturn
 
 
@@ -74,18 +74,13 @@ def raised_by_signal(error: BaseException) -> bool:
         return False
     ending = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
     handlers = [signal.getsignal(number) for number in ending]
-    codes = {function.__code__ for handler in handlers if (function := _function_of(handler)) is not None}
+    codes = {getattr(getattr(handler, "__func__", handler), "__code__", None) for handler in handlers}
     if any(frame.f_code in codes for frame, _ in traceback.walk_tb(error.__traceback__)):
         return True
     # Python's own handler has no frame.
     in_main = threading.current_thread() is threading.main_thread()
     default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     return isinstance(error, KeyboardInterrupt) and in_main and default
-
-
-def _function_of(handler: object) -> FunctionType | None:
-    function = getattr(handler, "__func__", handler)
-    return function if isinstance(function, FunctionType) else None
 
 
 _leave = os._exit

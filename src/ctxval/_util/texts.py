@@ -105,6 +105,7 @@ def aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> str:
 
 
 def parted(label: str) -> tuple[str, str]:
-    """Return the name and the unit of ``name [unit]``; a name without brackets has no unit."""
-    name, _, unit = label.partition("[")
-    return name.strip(), unit.rpartition("]")[0].strip()
+    """Return the name and the unit of ``name [unit]``; ``x[1]`` is a name, as FMUs have them, and has no unit."""
+    name, bracket, unit = label.strip().rpartition("[")
+    unit = unit.removesuffix("]").strip()
+    return (name.strip(), unit) if bracket and not unit.isdigit() else (label.strip(), "")

@@ -109,20 +109,14 @@ def _measured(prediction: Prediction, dimension: int, batched: bool) -> tuple[fl
     """Return the seconds of a rough prediction, of a batch besides its points, and what an exact prediction adds."""
     predict, rng = prediction.rough or prediction.expected, np.random.default_rng(0)
     single = _predicting_seconds(predict, rng.random((1, dimension)))
-    points = rng.random((_batch_to_time(single, batched), dimension))
+    small, medium, large = _BATCHES
+    timed = large if batched and single <= _QUICK else medium if batched or single <= _ENOUGH else small
+    points = rng.random((timed, dimension))
     seconds, count = _predicting_seconds(predict, points), len(points)
     # What a batch costs besides its points follows from a batch of one point.
     each = seconds if count == 1 else min(max(seconds - single, 0.0) / (count - 1), seconds / count)
     # The controllers of these points are known now, so the exact prediction adds what its closed loops cost.
     return each, seconds - count * each, _predicting_seconds(prediction.expected, points) / count
-
-
-def _batch_to_time(single: float, batched: bool) -> int:
-    """Return the number of points of the batch that is timed, for the seconds of a single point."""
-    small, medium, large = _BATCHES
-    if batched and single <= _QUICK:
-        return large
-    return medium if batched or single <= _ENOUGH else small
 
 
 def _predicting_seconds(predict: Callable[[Array], object], points: Array) -> float:

@@ -39,7 +39,10 @@ class LearnedFromTrials:
 
         They are NaN if a task cannot be predicted, or if the trials teach nothing.
         """
-        prediction = self._before(before)
+        if before not in self._predictions:
+            earlier = [trial for trial in self.trials if trial.number < before]
+            self._predictions[before] = self.study.prediction(earlier)
+        prediction = self._predictions[before]
         return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
 
     def dynamics(self, confidence: float) -> DynamicsEvidence | None:
@@ -52,10 +55,3 @@ class LearnedFromTrials:
     def tasks(self, count: int, seed: int) -> Array:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
         return self.validation.space.unit_draws(count, np.random.default_rng([seed, _TASKS]))
-
-    def _before(self, before: int) -> Prediction | None:
-        """Return the prediction from the trials with smaller numbers; it is computed once."""
-        if before not in self._predictions:
-            earlier = [trial for trial in self.trials if trial.number < before]
-            self._predictions[before] = self.study.prediction(earlier)
-        return self._predictions[before]

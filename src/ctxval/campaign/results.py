@@ -12,11 +12,12 @@ from ctxval._util.checked import PositiveFloat, checked
 from ctxval._util.progress import stage
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display
+from ctxval.campaign.history import executed_trials
 from ctxval.campaign.learned import LearnedFromTrials
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import RESOLUTION, CertificateOptions, Provenance, Verdict, judge
 from ctxval.certificates.options import CONFIDENCE
-from ctxval.core.preflight import StartOffset
+from ctxval.core.preflight import StartOffset, start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
@@ -140,9 +141,13 @@ class CampaignResults:
         with self.store.snapshot():
             known = Provenance.of(self.store.description(), self.store.history())
         learned = LearnedFromTrials(self.validation, self.trials, self._recorder.dynamics)
-        offsets = [(self.start_offset(trial), trial.number) for trial in self.completed]
-        start = max(((o.size, f"{o.text} (trial {n})") for o, n in offsets if o is not None), default=None)
-        return replace(known, space=self.validation.space, learned=learned, start=start)
+        space = self.validation.space
+        offsets = [
+            (start_offset(self.validation, space.point(trial.parameters), executed), trial.number)
+            for trial, executed in executed_trials(self.store, self.trials)
+        ]
+        start = max(((offset.size, f"{offset.text} (trial {number})") for offset, number in offsets), default=None)
+        return replace(known, space=space, learned=learned, start=start)
 
     def surrogate(self) -> Surrogate:
         """Return the Gaussian process of the distance over the task space, for every search.

@@ -108,7 +108,7 @@ class TrialRecorder:
         if not 0 <= number < len(self._trials):
             raise InputError(f"there is no trial {number}; the campaign has {len(self._trials)}.")
         trial = self._trials[number]
-        if trial.state == "open" or trial.attempts or not trial.executed:
+        if not trial.told:
             raise InputError(f"trial {number} has no result that was told by a person, so none can be replaced.")
         return trial
 
@@ -225,7 +225,8 @@ class TrialRecorder:
             # The points of such a search are uniform, and the tasks are not.
             choice = replace(choice, unit_point=self.draw(), origin="iid")
         if choice.unit_point is None:
-            origin = self._origin()
+            first = len(self._trials) < self.search.initial
+            origin: Origin = "iid" if self.search.iid else "initial" if first else "acquisition"
             if not isinstance(self.search, SequentialSearch):
                 self.replay()  # such a search may still know the point that it proposed, and not the rounded one
             unit_point, note = self._proposals.next(self._trials, choice.rejected or 0)
@@ -242,11 +243,6 @@ class TrialRecorder:
         same = (trial.parameters for trial in self._trials if np.array_equal(trial.unit_point, unit_point))
         parameters = choice.parameters or next(same, None) or space.describe_point(space.from_unit(unit_point))
         return Trial(number, origin, "open", unit_point, dict(parameters), attempts, note=note, because=choice.because)
-
-    def _origin(self) -> Origin:
-        if self.search.iid:
-            return "iid"
-        return "initial" if len(self._trials) < self.search.initial else "acquisition"
 
     # Closing
 

@@ -173,8 +173,10 @@ class ProcessPool(WorkerPool):
                 if worker.pipe in ready:
                     return self._received(worker)
             for worker in busy:
-                if self.timeout is not None and time.monotonic() - worker.started >= self.timeout:
-                    return self._too_late(worker)
+                elapsed = time.monotonic() - worker.started
+                if self.timeout is not None and elapsed >= self.timeout:
+                    self._stop(worker)
+                    return worker.release(), _timed_out(self.timeout, elapsed)
 
     def _remaining(self, busy: list[_Worker]) -> float | None:
         if self.timeout is None:
@@ -189,11 +191,6 @@ class ProcessPool(WorkerPool):
             self._stop(worker)
             return number, _result_of_exit(worker.process.exitcode)
         return number, result
-
-    def _too_late(self, worker: _Worker) -> tuple[int, ExecutionResult]:
-        assert self.timeout is not None
-        self._stop(worker)
-        return worker.release(), _timed_out(self.timeout, time.monotonic() - worker.started)
 
     def _stop(self, worker: _Worker) -> None:
         """End a worker, with some time to clean up, because it must end the process of a command too."""

@@ -39,8 +39,7 @@ class Assessment:
         proved = refused if self.certificate is None else self.certificate.to_json()
         return {**said, **proved, "expected": expected}
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def assess(

@@ -233,5 +233,4 @@ class CertificateKind(ABC):
         """Return the end of a sentence on why the volume left out is not smaller; empty if there is no reason."""
         return ""
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record

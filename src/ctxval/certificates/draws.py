@@ -21,7 +21,9 @@ def countable_draws(sample: Sample, kind: str) -> Sample:
     everything = sample.only("iid")
     if not len(everything):
         raise CertificateError(f"{kind} needs independent draws of tasks, but there is none; run certify --audit N.")
-    drawn = _last_decided_on(everything)
+    # Draws that stop when the verdict is reached are planned as 0.
+    plans = [planned for planned in everything.planned if planned != 0]
+    drawn = everything.rows([row for row, planned in enumerate(everything.planned) if plans and planned == plans[-1]])
     if not len(drawn):
         raise CertificateError(
             f"the {len(everything)} independent draws ended with the verdict (--until-decided), so their number "
@@ -29,12 +31,6 @@ def countable_draws(sample: Sample, kind: str) -> Sample:
             f"counts only those after the first {len(everything)}."
         )
     return drawn
-
-
-def _last_decided_on(drawn: Sample) -> Sample:
-    """Return the draws of the last decision on their number, without draws that stop when the verdict is reached."""
-    plans = [planned for planned in drawn.planned if planned != 0]
-    return drawn.rows([row for row, planned in enumerate(drawn.planned) if plans and planned == plans[-1]])
 
 
 def how_drawn(sample: Sample, drawn: Sample) -> tuple[str, ...]:

@@ -66,8 +66,7 @@ class CertificateOptions:
             raise InputError("confidence, stochastic and resolution are options of certificate=; state them there.")
         return certificate
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @checked

@@ -170,7 +170,11 @@ def certify_posterior(
             "error": error,
             "draws": len(drawn.draws),
             "stochastic": stochastic,
-            "resolution": _resolution(resolution, sample.points.shape[1]),
+            "resolution": {
+                "diagonals": resolution,
+                "of_each_range": resolution * float(np.sqrt(sample.points.shape[1])),
+                "of_the_space": resolved_volume(resolution, sample.points.shape[1]),
+            },
             "instantaneous": instantaneous_bound(used),
             **_summary(drawn.conditioned),
             "diagnosis": diagnosis.to_json(),
@@ -244,12 +248,6 @@ def _assumptions(stochastic: bool, resolution: float) -> tuple[str, ...]:
         noise,
         "how the tasks were chosen and when the campaign stopped does not matter",
     )
-
-
-def _resolution(resolution: float, dimension: int) -> dict[str, float]:
-    """Return the resolution in diagonals, as a share of each parameter's range, and as a volume of the task space."""
-    share = resolution * float(np.sqrt(dimension))
-    return {"diagonals": resolution, "of_each_range": share, "of_the_space": resolved_volume(resolution, dimension)}
 
 
 def _summary(conditioned: list[Conditioned]) -> dict[str, Any]:

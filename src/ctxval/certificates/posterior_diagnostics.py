@@ -53,8 +53,7 @@ class Diagnosis:
         """Return the numbers, ready for JSON."""
         return {"surprise": self.surprise, "trial": self.trial, "left_out": self.left_out, "farthest": self.farthest}
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def diagnose(

@@ -61,8 +61,7 @@ class Provenance:
         """
         return replace(Sample.of(trials, self.search, self.learned), distribution=self.distribution)
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:

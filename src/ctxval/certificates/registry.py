@@ -97,9 +97,7 @@ class Options:
     discard: int | None = None
     resolution: float = RESOLUTION
     remarks: tuple[str, ...] = ()
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @checked

@@ -35,9 +35,7 @@ class MadeGood:
     trial: int
     by: int
     because: str | None
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @dataclass(frozen=True, eq=False)

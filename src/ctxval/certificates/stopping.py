@@ -37,9 +37,7 @@ class StoppingDecision:
 
     decided: bool = False
     next_point: Array | None = None
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @dataclass(frozen=True)
@@ -147,8 +145,7 @@ class StoppingRule:
             for one in self.screenings
         )
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def _ended(trials: Sequence[Trial]) -> Sample:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 import importlib
 import io
-import json
 import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from dataclasses import asdict
+from json import dumps  # code of users may replace what is in a module
 from typing import Annotated, Any
 
 import typer
@@ -105,7 +105,7 @@ def _print_failure(sentence: str, as_json: bool) -> None:
     if not as_json:
         return
     try:
-        print(json.dumps({"error": sentence}), flush=True)
+        print(dumps({"error": sentence}), flush=True)
     except OSError as error:
         # What is still buffered must not fail again at the exit of the interpreter, which would change the status.
         with suppress(io.UnsupportedOperation, OSError, ValueError):
@@ -121,7 +121,7 @@ def _finish(result: Any, stdout: Any) -> None:
     """Print the JSON of a command if there is a stream for it, and leave with the command's exit status."""
     report, status = result if isinstance(result, tuple) else (result, 0)
     if stdout is not None:
-        print(json.dumps(describe(report), allow_nan=False), file=stdout, flush=True)
+        print(dumps(describe(report), allow_nan=False), file=stdout, flush=True)
     if status:
         raise typer.Exit(status)
 

@@ -10,7 +10,7 @@ import typer
 
 from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.progress import stage
-from ctxval.certificates import KINDS, Assessment, Certificate, Provenance, assess
+from ctxval.certificates import KINDS, Assessment, Provenance, assess
 from ctxval.cli.base import FALSIFIED, app, command, out, print_other_stores, print_verdict
 from ctxval.cli.options import (
     AsJson,
@@ -90,8 +90,11 @@ def certify_store(
     posterior, because auto loads the experiment.
     """
     opened = Store.existing(store)
-    asked, kind = kind, _chosen_kind(opened, kind, audit)
-    loads = audit is not None or _needs_model(opened, kind)
+    asked = kind
+    if kind is None:
+        kind = "audit" if audit is not None else planned_settings(opened).certificate.kind
+        kind = "posterior" if kind == "auto" else kind  # auto would load the experiment, so it must be asked for
+    loads = audit is not None or KINDS.find(kind).needs_model
     if not loads and (trust or experiment is not None):
         raise InputError(
             "--trust and --experiment need --audit or a kind that uses the model: otherwise no code is imported or run."
@@ -99,7 +102,8 @@ def certify_store(
     settings = settings_of(opened, experiment, trust) if loads else planned_settings(opened, kind)
     given = named_values(option, discard=discard, volume=volume, stochastic=stochastic, resolution=resolution)
     limit = require("threshold", PositiveFloat | None, settings.threshold if threshold is None else threshold)
-    _require_together(given, limit)
+    if "volume" in given and limit is None:
+        raise InputError("--volume needs --threshold: it is the share of the task space that may exceed the threshold.")
     options = settings.certificate.options(
         settings.confidence if confidence is None else confidence,
         kind=kind,
@@ -124,18 +128,6 @@ def certify_store(
     return report, FALSIFIED if found.verdict is not None and found.verdict.answer == "falsified" else 0
 
 
-def _chosen_kind(store: Store, kind: str | None, audit: int | None) -> str | None:
-    """Return the kind of the certificate; None for the one that the campaign was run with.
-
-    ``auto`` would load the experiment, which must be asked for by name.
-    """
-    if kind is not None:
-        return kind
-    if audit is not None:
-        return "audit"
-    return "posterior" if planned_settings(store).certificate.kind == "auto" else None
-
-
 def _print_auto(store: Path) -> None:
     """Say how to get the verdict of the campaign, which may differ from that of the posterior bound."""
     out.say(
@@ -145,26 +137,11 @@ def _print_auto(store: Path) -> None:
     )
 
 
-def _needs_model(store: Store, kind: str | None) -> bool:
-    """Return whether the kind of certificate uses what the experiment's model predicts."""
-    return KINDS.find(kind or planned_settings(store).certificate.kind).needs_model
-
-
-def _require_together(given: dict[str, Any], threshold: float | None) -> None:
-    if "volume" in given and threshold is None:
-        raise InputError("--volume needs --threshold: it is the share of the task space that may exceed the threshold.")
-
-
 def _print_assessment(found: Assessment) -> None:
     if found.verdict is not None:
         print_verdict(found.verdict)
     if found.certificate is None:
         out.say(f"no certificate: {found.refusal}", wrap=True)
-    else:
-        _print_certificate(found.certificate)
-
-
-def _print_certificate(certificate: Certificate) -> None:
-    for line in str(certificate).split("\n"):
+    for line in [] if found.certificate is None else str(found.certificate).split("\n"):
         head, colon, rest = line.partition(":")
         out.say((head, "bold red" if head == "withdrawn" else ""), f"{colon}{rest}", wrap=True)

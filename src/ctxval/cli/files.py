@@ -15,7 +15,7 @@ from ctxval.aspect1 import TASKS
 from ctxval.cli.aspect1_findings import aspect1_findings
 from ctxval.cli.base import BAD_INPUT, FALSIFIED, app, command, out
 from ctxval.cli.options import TARGET, AsJson, PartOptions, named_values
-from ctxval.config.check import Checked, check_experiment
+from ctxval.config.check import check_experiment
 from ctxval.config.settings import read_settings
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import InputError
@@ -180,13 +180,8 @@ def check(
     if found is not None:
         findings += aspect1_findings(found)
         status = FALSIFIED if found.exceeding and found.completes is False else 0
-    if not as_json:
-        _print_findings(findings)
+    colours = {"ok": "green", "noted": "yellow", "failed": "bold red", "skipped": "dim"}
+    for one in [] if as_json else findings:
+        out.say((f"{one.state:<8}", colours[one.state]), f"{one.check}: {one.text}")
     report = {"case": experiment.name, "ok": not status, "findings": [asdict(finding) for finding in findings]}
     return {**report, **({"aspect1": None if found is None else found.to_json()} if aspect1 else {})}, status
-
-
-def _print_findings(findings: list[Checked]) -> None:
-    colours = {"ok": "green", "noted": "yellow", "failed": "bold red", "skipped": "dim"}
-    for finding in findings:
-        out.say((f"{finding.state:<8}", colours[finding.state]), f"{finding.check}: {finding.text}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -118,7 +117,8 @@ def ask(
     option: PartOptions = None,
 ) -> Any:
     """Open the next trial of a system that people operate, and write its task and controller to files."""
-    _require_one_choice(parameters, draw, again, trial, until_decided)
+    if sum((bool(parameters), draw, again is not None, trial is not None, until_decided)) > 1:
+        raise InputError("--set, --draw, --again, --trial and --until-decided cannot be combined.")
     if not until_decided and (threshold is not None or budget is not None):
         raise InputError("--threshold and --budget need --until-decided.")
     if because is not None and again is None:
@@ -131,31 +131,21 @@ def ask(
         found = opened.campaign.reopen(trial)
     elif until_decided:
         limit = require_limit(opened.experiment, opened.settings, threshold, "--until-decided")
-        asked = _asked_until_decided(opened, limit, budget)
+        totals = (budget, opened.settings.budget, opened.experiment.budget)
+        total, options = next(one for one in totals if one is not None), opened.settings.certificate_options
+        asked = opened.campaign.ask_until_decided(limit, total, certificate=options, wait=_WAIT)
         if asked is None:
             return _decided(opened, limit, as_json)
         found = asked
     else:
-        chosen = _chosen(opened, parameters, again)
+        chosen = None if again is None else parameters_of_trial(opened.campaign, again)
+        if parameters:
+            chosen = parameters_from(parameters, opened.experiment.validation.space)
         found = opened.campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
     report = _asked(opened, found, out_folder, force)
     if not as_json:
         _print_asked(report, found)
     return report
-
-
-def _require_one_choice(
-    parameters: list[str] | None, draw: bool, again: int | None, trial: int | None, until_decided: bool
-) -> None:
-    if sum((bool(parameters), draw, again is not None, trial is not None, until_decided)) > 1:
-        raise InputError("--set, --draw, --again, --trial and --until-decided cannot be combined.")
-
-
-def _chosen(opened: Opened, parameters: list[str] | None, again: int | None) -> Mapping[str, Any] | None:
-    """Return the task that the user names; None if the search is to choose it."""
-    if parameters:
-        return parameters_from(parameters, opened.experiment.validation.space)
-    return None if again is None else parameters_of_trial(opened.campaign, again)
 
 
 def _asked(opened: Opened, found: OpenTrial, out_folder: Path | None, force: bool) -> dict[str, Any]:
@@ -304,13 +294,6 @@ def _opened(
     made = settings.load()
     where = settings.store_path(made.name)
     return Opened(settings, made, settings.campaign(made, where, accept_change=accept_change), where)
-
-
-def _asked_until_decided(opened: Opened, limit: float, budget: int | None) -> OpenTrial | None:
-    settings, experiment = opened.settings, opened.experiment
-    total = next(one for one in (budget, settings.budget, experiment.budget) if one is not None)
-    options = settings.certificate_options
-    return opened.campaign.ask_until_decided(limit, total, certificate=options, wait=_WAIT)
 
 
 def _decided(opened: Opened, limit: float, as_json: bool) -> tuple[dict[str, Any], int]:

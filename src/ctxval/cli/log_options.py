@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +12,7 @@ import typer
 from ctxval.cli.base import err, out
 from ctxval.config.settings import Settings
 from ctxval.core.experiment import Experiment
+from ctxval.core.labels import names_of
 from ctxval.data import Field, LogMapping, Recordings, read_recordings
 from ctxval.errors import InputError
 
@@ -111,10 +112,8 @@ class LogOptions:
 def _names(experiment: Experiment) -> tuple[dict[str, str], dict[str, str]]:
     """Return the names and units of the states and inputs of an experiment, as far as they are known."""
     system = experiment.validation.system
-    states, inputs = (getattr(experiment, kind) or getattr(system, kind, ()) for kind in ("states", "inputs"))
-    if not all(isinstance(one, Mapping | list | tuple) for one in (states, inputs)) or not states:
-        return {}, {}
-    return experiment.names(len(states), len(inputs))
+    states, inputs = experiment.states or names_of(system, "states"), experiment.inputs or names_of(system, "inputs")
+    return experiment.names(len(states), len(inputs)) if states else ({}, {})
 
 
 def _fields(given: Sequence[str]) -> dict[str, Field]:

@@ -181,22 +181,14 @@ def _opened(target: str, seed: int | None, option: list[str] | None, experiment:
     if Path(target).suffix in STORE_SUFFIXES:
         if seed is not None or option:
             raise InputError("--seed and --option are for an experiment; a store has its own.")
-        return _of_store(Path(target), experiment, trust)
+        found = open_store(Store.existing(target), Path(target), experiment, trust)
+        return _Opened(found.settings, found.experiment, found.campaign)
     if experiment is not None or trust:
         raise InputError("--experiment and --trust are for a store.")
     require_target(target)
-    return _of_experiment(target, seed, named_values(option))
-
-
-def _of_store(path: Path, experiment: str | None, trust: bool) -> _Opened:
-    found = open_store(Store.existing(path), path, experiment, trust)
-    return _Opened(found.settings, found.experiment, found.campaign)
-
-
-def _of_experiment(target: str, seed: int | None, options: dict[str, Any]) -> _Opened:
-    settings = read_settings(target, {"seed": seed, "options": options})
-    experiment = settings.load()
-    return _Opened(settings, experiment, settings.campaign(experiment, settings.store_path(experiment.name)))
+    settings = read_settings(target, {"seed": seed, "options": named_values(option)})
+    made = settings.load()
+    return _Opened(settings, made, settings.campaign(made, settings.store_path(made.name)))
 
 
 def _budget(given: int | None, opened: _Opened) -> int:
@@ -238,14 +230,8 @@ def _print(found: Refinement) -> None:
     out.say(found.last.verdict.reason, wrap=True)
     out.say(found.statement, wrap=True)
     print_parameters(found.parameters)
-    _print_residual(found)
-
-
-def _print_residual(found: Refinement) -> None:
-    residual = found.residual
-    if residual is None:
-        return
-    out.say(("residual of one step", "bold"), ", measured on executions that the model was not learned from:")
-    for row in residual.text.splitlines():
-        out.say(row)
-    out.say(f"measured for {residual.range_text}; it is not guaranteed, and nothing is known outside.", wrap=True)
+    if (residual := found.residual) is not None:
+        out.say(("residual of one step", "bold"), ", measured on executions that the model was not learned from:")
+        for row in residual.text.splitlines():
+            out.say(row)
+        out.say(f"measured for {residual.range_text}; it is not guaranteed, and nothing is known outside.", wrap=True)

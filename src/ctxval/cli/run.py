@@ -158,7 +158,12 @@ def run(
     total = experiment.budget if settings.budget is None else settings.budget
     if limit is not None:
         certificate.kind.require_usable(certificate.confidence, total)  # before executions are paid for
-    execute = _until_decided(campaign, experiment, settings) if settings.until_decided else campaign.run
+    execute: Callable[..., Campaign] = campaign.run
+    if settings.until_decided:
+        wanted = require_limit(experiment, settings, None, "--until-decided")
+        execute = functools.partial(
+            campaign.run_until_decided, wanted, certificate=certificate, audited=settings.audited
+        )
     with worker_options(workers, dask, timeout) as execution:
         execute(budget=total, **execution)
     known = experiment.truth() if truth and experiment.truth is not None else None
@@ -178,13 +183,6 @@ def _status(campaign: Campaign, verdict: Verdict | None) -> int:
         say_error(f"all {len(campaign.failed)} executions failed, so there is no distance.")
         return CANNOT_GO_ON
     return FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
-
-
-def _until_decided(campaign: Campaign, experiment: Experiment, settings: Settings) -> Callable[..., Campaign]:
-    limit = require_limit(experiment, settings, None, "--until-decided")
-    return functools.partial(
-        campaign.run_until_decided, limit, certificate=settings.certificate_options, audited=settings.audited
-    )
 
 
 def _require_truth(experiment: Experiment) -> None:
@@ -235,26 +233,22 @@ def _report(
 
 def _save_pictures(campaign: Campaign, experiment: Experiment, path: Path, verdict: Verdict | None) -> list[Path]:
     try:
-        return _draw_pictures(campaign, experiment, path, verdict)
+        if campaign.worst is None:
+            return []
+        drawn = [plot.save(plot.worst_trajectories(campaign), path.with_suffix(".worst.png"))]
+        if len(campaign.completed) >= 2:
+            figure = plot.surrogate(
+                campaign,
+                truth=_true_curve(experiment),
+                threshold=None if verdict is None else verdict.threshold,
+                bound=None if verdict is None else verdict.bound,
+            )
+            drawn.append(plot.save(figure, path.with_suffix(".surrogate.png")))
+        return drawn
     except Exception as error:
         # An error in a figure must not hide the verdict, for which executions were paid.
         err.say(f"no pictures: {reason_of(error)}")
         return []
-
-
-def _draw_pictures(campaign: Campaign, experiment: Experiment, path: Path, verdict: Verdict | None) -> list[Path]:
-    if campaign.worst is None:
-        return []
-    drawn = [plot.save(plot.worst_trajectories(campaign), path.with_suffix(".worst.png"))]
-    if len(campaign.completed) >= 2:
-        figure = plot.surrogate(
-            campaign,
-            truth=_true_curve(experiment),
-            threshold=None if verdict is None else verdict.threshold,
-            bound=None if verdict is None else verdict.bound,
-        )
-        drawn.append(plot.save(figure, path.with_suffix(".surrogate.png")))
-    return drawn
 
 
 def _save_report(campaign: Campaign, verdict: Verdict | None, budget: int, path: Path) -> str | None:

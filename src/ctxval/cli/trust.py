@@ -100,7 +100,11 @@ def open_store(
         settings, made, settings.campaign(made, store, accept_change=accept_change, remeasure=remeasure), path
     )
     if asked and code_named(store.settings()):
-        _say_signed(opened)
+        reason = why_no_key()
+        does = "now carries your signature, and the question will not be asked again"
+        if reason is not None:
+            does = f"cannot carry your signature, and the question will be asked again: {reason}"
+        err.say(f"{path} {does}.")
     return opened
 
 
@@ -114,11 +118,3 @@ def _load(settings: Settings) -> Experiment:
             f"{error} The store names the folder {str(settings.folder)!a}, which does not exist any more: name the "
             "experiment at its present place with --experiment FILE.toml or module:attr."
         ) from error
-
-
-def _say_signed(opened: Opened) -> None:
-    reason = why_no_key()
-    sentence = f"{opened.path} now carries your signature, and the question will not be asked again."
-    if reason is not None:
-        sentence = f"{opened.path} cannot carry your signature, and the question will be asked again: {reason}."
-    err.say(sentence)

@@ -86,7 +86,8 @@ class Race:
         if left <= 0:
             return False
         worst = "worst" in self.questions and bool(self.worst.undecided)
-        spent = sum(_question_of(trial) == "worst" for one in self.candidates for trial in one.executed)
+        notes = [TrialNote.of(trial) for one in self.candidates for trial in one.executed]
+        spent = sum(note is not None and note.question == "worst" for note in notes)
         last = "mean" not in self.questions
         if worst and (last or spent < _WORST_FIRST * self.budget) and self.worst.step():
             return True
@@ -188,8 +189,3 @@ class Race:
         if self.stochastic:
             said.append("executions of one task may differ, and the questions are about expected distances of tasks")
         return tuple(said)
-
-
-def _question_of(trial: Trial) -> Question | None:
-    note = TrialNote.of(trial)
-    return None if note is None else note.question

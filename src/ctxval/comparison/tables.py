@@ -74,19 +74,15 @@ def markdown(comparison: Comparison) -> str:
         f"confidence {comparison.confidence:.6g}.{units}",
         _table(CANDIDATES, candidate_rows(comparison)),
         _table(PAIRS, pair_rows(comparison)),
-        _reasons(comparison),
+        "\n".join(
+            f"- {', '.join(map(markdown_text, (pair.first, pair.second)))}: {markdown_text(pair.reason)}."
+            for pair in comparison.pairs
+        ),
         "It assumes that",
         "\n".join(f"- {markdown_text(assumption)};" for assumption in comparison.assumptions),
         f"<!-- {MADE_BY} -->",
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _reasons(comparison: Comparison) -> str:
-    return "\n".join(
-        f"- {', '.join(map(markdown_text, (pair.first, pair.second)))}: {markdown_text(pair.reason)}."
-        for pair in comparison.pairs
-    )
 
 
 def _table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -44,17 +44,13 @@ class CertificateTable(BaseModel):
             return self  # it is checked when it is used: reading imports nothing, and a store must stay readable
         try:
             for name in self.model_extra or {}:
-                self._require_known(name)
+                if name not in (names := {*type(self).model_fields, *KINDS[self.kind].options()}):
+                    raise UnknownNameError.among("setting", name, names)
             require_use(self.kind, sorted(self._changed()))
             typed(KINDS[self.kind], self.model_extra or {})
         except (CertificateError, InputError) as error:
             raise PydanticCustomError("use", str(error)) from error
         return self
-
-    def _require_known(self, name: str) -> None:
-        names = {*type(self).model_fields, *KINDS[self.kind].options()}
-        if name not in names:
-            raise UnknownNameError.among("setting", name, names)
 
     def _changed(self) -> set[str]:
         """Return the names of the options whose values differ from the default."""

@@ -14,7 +14,7 @@ from ctxval._util.texts import reason_of
 from ctxval.campaign.costs import ThinkingCosts
 from ctxval.core.controller import converged_of
 from ctxval.core.experiment import Experiment, mixed_units_sentence
-from ctxval.core.labels import labels_of
+from ctxval.core.labels import labels_of, names_of
 from ctxval.core.plan import Plan
 from ctxval.core.soundness import MISSED, goal_misses
 from ctxval.core.task import Task
@@ -207,13 +207,10 @@ def _system(validation: Validation, plan: Plan) -> Iterator[Checked]:
         yield Checked("system", "failed", f"the time step of the system is {dt:g} s, that of the task is {task.dt:g} s")
     counts = plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1]
     for kind, count in zip(("states", "inputs"), counts, strict=True):
-        own = getattr(system, kind, None)
-        if isinstance(own, dict | list | tuple) and len(own) != count:
-            yield Checked(
-                "system",
-                "failed",
-                f"the system has {len(own)} {kind}, the model has {count}: {', '.join(map(str, own))}",
-            )
+        own = names_of(system, kind)
+        if own and len(own) != count:
+            text = f"the system has {len(own)} {kind}, the model has {count}: {', '.join(own)}"
+            yield Checked("system", "failed", text)
 
 
 def _model(validation: Validation, plan: Plan) -> Iterator[Checked]:

@@ -78,6 +78,7 @@ class Settings(BaseModel):
         units: the units of the distance.
         budget, threshold, store: the budget, the threshold and the store of the campaign; None for those of the
             experiment.
+        longest: the largest horizon that is planned; None for that of the experiment.
         seed: the seed of the data, the model and the search.
         until_decided, audited: as the options of ``ctxval run``, so that a store knows the command that made it.
         confidence: the confidence level of the certificate.
@@ -108,6 +109,7 @@ class Settings(BaseModel):
     units: str | None = None
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
+    longest: int | None = Field(default=None, ge=1, strict=True)
     until_decided: bool = False
     audited: bool = False
     confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
@@ -125,6 +127,8 @@ class Settings(BaseModel):
         made = self._made()
         if self.refined is not None:
             made = replace(made, validation=_with_refined(made.validation, self._path(self.refined)), truth=None)
+        if self.longest is not None:
+            made = replace(made, validation=made.validation.with_longest(self.longest))
         if self.distribution is None:
             return made
         space = with_distribution(made.validation.space, self.distribution, self.folder)

@@ -53,9 +53,7 @@ class ILQRSolution:
     cost: Array
     iterations: Array
     converged: Array
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @part()
@@ -229,7 +227,9 @@ class _Descent:
             moved.append(waiting[accepted])
             waiting, tried = waiting[~accepted], (tried + counts)[~accepted]
             exhausted = tried == len(_STEP_LENGTHS)
-            self._refuse(rows[waiting[exhausted]])
+            refused = rows[waiting[exhausted]]
+            self.damping[refused] = np.maximum(_DAMPING_MIN, 10 * self.damping[refused])
+            self.refused[refused] = self.shortened[refused] = True
             waiting, tried = waiting[~exhausted], tried[~exhausted]
         return np.concatenate(moved)
 
@@ -250,11 +250,6 @@ class _Descent:
         self.shortened[to] = index[chosen] > 0
         self.damping[to] = np.where(self.damping[to] > _DAMPING_MIN, self.damping[to] / 10, 0.0)
         return np.isin(np.arange(len(waiting)), moved)
-
-    def _refuse(self, rows: Rows) -> None:
-        """Damp the next step of tasks for which no step length lowers the cost."""
-        self.damping[rows] = np.maximum(_DAMPING_MIN, 10 * self.damping[rows])
-        self.refused[rows] = self.shortened[rows] = True
 
     def _forward(self, rows: Rows, policy: Policy, tasks: Rows, lengths: Array) -> tuple[Array, Array, Array]:
         """Run the model under ``u = u_old + length * k + K (x - x_old)``; return states, inputs and costs."""

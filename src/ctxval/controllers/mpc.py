@@ -119,8 +119,7 @@ class RecedingHorizon:
         with np.errstate(all="ignore"):
             return problem.solve(t)
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 class _Problem:

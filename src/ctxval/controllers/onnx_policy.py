@@ -96,5 +96,4 @@ class BoundOnnxPolicy:
         """Return the controller of one task of the batch."""
         return BoundOnnxPolicy(self.settings, self.task[index])
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record

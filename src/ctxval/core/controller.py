@@ -125,8 +125,7 @@ class Limits:
         """Return inputs ``(..., m)`` clipped to the limits; NaN stays NaN."""
         return np.asarray(np.clip(u, self.low, self.high))
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 LimitsLike = float | Limits | Mapping[str, ArrayLike] | ArrayLike
@@ -287,5 +286,4 @@ class _BoundPolicy:
         """Return the controller of one task of the batch."""
         return _BoundPolicy(self.policy, self.task[index], self.limits)
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record

@@ -51,9 +51,7 @@ class ControllerFile:
     dt: float
     states: dict[str, str]
     inputs: dict[str, str]
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def write_controller(

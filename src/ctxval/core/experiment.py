@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from ctxval._util.checked import PositiveFloat, PositiveInt, checked
 from ctxval._util.representation import call, lines
 from ctxval._util.texts import parted
-from ctxval.core.labels import Labels
+from ctxval.core.labels import Labels, names_of
 from ctxval.core.truth import Truth
 from ctxval.core.validation import Validation
 
@@ -64,10 +64,7 @@ class Experiment:
         A distance states them by its method ``mixed_units(units) -> units``, as the ready-made ones do.
         """
         ask = getattr(self.validation.distance, "mixed_units", None)
-        own = getattr(self.validation.system, "states", None)
-        units = [parted(label)[1] for label in self.states]
-        if not units and isinstance(own, Mapping):
-            units = [str(unit) for unit in own.values()]
+        units = [parted(label)[1] for label in self.states] or [*names_of(self.validation.system, "states").values()]
         return tuple(ask(units)) if callable(ask) and units else ()
 
     def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:

@@ -41,16 +41,19 @@ class Labels:
             states, inputs: the numbers of states and of inputs.
         """
         return (
-            _named(self.states, getattr(system, "states", None), "x", states),
-            _named(self.inputs, getattr(system, "inputs", None), "u", inputs),
+            _named(self.states, names_of(system, "states"), "x", states),
+            _named(self.inputs, names_of(system, "inputs"), "u", inputs),
         )
 
     def state_names(self, system: object) -> tuple[str, ...]:
         """Return the names of the states by these labels, else by the system; empty if neither names them."""
-        return tuple(parted(str(label))[0] for label in self.states or getattr(system, "states", None) or ())
+        return tuple(parted(label)[0] for label in self.states or names_of(system, "states"))
 
-    def __repr__(self) -> str:
-        return record(self)
+    def require_readable(self, system: object) -> None:
+        """Refuse a system whose own names make a recording unreadable, if these labels do not replace them."""
+        require_names(self.states or names_of(system, "states"), self.inputs or names_of(system, "inputs"))
+
+    __repr__ = record
 
 
 def require_names(states: Iterable[str], inputs: Iterable[str]) -> None:
@@ -75,11 +78,15 @@ def labels_of(named: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(f"{name} [{unit}]" if unit else name for name, unit in named.items())
 
 
-def _named(labels: tuple[str, ...], own: object, letter: str, count: int) -> dict[str, str]:
+def names_of(system: object, kind: str) -> dict[str, str]:
+    """Return the names and units of the ``"states"`` or ``"inputs"`` of a system; empty if it names none."""
+    own = getattr(system, kind, None)
+    if isinstance(own, Mapping):
+        return {str(name): str(unit) for name, unit in own.items()}
+    return dict.fromkeys(map(str, own), "") if isinstance(own, list | tuple) else {}
+
+
+def _named(labels: tuple[str, ...], own: dict[str, str], letter: str, count: int) -> dict[str, str]:
     if len(labels) == count and len({parted(label)[0] for label in labels}) == count:
         return dict(parted(label) for label in labels)
-    if isinstance(own, Mapping) and len(own) == count:
-        return {str(name): str(unit) for name, unit in own.items()}
-    if isinstance(own, list | tuple) and len(set(map(str, own))) == count:
-        return {str(name): "" for name in own}
-    return {f"{letter}{i}": "" for i in range(count)}
+    return own if len(own) == count else {f"{letter}{i}": "" for i in range(count)}

@@ -80,7 +80,8 @@ def require_affordable(validation: Validation, parameters: Parameters, task: Tas
     cost = f"each plan with a horizon of {steps} needs about {size:.2g} GB of memory and {seconds:.2g} s of CPU time"
     if not permitted:
         raise InputError(
-            f"{cost}, and at most {validation.longest} steps are permitted: Validation(longest={steps}) permits them."
+            f"{cost}, and at most {validation.longest} steps are permitted: longest = {steps} permits them, in "
+            "Validation or in the experiment file."
         )
     _stated.add(validation)
     warnings.warn(f"{cost}, and a simulated execution about as much.", CostWarning, stacklevel=2)

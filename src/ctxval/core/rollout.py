@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.core.controller import Controller
 from ctxval.core.model import Step
 from ctxval.core.task import Task
-from ctxval.core.trajectory import COMPLETE, Trajectory
+from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ShapeError
 
 
@@ -43,7 +45,10 @@ def rollout(step: Step, controller: Controller, task: Task) -> Trajectory:
                 _require_state(x, states[t])
             states[t + 1] = x
     trajectory = Trajectory(task.times, np.moveaxis(states, 0, -2), np.moveaxis(inputs, 0, -2))
-    return trajectory if trajectory.finite.all() else _with_divergence(trajectory)
+    if trajectory.finite.all():
+        return trajectory
+    bad = ~np.isfinite(states).reshape(task.horizon + 1, -1).all(axis=1)
+    return replace(trajectory, ended=f"diverged at step {bad.argmax()}" if bad.any() else "not finite in its inputs")
 
 
 def _first_input(controller: Controller, x: Array) -> Array:
@@ -62,10 +67,3 @@ def _require_input(u: Array, first: Array) -> Array:
 def _require_state(x_next: Array, x: Array) -> None:
     if np.shape(x_next) != x.shape:
         raise ShapeError(f"a step from states of shape {x.shape} must return the same shape, got {np.shape(x_next)}.")
-
-
-def _with_divergence(trajectory: Trajectory) -> Trajectory:
-    bad = ~np.isfinite(trajectory.states).all(axis=-1)
-    first = int(np.argmax(bad.reshape(-1, bad.shape[-1]).any(axis=0)))
-    ended = f"diverged at step {first}" if bad.any() else "not finite in its inputs"
-    return Trajectory(trajectory.times, trajectory.states, trajectory.inputs, ended if ended else COMPLETE)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -294,11 +294,8 @@ class TaskSpace:
     @checked
     def grid(self, per_axis: AxisPoints) -> Array:
         """Return a full grid that includes both bounds of each axis, shape ``(per_axis ** d, d)``."""
-        return np.stack(list(self._grid_axes(per_axis)), axis=-1).reshape(-1, self.dimension)
-
-    def _grid_axes(self, per_axis: int) -> Iterator[Array]:
         axes = [np.linspace(low, high, per_axis) for low, high in zip(self.low, self.high, strict=True)]
-        return iter(np.meshgrid(*axes, indexing="ij"))
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dimension)
 
 
 def _digits(size: Array) -> Array:

@@ -91,8 +91,7 @@ class Normal:
         mean, deviation = self._floats
         return {"mean": mean.tolist(), "deviation": deviation.tolist()}
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 class TaskDistribution(Protocol):

@@ -63,6 +63,11 @@ class Trial:
     note: dict[str, Any] | None = None
     because: str | None = None
 
+    @property
+    def told(self) -> bool:
+        """Whether a person has told the result of the execution."""
+        return self.executed and self.state != "open" and not self.attempts
+
     def __repr__(self) -> str:
         ended = {"distance": self.distance, "seconds": self.seconds, "attempts": self.attempts}
         head = call(self, self.number, origin=self.origin, state=self.state, **ended, parameters=self.parameters)
@@ -121,6 +126,4 @@ class Change:
     why: str
     content: dict[str, Any]
     at: str = ""
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record

@@ -236,7 +236,10 @@ def cached_truth(
         folder: the folder of the files; it is created if it does not exist.
     """
     path = Path(folder) / f"{_fingerprint(validation, compute)}.json"
-    stored = _read_truths(path)
+    stored = list[Any]()
+    with suppress(OSError, ValueError):
+        read = json.loads(path.read_text(encoding="utf-8"))
+        stored = read if isinstance(read, list) else stored
     for content in stored:
         truth = _truth_of(content, validation)
         if truth is not None:
@@ -259,14 +262,6 @@ def _fingerprint(validation: Validation, compute: Callable[[Validation], Truth])
     how = [describe(compute), str(inspect.signature(compute))]
     known = [validation.space.describe(), without_numbers(validation.describe()), *how]
     return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()[:32]
-
-
-def _read_truths(path: Path) -> list[Any]:
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return []
-    return stored if isinstance(stored, list) else []
 
 
 def _truth_of(content: Any, validation: Validation) -> Truth | None:

@@ -84,6 +84,7 @@ class Validation:
         self.model = as_model(model)
         self.synthesizer = synthesizer
         self.labels = Labels() if labels is None else labels
+        self.labels.require_readable(system)
         named = getattr(distance, "with_states", None)
         self.distance: Distance = named(self.labels.state_names(system)) if callable(named) else distance
         self.start_tolerance = float(start_tolerance)
@@ -126,6 +127,10 @@ class Validation:
     def with_labels(self, labels: Labels) -> Validation:
         """Return this validation with other names and units."""
         return self._with(labels=labels)
+
+    def with_longest(self, longest: int) -> Validation:
+        """Return this validation with another largest horizon that is planned."""
+        return self._with(longest=longest)
 
     def _with(self, **changed: Any) -> Validation:
         return Validation(**{**vars(self), **changed})

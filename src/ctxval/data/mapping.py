@@ -224,8 +224,7 @@ class LogMapping:
             )
         return LogMapping(*found, dt=log.period)
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def _in_units(own: Mapping[str, Field], units: Mapping[str, str]) -> dict[str, Field]:

@@ -21,6 +21,9 @@ from ctxval.data.readers import is_lerobot, read_logs
 from ctxval.data.sampling import Break, Channel, sampled
 from ctxval.errors import InputError
 
+_LARGEST = 1e100
+"""Largest size of a recorded value: squares of errors must be finite."""
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -173,23 +176,28 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
         if signal.clock:
             notes.append(f"the times of messages are {_CLOCKS[signal.clock]}")
         components = names.get(one.path, [])
-        width = values.shape[1]
+        width, scale = values.shape[1], one.scale(signal.unit)
         for k in range(width):
             label = components[k] if len(components) == width else (name if width == 1 else f"{name}{k}")
-            for value in sentinels(values[:, k]):
+            for value in sentinels(values[:, k], scale):
                 rows_of_value = values[:, k] == value
                 notes.append(
                     f"{log.source}: {label} is {value:g} in {counted(int(rows_of_value.sum()), signal.word)}, far from "
                     "all other values: it is taken as missing"
                 )
                 values[rows_of_value, k] = np.nan
+            known = np.abs(values[:, k][np.isfinite(values[:, k])])
+            if (largest := float(known.max(initial=0.0))) > _LARGEST:
+                raise InputError(
+                    f"{log.source}: {label} must be at most {_LARGEST:g}, got {largest:g}; leave out missing values."
+                )
             channels.append(
                 Channel(
                     label,
                     one.unit or (signal.unit if one.factor is None else ""),
                     name in mapping.inputs,
                     signal.times,
-                    one.scale(signal.unit) * values[:, k] + one.offset,
+                    scale * values[:, k] + one.offset,
                     angle=one.angle,
                     held=one.held,
                     path=one.path,

@@ -76,8 +76,7 @@ class Channel:
         steps = steps[steps > 0]
         return float(np.median(steps)) if len(steps) else 0.0
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def sampled(

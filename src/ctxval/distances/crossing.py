@@ -99,8 +99,7 @@ class CrossingTime(NamedStates):
         above = trajectory.states[..., state] - self.level
         return _crossings(above, self.direction, 1, self.angle)[..., 0]
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def _crossings(above: Array, direction: Direction, count: int, on_circle: bool) -> Array:

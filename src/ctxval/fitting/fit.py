@@ -89,9 +89,7 @@ class FailedFit:
 
     kind: Kind
     reason: str
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @dataclass(frozen=True, eq=False)

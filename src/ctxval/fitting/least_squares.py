@@ -43,9 +43,7 @@ class FittedParameter:
     low: float
     high: float
     note: str = ""
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def fit_parameters(

@@ -47,8 +47,7 @@ class SquaredExponential:
         np.minimum(exponent, 0.0, out=exponent)  # rounding may leave a point at a distance from itself
         return np.asarray(self.variance * np.exp(exponent, out=exponent))
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @part()

@@ -58,8 +58,7 @@ class IncrementScaling:
         whole[..., :n] += np.eye(n)
         return whole[..., :n], whole[..., n:]
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def standardised_pairs(x: Array, u: Array, shift: Array, scale: Array) -> Array:

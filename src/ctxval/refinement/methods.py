@@ -127,8 +127,7 @@ class ResidualCorrection(Method):
         found = learn_posterior(model, records.transitions, records.sources, settings=settings)
         return None if found is None else correction_of(found)
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def correction_of(posterior: DynamicsPosterior) -> Correction:
@@ -208,8 +207,7 @@ class Refit(Method):
 
         return Learned(_usable(fitted(records), records), held_out(fitted, model, records))
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,8 +51,7 @@ class StepError:
         """The error as a share of the recorded change; 1 or more means that the model predicts nothing."""
         return self.rms / self.change if self.change > 0 else (0.0 if self.rms == 0 else float("inf"))
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @dataclass(frozen=True)
@@ -74,9 +73,7 @@ class Region:
     count: int
     error: float
     ratio: float
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def step_errors(model: Model, recorded: RecordedSteps, steps: Sequence[int]) -> tuple[StepError, ...]:

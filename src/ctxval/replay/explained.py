@@ -49,9 +49,7 @@ class ResidualShare:
     history: float
     correlation: float
     rest: float
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[ResidualShare, ...]:

@@ -140,8 +140,10 @@ def _unusable(x: Array, u: Array, why: str) -> ModelError:
 
 
 def root_mean_square(values: Array) -> Array:
-    """Return the root mean square over the first axis, without rows that are not finite; NaN if there is none."""
-    finite = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+    """Return the root mean square over the first axis, without rows whose squares are not finite; NaN if none is."""
+    with np.errstate(over="ignore"):
+        squares = values**2
+    finite = np.isfinite(squares).all(axis=tuple(range(1, values.ndim)))
     if not finite.any():
         return np.full(values.shape[1:], np.nan)
-    return np.asarray(np.sqrt((values[finite] ** 2).mean(axis=0)))
+    return np.asarray(np.sqrt(squares[finite].mean(axis=0)))

@@ -50,9 +50,7 @@ class Suggestion:
     ratio: float
     agreeing: float
     sentence: str
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 def suggestions(model: Model, recorded: RecordedSteps) -> tuple[Suggestion, ...]:

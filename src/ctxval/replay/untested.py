@@ -48,9 +48,7 @@ class PredictedTask:
     low: float
     high: float
     resolved: float | None = None
-
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @dataclass(frozen=True, eq=False)

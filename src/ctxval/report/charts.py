@@ -95,8 +95,7 @@ class Axis:
         first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
         return [float(k * step) for k in np.arange(first, last + 1)][: 4 * count]
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 @dataclass(eq=False)

@@ -51,8 +51,7 @@ class Finding:
         """Return all attributes, ready for JSON."""
         return {"name": self.name, "light": self.light, "text": self.text, "numbers": self.numbers}
 
-    def __repr__(self) -> str:
-        return record(self)
+    __repr__ = record
 
 
 Question = Callable[[ReportContext], Finding | None]

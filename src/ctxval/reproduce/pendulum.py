@@ -9,7 +9,7 @@ import numpy as np
 from ctxval import cases, plot
 from ctxval._util.arrays import Array, Mask
 from ctxval.core.trajectory import Trajectory
-from ctxval.gp.surrogate import Surrogate, fit_surrogate
+from ctxval.gp.surrogate import fit_surrogate
 from ctxval.reproduce.frameworks import PAPERS_GOAL, closed_loops
 from ctxval.reproduce.jobs import INFORMED, Job, Result, Results, distances_of
 from ctxval.reproduce.study import (
@@ -41,7 +41,6 @@ _COMMON = 5
 """Number of common first samples."""
 _NEAR = 2.5
 """Per cent of d*: the paper says of SC that it is so near after 60 samples."""
-_CONVERGED = 25
 
 
 class Frameworks:
@@ -274,7 +273,7 @@ class Techniques:
         ucb, sc, sd = (np.median(errors[name], axis=0) for name in TECHNIQUES)
         within = {name: [_first(row <= 1.0) - _COMMON for row in errors[name]] for name in ("gp-ucb", *INFORMED)}
         median = {name: spread(counts)[0] for name, counts in within.items()}
-        beyond = {name: f"{ranged(counts, 1)}".replace(".0", "") for name, counts in within.items()}
+        beyond = {name: ranged(counts, 1).replace(".0", "") for name, counts in within.items()}
         near = _first(sc <= _NEAR)
         found = int((errors["random"][:, -1] <= ucb[19]).sum())
         return [
@@ -339,25 +338,16 @@ class ConvergedGP:
     title = "Pendulum: converged GP"
     case = "pendulum"
 
-    def _campaign(self) -> Job:
-        return Job("search", "pendulum", SHOWN, search="gp-ucb", budget=_CONVERGED)
-
-    def _curve(self) -> Job:
-        return Job("profile", "pendulum", SHOWN, budget=801)
+    campaign = Job("search", "pendulum", SHOWN, search="gp-ucb", budget=25)
+    curve = Job("profile", "pendulum", SHOWN, budget=801)
 
     def jobs(self, scale: Scale) -> list[Job]:
         """Return one campaign and the true profile."""
-        return [self._campaign(), self._curve()]
-
-    def _fit(self, results: Results) -> tuple[Array, Array, Surrogate]:
-        found = results[self._campaign()]
-        points, values = np.array(found["points"]), np.array(found["distances"])
-        space = cases.by_name("pendulum", SHOWN).validation.space
-        return points[:, 0], values, fit_surrogate(space.to_unit(points), values)
+        return [self.campaign, self.curve]
 
     def draw(self, results: Results, scale: Scale) -> Figure:
         """Return a figure of the GP with its band, the truth, the samples and the maximum."""
-        x, y, _ = self._fit(results)
+        x, y = np.ravel(results[self.campaign]["points"]), np.array(results[self.campaign]["distances"])
         columns = self.data(results, scale)
         goals, truth, mean, deviation = (np.array(column) for column in columns.values)
         figure = new_figure()
@@ -382,9 +372,9 @@ class ConvergedGP:
 
     def data(self, results: Results, scale: Scale) -> Columns:
         """Return truth, mean and standard deviation over the goals."""
-        _, _, surrogate = self._fit(results)
-        curve = results[self._curve()]
+        found, curve = results[self.campaign], results[self.curve]
         space = cases.by_name("pendulum", SHOWN).validation.space
+        surrogate = fit_surrogate(space.to_unit(np.array(found["points"])), np.array(found["distances"]))
         mean, deviation = surrogate.predict(space.to_unit(np.array(curve["points"])[:, None]))
         names = ["goal_rad", "true_distance", "gp_mean", "gp_standard_deviation"]
         return Columns(names, [curve["points"], curve["distances"], mean.tolist(), deviation.tolist()])

@@ -169,7 +169,10 @@ class _Execution:
         self.simulations.advance(self.system.substeps, self.healthy, locate=bool(self.system.sites))
         warned: Mask = np.asarray(self.simulations.warnings > 0)
         if warned.any():
-            self._mark(np.asarray(warned.any(axis=1)), f"MuJoCo warned of {_warning_name(warned)}")
+            from mujoco import mjtWarning
+
+            kind = mjtWarning(int(warned.any(axis=0).argmax())).name.removeprefix("mjWARN_")
+            self._mark(np.asarray(warned.any(axis=1)), f"MuJoCo warned of {kind}")
         states = self.system._observed(self.simulations)
         states[~self.healthy] = np.nan
         return states.reshape(x.shape)
@@ -286,10 +289,3 @@ def _coordinates(model: Any, sites: Sequence[str], axes: str) -> tuple[Rows, ...
             raise UnknownNameError.among("site", site, known)
     rows = np.array([known.index(site) for site in sites], dtype=np.intp)
     return np.ix_(rows, np.array(["xyz".index(axis) for axis in axes], dtype=np.intp))
-
-
-def _warning_name(warned: Mask) -> str:
-    """Return the first kind of warning in ``(N, kinds)``."""
-    from mujoco import mjtWarning
-
-    return str(mjtWarning(int(warned.any(axis=0).argmax())).name).removeprefix("mjWARN_")

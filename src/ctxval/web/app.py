@@ -154,15 +154,16 @@ class OperatorPage:
         if kind not in _KINDS:
             return HTMLResponse(self.page.message("Not found", "There is no such page."), 404)
         fields: dict[str, str] = {}
-        where = self._where(number, kind)
         try:
             async with _form(request, max_files=1, max_fields=20, max_part_size=65_536) as form:
                 fields = _texts(form)
                 if not self.access.allows_form(session, fields.get("token", "")):
+                    where = self._where(number, kind, fields)
                     return self._problem(request, session, Problem(where, _OUT_OF_DATE, fields, 403))
                 await self._tell(number, kind, form)
         except HTTPException as error:
-            problem = Problem(where, f"the form cannot be read: {error.detail}", fields, error.status_code)
+            sentence = f"the form cannot be read: {error.detail}"
+            problem = Problem(self._where(number, kind, fields), sentence, fields, error.status_code)
             return self._problem(request, session, problem)
         except CtxvalError as error:
             return self._problem(request, session, self._not_told(number, kind, error, fields))
@@ -183,25 +184,27 @@ class OperatorPage:
                 raise InputError(str(error).replace(f"{folder}/", "")) from error
 
     def _not_told(self, number: int, kind: str, error: CtxvalError, fields: dict[str, str]) -> Problem:
-        """Return why a result was not recorded, at the form if the trial is still open."""
+        """Return why a result was not recorded, at the form if that is still on the page."""
         sentence = shortened(str(error))
-        ended = self.page.ended(number)
+        ended = None if "replace" in fields else self.page.ended(number)
         if ended is not None:
             sentence = f"a result of this trial is recorded already: {ended}."
         status = 409 if ended is not None else 500 if isinstance(error, StoreError | CampaignError) else 422
-        return Problem(self._where(number, kind), sentence, fields, status)
+        return Problem(self._where(number, kind, fields), sentence, fields, status)
 
-    def _where(self, number: int, kind: str) -> str:
-        """Return the form in which a problem is shown; if the trial is not open, the top of the page."""
-        is_open = any(trial.number == number for trial in self.service.snapshot.waiting)
-        return f"{kind}-{number}" if is_open else "trial"
+    def _where(self, number: int, kind: str, fields: dict[str, str]) -> str:
+        """Return the form in which a problem is shown; if it is not on the page any more, the top of the page."""
+        snapshot = self.service.snapshot
+        shown = [trial for trial in snapshot.trials if trial.told] if "replace" in fields else snapshot.waiting
+        return f"{kind}-{number}" if any(trial.number == number for trial in shown) else "trial"
 
     def _campaign(self, request: Request, session: str, problem: Problem | None = None) -> str:
-        told = request.query_params.get("told", "")
+        replaces = problem is not None and "replace" in problem.fields
         return self.page.campaign(
             self.access.form_token(session),
             problem=problem,
-            told=int(told) if told.isdecimal() and len(told) < 10 else None,
+            told=_number(request.query_params.get("told", "")),
+            replaced=request.path_params["number"] if replaces else _number(request.query_params.get("replace", "")),
             all_="all" in request.query_params,
         )
 
@@ -259,6 +262,10 @@ class OperatorPage:
                 yield _event(kind, content)
         finally:
             self._listeners -= 1
+
+
+def _number(text: str) -> int | None:
+    return int(text) if text.isdecimal() and len(text) < 10 else None
 
 
 def _event(kind: str, content: Any) -> str:

@@ -44,19 +44,21 @@ def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
 
 
 def result(kind: str, fields: Fields, recording: Path | None) -> ToldResult:
-    """Return what an operator reports of a trial."""
+    """Return what an operator reports of a trial, with the reason if it replaces an earlier result."""
+    replace = fields.get("replace")
     if kind == "failure":
         reason = fields.get("reason", "").strip()
         if not reason:
             raise InputError('a failure needs a reason, such as "the motor cut out".')
-        return ToldResult(failed=reason)
+        return ToldResult(failed=reason, replace=replace)
     if kind == "distance":
-        return ToldResult(distance=_number(fields, "distance", "the distance"))
+        return ToldResult(distance=_number(fields, "distance", "the distance"), replace=replace)
     if recording is None:
         raise InputError("choose the file of the recording.")
     tolerance = _number(fields, "tolerance", "the start tolerance") if fields.get("tolerance", "").strip() else None
     require("the start tolerance", NonNegativeFloat | None, tolerance)
-    return ToldResult(recording, resample="resample" in fields, start_tolerance=tolerance, uploaded=True)
+    resample = "resample" in fields
+    return ToldResult(recording, resample=resample, start_tolerance=tolerance, replace=replace, uploaded=True)
 
 
 def _number(fields: Fields, field: str, name: str) -> float:

@@ -87,8 +87,16 @@ class Page:
         )
         self._templates.filters["text"] = text
 
-    def campaign(self, form_token: str, *, problem: Problem | None = None, told: int | None = None, all_: bool) -> str:
-        """Return the page of the campaign."""
+    def campaign(
+        self,
+        form_token: str,
+        *,
+        problem: Problem | None = None,
+        told: int | None = None,
+        replaced: int | None = None,
+        all_: bool,
+    ) -> str:
+        """Return the page of the campaign, with the forms of a trial whose result is to be replaced."""
         service = self._service
         snapshot, background, description = service.snapshot, service.background, service.description
         opened = [self._open_view(trial, snapshot) for trial in snapshot.waiting]
@@ -106,6 +114,7 @@ class Page:
             worst=None if snapshot.worst is None else self._row(snapshot.worst),
             news=self._news(),
             told=None if told is None else self.ended(told),
+            replaced=[self._row(trial) for trial in snapshot.trials if trial.told and trial.number == replaced],
             problem=problem,
             given=_given(problem),
             token=form_token,
@@ -149,6 +158,7 @@ class Page:
             "task": in_words(trial, self._service.description.space.units),
             "origin": trial.origin,
             "state": trial.state,
+            "told": trial.told,
             "distance": "" if trial.distance is None else f"{trial.distance:.4g} {units}".rstrip(),
             "remark": "" if trial.failure is None else text(trial.failure),
         }

@@ -129,6 +129,7 @@ class CampaignService:
         self._tasks: set[asyncio.Task[Any]] = set()
         self._preparing: dict[int, asyncio.Task[None]] = {}
         self._submitted: OrderedDict[str, int] = OrderedDict()
+        self._telling = asyncio.Lock()
         self._closing = False
         self._chooser = BackgroundProcess(reopen, lambda stage: self._told("choosing", stage))
         self._judge = BackgroundProcess(reopen, lambda stage: self._told("judging", stage))
@@ -168,20 +169,17 @@ class CampaignService:
         self._spawn(self._choose(request))
 
     async def tell(self, number: int, told: ToldResult, submission: str) -> Trial:
-        """Record the result of an open trial, once for each submitted form."""
-        try:
-            ended = await self._desk.tell(number, told)
-        except InputError:
+        """Record the result of an open trial, or replace an earlier result, once for each submitted form."""
+        async with self._telling:
             if not submission or self._submitted.get(submission) != number:
-                raise
+                try:
+                    await self._desk.tell(number, told)
+                finally:
+                    await self._look()
+                self._submitted[submission] = number
+                if len(self._submitted) > _REMEMBERED:
+                    self._submitted.popitem(last=False)
             return self.snapshot.trials[number]
-        else:
-            self._submitted[submission] = number
-            if len(self._submitted) > _REMEMBERED:
-                self._submitted.popitem(last=False)
-            return ended
-        finally:
-            await self._look()
 
     async def files(self, number: int) -> Files:
         """Return the files of an open trial, after they are prepared."""

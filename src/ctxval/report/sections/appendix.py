@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from markupsafe import Markup
 
+from ctxval._util.representation import call
 from ctxval.certificates.bounds import at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
@@ -51,12 +52,12 @@ class AppendixSection:
             ]
         )
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    __repr__ = call
 
 
 def appendix(context: ReportContext) -> list[Entry]:
     """Return the entries of the appendix."""
+    changes = [f"{one.at[:19]} {one.what}: {one.why}" for one in context.changes]
     return [
         Entry("Intended use", f"{_NASA}, {_V10}", _intended_use(context)),
         Entry("Response quantity of interest and validation metric", f"{_V10}, {_V20}", _metric(context)),
@@ -69,9 +70,9 @@ def appendix(context: ReportContext) -> list[Entry]:
         Entry("Assumptions", f"{_NASA}, {_V10}", _assumptions(context)),
         Entry("Limits of the assessment: what was not tested", f"{_NASA}, {_V10}", " ".join(not_tested(context))),
         Entry("Verification", f"{_NASA}, {_V10}", _verification(context)),
-        Entry("Changes during the campaign", _NASA, _changes(context)),
+        Entry("Changes during the campaign", _NASA, "; ".join(changes) or "None is recorded."),
         Entry("Provenance", _NASA, _provenance(context)),
-        Entry("Conclusion", f"{_NASA}, {_V10}", _conclusion(context)),
+        Entry("Conclusion", f"{_NASA}, {_V10}", str(context.verdict or "No verdict, because no threshold was stated.")),
     ]
 
 
@@ -177,9 +178,7 @@ def _robustness(context: ReportContext) -> str:
 
 def _assumptions(context: ReportContext) -> str:
     found = context.certificate
-    if found is None:
-        return "None beyond the recorded executions."
-    return "; ".join(found.assumptions) + "."
+    return "None beyond the recorded executions." if found is None else f"{'; '.join(found.assumptions)}."
 
 
 def _verification(context: ReportContext) -> str:
@@ -188,10 +187,6 @@ def _verification(context: ReportContext) -> str:
         "Software and solution verification of the model itself are not part of this campaign. Diagnostics of the "
         f"campaign: {said}."
     )
-
-
-def _changes(context: ReportContext) -> str:
-    return "; ".join(f"{one.at[:19]} {one.what}: {one.why}" for one in context.changes) or "None is recorded."
 
 
 def _provenance(context: ReportContext) -> str:
@@ -204,7 +199,3 @@ def _provenance(context: ReportContext) -> str:
 def _part_digest(context: ReportContext, part: str) -> str:
     parts = context.description.get("validation")
     return digest(parts[part]) if isinstance(parts, dict) and part in parts else "not known"
-
-
-def _conclusion(context: ReportContext) -> str:
-    return "No verdict, because no threshold was stated." if context.verdict is None else f"{context.verdict}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from markupsafe import Markup
 
+from ctxval._util.representation import call
 from ctxval.report.charts import Axis, Chart
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.markup import element, joined, number, paragraph
@@ -21,8 +22,7 @@ class ConvergenceSection:
             return paragraph("No distance is known yet.")
         return joined([element("div", _distances(context), _times(context), class_="charts"), _spent(context)])
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    __repr__ = call
 
 
 def _distances(context: ReportContext) -> Chart:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from markupsafe import Markup
 
+from ctxval._util.representation import call
 from ctxval.report.context import ReportContext
 from ctxval.report.insights import insights
 from ctxval.report.markup import paragraph
@@ -20,5 +21,4 @@ class InsightsSection:
         found = insights(context)
         return lights(found) if found else paragraph("No distance is known yet, so nothing can be said.")
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    __repr__ = call

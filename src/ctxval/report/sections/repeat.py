@@ -13,6 +13,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from ctxval._util.representation import call
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.trial import Trial
@@ -54,8 +55,7 @@ class RepeatSection:
             parts += _snippets(context, trial)
         return joined(parts)
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    __repr__ = call
 
 
 def identity(context: ReportContext) -> dict[str, str]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from markupsafe import Markup
 
 from ctxval._util.arrays import Array, Mask
+from ctxval._util.representation import call
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, Kind, colour_scale, small_charts
 from ctxval.report.context import ReportContext
@@ -40,14 +41,15 @@ class TasksSection:
         model = context.distance_model
         if model is None:
             return paragraph("Fewer than two distances are known, so no picture of the distance can be drawn.")
-        parts = [_space_charts(context, model), element("div", *_second_row(context, model), class_="charts")]
+        shares = [_sensitivity(context, model)] if context.space.dimension > 1 else []
+        second = element("div", *shares, _predicted(context, model), class_="charts")
+        parts = [_space_charts(context, model), second]
         mapped = region_map(context)
         if mapped is not None:
             parts += [heading("Where the threshold is kept"), mapped]
         return joined(parts)
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    __repr__ = call
 
 
 def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:
@@ -173,13 +175,6 @@ def _distances(trials: Sequence[Trial]) -> Array:
 
 def _named(trial: Trial) -> str:
     return f"trial {trial.number}: {'no distance' if trial.distance is None else number(trial.distance)}"
-
-
-def _second_row(context: ReportContext, model: DistanceModel) -> Iterator[Markup | Chart]:
-    """Yield the sensitivity to each parameter, and predicted against executed distances."""
-    if context.space.dimension > 1:
-        yield _sensitivity(context, model)
-    yield _predicted(context, model)
 
 
 def _sensitivity(context: ReportContext, model: DistanceModel) -> Markup:

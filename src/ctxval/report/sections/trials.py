@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import counted
+from ctxval._util.representation import call, counted
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, small_charts
 from ctxval.report.context import Recording, ReportContext
@@ -50,8 +50,7 @@ class TrialsSection:
             ]
         )
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    __repr__ = call
 
 
 def data_element(identifier: str, data: Any) -> Markup:

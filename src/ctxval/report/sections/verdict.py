@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from markupsafe import Markup
 
-from ctxval._util.representation import counted
+from ctxval._util.representation import call, counted
 from ctxval.certificates.bounds import as_text, at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
@@ -40,8 +40,7 @@ class VerdictSection:
             ]
         )
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    __repr__ = call
 
 
 def _answer(context: ReportContext) -> str:
@@ -55,14 +54,11 @@ def _sentence(context: ReportContext) -> str:
         worst = context.worst_first[0] if context.worst_first else None
         largest = "no distance is known" if worst is None else f"the largest executed distance is {_of(context)}"
         return f"No threshold was given; {largest}."
-    reason = f"{verdict.reason[:1].upper()}{verdict.reason[1:]} {_effort(context)}"
-    return reason if verdict.rests_on is None else f"{reason} {verdict.rests_on}"
-
-
-def _effort(context: ReportContext) -> str:
     without = len(context.failed)
     lost = "each gave a distance" if not without else f"{without} of the trials have no distance"
-    return f"{context.executions} executions were spent, and {lost}."
+    effort = f"{context.executions} executions were spent, and {lost}."
+    reason = f"{verdict.reason[:1].upper()}{verdict.reason[1:]} {effort}"
+    return reason if verdict.rests_on is None else f"{reason} {verdict.rests_on}"
 
 
 def _of(context: ReportContext) -> str:
