@@ -10,7 +10,7 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
-from ctxval import Campaign, cases, report, searches
+from ctxval import Campaign, cases, report
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "report.png"
 WIDTH, HEIGHT = 720, 860
@@ -21,8 +21,8 @@ LARGEST = 200_000
 def write_report(folder: Path) -> Path:
     """Write the report of a campaign on the running example, and return its path."""
     experiment = cases.by_name("pendulum", seed=0)
-    search, store = searches.Auto(thinking="thorough"), folder / "pendulum.sqlite"
-    campaign = Campaign(experiment.validation, search=search, seed=0, name="pendulum", store=store).run(12)
+    campaign = Campaign(experiment.validation, seed=0, name="pendulum", store=folder / "pendulum.sqlite")
+    campaign.run_until_decided(threshold=0.5, budget=12)
     return report.write(campaign, folder / "report.html", threshold=0.5)
 
 

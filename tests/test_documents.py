@@ -55,7 +55,8 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
     names: dict[str, object] = {}
     exec(block("README.md", "python", "Campaign"), names)
     campaign = names["campaign"]
-    assert campaign.executions == 8  # type: ignore[attr-defined]
+    assert campaign.executions <= 8  # type: ignore[attr-defined]
+    assert campaign.verdict(0.1).answer == "validated"  # type: ignore[attr-defined]
 
 
 def test_the_settings_of_a_named_experiment_are_valid() -> None:

@@ -194,6 +194,14 @@ def test_what_is_executed_next_depends_on_what_stands_in_the_way() -> None:
     assert asked(contested, np.array([[0.9, 0.9], [0.8, 0.8], [0.7, 0.7], farthest]), 2.0) == at_bound.tolist()
 
 
+def test_next_to_an_executed_task_one_more_may_lead_elsewhere() -> None:
+    contested, farthest = evidence(), evidence().coverage.task
+    beside, also_beside = farthest + 0.01, farthest - 0.01
+    assert asked(contested, beside[None], 2.0) == farthest.tolist()
+    assert asked(contested, np.stack([beside, also_beside]), 2.0) == contested.points[38].tolist()
+    assert asked(contested, farthest[None], 2.0) == contested.points[38].tolist()
+
+
 def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: float = 0.2) -> list[float]:
     point = next_task(found, known, best, threshold, 0.95)
     assert point is not None

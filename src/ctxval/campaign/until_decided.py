@@ -40,8 +40,6 @@ _FAILING = 6
 """Number of the last predictions, of which at least half must hold."""
 _PATIENCE = 16
 """Number of executions after which ``auto`` uses the posterior bound if the dynamics have not decided."""
-_SAME = 1e-6
-"""Largest difference in each coordinate between tasks that lead to the same states."""
 _EXPLORE = 3
 """Every so many executions, the task that leads farthest from the records is executed in any case."""
 
@@ -226,9 +224,10 @@ def next_task(
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]
 
     def is_new(point: Array) -> bool:
-        # Next to an executed task, the closed loop may still lead elsewhere: a start may jump between tasks.
-        least = _SAME if np.array_equal(point, evidence.coverage.task) else NEAR
-        return not len(known) or bool(np.abs(known - point).max(axis=1).min() > least)
+        near = known[np.abs(known - point).max(axis=1) <= NEAR]
+        # A start may jump between tasks, so the closed loop next to an executed task may lead elsewhere.
+        most = 2 if np.array_equal(point, evidence.coverage.task) else 1
+        return len(near) < most and not (near == point).all(axis=1).any()
 
     return next((point for point in np.concatenate(candidates) if is_new(point) and steady(point)), None)
 

@@ -161,9 +161,10 @@ class WorstCaseSearch:
     def pool(self) -> Array:
         """Tasks that are spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``."""
         rng = np.random.default_rng([self._seed, 0])
-        from scipy.stats import qmc  # imported here, because it is slow to load
-
-        points = qmc.Sobol(self.dimension, rng=rng).random(self.settings.pool)
+        count = self.settings.pool
+        # A Latin hypercube; scipy.stats, which has others, takes a second to load.
+        strata = rng.permuted(np.tile(np.arange(count), (self.dimension, 1)), axis=1).T
+        points = (strata + rng.random((count, self.dimension))) / count
         ends = rng.random(points.shape) < rng.random((len(points), 1))
         ends[::2] = False
         return np.asarray(np.where(ends, np.round(points), points))
