@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from conftest import make_validation
-from ctxval import Campaign, Labels, searches
+from ctxval import Campaign, Labels, Trajectory, searches
 from ctxval.certificates import LearnedDistance, Sample, require_learned
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy
@@ -89,3 +89,22 @@ def test_a_fault_while_learning_is_named_and_not_taken_for_dynamics_that_cannot_
     for _ in range(2):
         with pytest.raises(CertificateError, match=r"no dynamics can be learned: ZeroDivisionError: no scale\.$"):
             learned.dynamics(0.5)
+
+
+def test_a_result_that_was_replaced_teaches_what_replaced_it() -> None:
+    validation = make_validation()
+    campaign = Campaign(validation, search=searches.Random(), seed=3)
+    opened = campaign.ask({"goal": 1.0})
+    right = validation.execute(opened.plan)
+    wrong = Trajectory(right.times, right.states * np.linspace(1, 1.1, len(right.states))[:, None], right.inputs)
+    campaign.tell(opened, wrong)
+    dynamics = campaign._recorder.dynamics
+    before = dynamics.learned(campaign.trials)
+    assert dynamics.learned(campaign.trials) is before
+    campaign.tell(opened.number, right, replace="wrong file")
+    after = dynamics.learned(campaign.trials)
+    assert before is not None
+    assert after is not None
+    x_next = after.posterior.data.transitions.x_next
+    assert np.isin(right.states[1:], x_next).all()
+    assert not np.isin(right.states[1:], before.posterior.data.transitions.x_next).all()

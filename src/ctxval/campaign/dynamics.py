@@ -76,7 +76,7 @@ class CampaignDynamics:
         self._store = store
         self.elsewhere: Callable[[], Sequence[Trajectory]] = tuple
         self.failure: str | None = None
-        self._learned: dict[tuple[int, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]] = {}
+        self._learned: dict[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]] = {}
 
     @property
     def planner(self) -> LoopPlanner:
@@ -88,8 +88,9 @@ class CampaignDynamics:
         executed, others = executed_trials(self._store, trials), () if alone else self.elsewhere()
         if not self._study.is_current:
             self._study, self._learned = DynamicsStudy(self._study.validation, self._study.seed), {}
-        # The recordings are kept with what they taught, so that their identities stay theirs.
-        key = (*(trial.number for trial, _ in executed), -1, *map(id, others))
+        # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
+        # replaced, and then has another distance.
+        key = (*((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
         if key not in self._learned:
             if len(self._learned) == _REMEMBERED:
                 del self._learned[next(iter(self._learned))]

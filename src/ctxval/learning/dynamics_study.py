@@ -134,7 +134,7 @@ class DynamicsStudy:
             covariances = self._learned_covariances(executed, logged)
         recorded = self._recorded(executed, logged)
         posterior = None if covariances is None or recorded is None else condition(covariances, *recorded)
-        if posterior is None:
+        if posterior is None or not np.isfinite(posterior.most_probable.weights).all():
             return None
         points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)
         return LearnedDynamics(self, posterior, points)
