@@ -31,10 +31,9 @@ from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
 from ctxval.core.model import Step
 from ctxval.core.rollout import rollout
-from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.learning.closed_loops import LoopPlanner, loop_pairs
 from ctxval.learning.dynamics_posterior import PosteriorSettings, learn_posterior
 from ctxval.learning.hyperparameters import Hyperparameters, draw_prior
-from ctxval.learning.worst_case import loop_pairs
 from ctxval.models.scaling import standard_deviations
 
 KEY = ("design", "states", "seed")

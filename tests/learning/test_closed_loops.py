@@ -15,7 +15,8 @@ from ctxval.core.rollout import rollout
 from ctxval.errors import DesignError
 from ctxval.learning import closed_loops
 from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.dynamics_posterior import DynamicsDraws, learn_posterior
+from ctxval.learning.draws import DynamicsDraws
+from ctxval.learning.dynamics_posterior import learn_posterior
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 LQR = controllers.LQR([1.0, 0.1], [0.1])

@@ -8,13 +8,8 @@ import pytest
 from ctxval import Transitions, models
 from ctxval._util.arrays import Array
 from ctxval.gp.cholesky import factorise
-from ctxval.learning.dynamics_posterior import (
-    Component,
-    DynamicsPosterior,
-    PosteriorSettings,
-    _drawn,
-    learn_posterior,
-)
+from ctxval.learning.component import Component, draw_functions
+from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters
 from ctxval.learning.residual_kernel import ResidualKernel
 
@@ -95,7 +90,7 @@ def test_transitions_that_add_nothing_are_left_out() -> None:
 
 def moments(one: Component, relevant: Array, at: Array, pivots: int, count: int = 4000) -> tuple[Array, Array, float]:
     """Return mean and covariance of draws of the first output at pairs, relative to the amplitude, and what is left."""
-    expansion, left_out = _drawn([one], relevant, count, pivots, np.random.default_rng(5))
+    expansion, left_out = draw_functions([one], relevant, count, pivots, np.random.default_rng(5))
     values = expansion(np.repeat(at[None], count, axis=0))[..., 0]
     return values.mean(axis=0), np.cov(values.T) / one.amplitudes[0] ** 2, left_out
 
@@ -158,7 +153,7 @@ def test_draws_differ_even_if_less_than_the_noise() -> None:
 
 def test_without_pairs_to_choose_pivots_from_draws_are_the_mean() -> None:
     one = component()
-    expansion, _ = _drawn([one], np.empty((0, 2)), 2, 50, np.random.default_rng(0))
+    expansion, _ = draw_functions([one], np.empty((0, 2)), 2, 50, np.random.default_rng(0))
     Z = np.random.default_rng(1).normal(size=(20, 2))
     np.testing.assert_allclose(expansion(np.repeat(Z[None], 2, 0)), np.repeat(one.mean(Z[None]), 2, 0), atol=1e-9)
 
@@ -166,7 +161,7 @@ def test_without_pairs_to_choose_pivots_from_draws_are_the_mean() -> None:
 def test_without_pivots_draws_are_the_mean() -> None:
     one = component()
     Z = np.random.default_rng(1).normal(size=(20, 2))
-    expansion, left_out = _drawn([one], Z, 3, 0, np.random.default_rng(0))
+    expansion, left_out = draw_functions([one], Z, 3, 0, np.random.default_rng(0))
     np.testing.assert_allclose(expansion(np.repeat(Z[None], 3, 0)), np.repeat(one.mean(Z[None]), 3, 0), atol=1e-9)
     assert left_out == 1
 
@@ -174,7 +169,7 @@ def test_without_pivots_draws_are_the_mean() -> None:
 def test_outputs_of_a_draw_are_independent() -> None:
     one = component()
     pivot = np.array([[3.0, 3.0]])
-    expansion, _ = _drawn([one], pivot, 4000, 1, np.random.default_rng(0))
+    expansion, _ = draw_functions([one], pivot, 4000, 1, np.random.default_rng(0))
     values = expansion(np.repeat(pivot[None], 4000, axis=0))[:, 0]
     assert abs(np.corrcoef(values.T)[0, 1]) < 5 / np.sqrt(4000)
 
@@ -318,7 +313,7 @@ def test_components_of_equal_hyperparameters_are_drawn_as_if_alone() -> None:
     together = posterior.draw(posterior.data.pairs, np.random.default_rng(0))
     rng = np.random.default_rng(0)
     alone = [
-        _drawn([one], posterior.data.pairs, posterior.settings.functions, posterior.settings.pivots, rng)[0]
+        draw_functions([one], posterior.data.pairs, posterior.settings.functions, posterior.settings.pivots, rng)[0]
         for one in posterior.components
     ]
     assert len(together) == sum(len(one.weights) for one in alone)

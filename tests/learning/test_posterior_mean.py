@@ -7,8 +7,8 @@ import numpy as np
 from ctxval import Transitions, models
 from ctxval._util.arrays import Array, Rows
 from ctxval.core.model import Model
+from ctxval.learning.component import Component
 from ctxval.learning.dynamics_posterior import (
-    Component,
     DynamicsPosterior,
     PosteriorSettings,
     condition,

@@ -9,9 +9,10 @@ import pytest
 
 from ctxval import Task, TaskSpace, Transitions, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
-from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.dynamics_posterior import DynamicsDraws, DynamicsPosterior, PosteriorSettings, learn_posterior
-from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings, loop_pairs
+from ctxval.learning.closed_loops import LoopPlanner, loop_pairs
+from ctxval.learning.draws import DynamicsDraws
+from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
+from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ctxval.learning.coverage import Coverage
+from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import (
-    DynamicsDraws,
     DynamicsPosterior,
     PosteriorSettings,
     learn_posterior,

@@ -18,10 +18,13 @@ from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.dynamics_posterior import DynamicsDraws
+from ctxval.learning.draws import DynamicsDraws
+from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 _TASKS = 512
 """Largest number of tasks whose controllers are designed in one call."""
+_FARTHEST = 1e3
+"""Standardised pairs beyond this magnitude belong to loops that diverge, which would otherwise take all pivots."""
 _REMEMBERED = 64_000_000
 """Largest size of the plans that are kept, in bytes, approximately."""
 
@@ -222,6 +225,16 @@ class LoopPlanner:
             return np.array(np.inf)
         each = (self.measured(task[k], model[k], system[k]) for k in range(model.batch_shape[0]))
         return np.array([float(one) for one in each])
+
+
+def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Array:
+    """Return the standardised pairs ``(N, k)`` that the mean's closed loops on tasks visit, without those far away."""
+    parts = [np.empty((0, posterior.data.pairs.shape[1]))]
+    for loops in planner.run(posterior.mean, planner.plan(tasks)):
+        visited = posterior.data.standardised(loops.states[..., :-1, :], loops.inputs)
+        parts.append(visited.reshape(-1, visited.shape[-1]))
+    pairs = np.concatenate(parts)
+    return np.asarray(pairs[(np.abs(pairs) < _FARTHEST).all(axis=1)])
 
 
 @dataclass(frozen=True, eq=False)

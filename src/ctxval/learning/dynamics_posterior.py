@@ -16,13 +16,14 @@ from itertools import groupby
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Rows, rows_of, single_threaded
+from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.representation import call
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
-from ctxval.gp.cholesky import CholeskyFactor, factorise, tenfold
-from ctxval.gp.subset import pivoted_cholesky, pivoted_rows
+from ctxval.gp.subset import pivoted_rows
+from ctxval.learning.component import Component, draw_functions
+from ctxval.learning.draws import DynamicsDraws, bounded
 from ctxval.learning.hyperparameters import (
     FAMILIES,
     SMOOTHER_FAMILIES,
@@ -37,10 +38,6 @@ from ctxval.learning.without_model import smoother_than
 
 _PIVOT = 0.1
 """Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
-_NEGLIGIBLE = 1e-6
-"""Share of the largest posterior variance below which a pivot adds nothing to those chosen before it."""
-_ROUNDING = 1e-13
-"""Posterior variances below this share of the prior variance are rounding errors."""
 _CENTRES = (150, 400)
 """Least and largest number of centres."""
 _REACH = 5.0
@@ -51,8 +48,6 @@ _REPLACING = (600, 100)
 """Number of other transitions from which replacements of those that are left out are chosen, and of replacements."""
 _ROUGH_CENTRES, _ROUGHLY = 64, 0.03
 """Least number of centres of a rough mean, and its largest error as a share of the residuals that it predicts."""
-_LARGEST = 1e6
-"""Standardised pairs are limited to this magnitude, so that a loop that diverges stays finite in its residual."""
 
 
 @dataclass(frozen=True)
@@ -85,108 +80,6 @@ class PosteriorSettings:
     def without_model(self) -> PosteriorSettings:
         """Return settings for learning S itself, which is smoother than the error of M and takes more transitions."""
         return replace(self, centres=2 * self.centres, families=SMOOTHER_FAMILIES)
-
-
-@dataclass(frozen=True, eq=False)
-class Component:
-    """The posterior of r for one draw of the hyperparameters.
-
-    Attributes:
-        hyperparameters: the covariance and its hyperparameters.
-        centres: standardised pairs that it is conditioned on, shape ``(M, k)``.
-        factor: Cholesky factor of their covariance with noise.
-        weights: weights of the mean, shape ``(M, n)``.
-        squares: squared size of each state's residuals, relative to the covariance, shape ``(n,)``.
-        amplitudes: standard deviations of the states' residuals, relative to the covariance, shape ``(n,)``.
-    """
-
-    hyperparameters: Hyperparameters
-    centres: Array
-    factor: CholeskyFactor
-    weights: Array
-    squares: Array
-    amplitudes: Array
-
-    @classmethod
-    def conditioned(cls, hyperparameters: Hyperparameters, Z: Array, Y: Array, rng: np.random.Generator) -> Component:
-        """Return the process conditioned on pairs ``(M, k)``, with amplitudes drawn from their posterior."""
-        kernel, theta = hyperparameters.kernel, hyperparameters.theta
-        factor = factorise(kernel(theta, Z, Z), tenfold(hyperparameters.noise))
-        weights = factor.solve(Y)
-        squares = (Y * weights).sum(axis=0)
-        return cls(hyperparameters, Z, factor, weights, squares, _amplitudes(squares, len(Z), rng))
-
-    def again(self, rng: np.random.Generator) -> Component:
-        """Return the same process with other amplitudes."""
-        return replace(self, amplitudes=_amplitudes(self.squares, len(self.centres), rng))
-
-    @property
-    def mean(self) -> KernelExpansion:
-        """The posterior mean, as one function."""
-        return KernelExpansion(self.hyperparameters, self.centres, self.weights[None])
-
-    @property
-    def noise(self) -> Array:
-        """The standard deviation of the noise of each standardised residual, shape ``(n,)``."""
-        return np.asarray(np.sqrt(self.hyperparameters.noise) * self.amplitudes)
-
-    def variance(self, Z: Array) -> Array:
-        """Return the posterior variance at pairs ``(N, k)``, relative to the amplitudes, shape ``(N,)``."""
-        return self._halved(Z)[1]
-
-    def _halved(self, Z: Array) -> tuple[Array, Array]:
-        kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
-        # For many pairs, a product with the inverse factor is several times as fast as substitution.
-        half = self.factor.whiten_many(kernel(theta, Z, self.centres).T)
-        return half, np.maximum(kernel.diagonal(theta, Z) - (half**2).sum(axis=0), 0.0)
-
-    def pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
-        """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""
-        kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
-        half, left = self._halved(relevant)
-        first = left.max(initial=0.0)
-        # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
-        rounding = _ROUNDING * kernel.diagonal(theta, relevant).max(initial=0.0)
-        towards = kernel.towards(theta, relevant)
-
-        def covariances(row: int) -> Array:
-            return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
-
-        found = pivoted_cholesky(left, covariances, count, least=max(_NEGLIGIBLE * first, rounding))
-        left_out = found.left.max() / first if first > rounding else 0.0
-        return found.rows, found.L, float(left_out)
-
-
-def _amplitudes(squares: Array, count: int, rng: np.random.Generator) -> Array:
-    """Return a draw of the amplitudes from their posterior, given ``count`` transitions."""
-    return np.asarray(np.sqrt(squares / rng.chisquare(count, len(squares))))
-
-
-def _drawn(
-    alike: Sequence[Component], relevant: Array, count: int, pivots: int, rng: np.random.Generator
-) -> tuple[KernelExpansion, float]:
-    """Return ``count`` draws of each of some components, and the share of the variance that they leave out elsewhere.
-
-    Args:
-        alike: components that differ in their amplitudes only.
-        relevant: pairs ``(R, k)`` that closed loops visit; the pivots, at which draws are exact, are chosen from them.
-        count: number of draws.
-        pivots: largest number of pivots.
-        rng: the source of the draws.
-    """
-    own = alike[0]
-    chosen, L, left_out = own.pivots(relevant, pivots)
-    if not len(chosen):
-        return own.mean.repeated(count * len(alike)), left_out
-    kernel, theta = own.hyperparameters.kernel, own.hyperparameters.theta
-    shape = (count, len(chosen), own.weights.shape[1])
-    normal = np.concatenate([rng.standard_normal(shape) * one.amplitudes for one in alike])
-    # The values L xi at the pivots are interpolated by the posterior covariance L L', with weights L'^-1 xi.
-    weights = np.linalg.solve(L.T, normal)
-    cross = own.factor.solve(kernel(theta, own.centres, relevant[chosen]))
-    together = np.concatenate([own.weights - np.matmul(cross, weights), weights], axis=1)
-    centres = np.concatenate([own.centres, relevant[chosen]])
-    return KernelExpansion(own.hyperparameters, centres, together), left_out
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,7 +250,7 @@ class DynamicsPosterior:
         """
         horizon, data, most = inputs.shape[1], self.data, self.most_probable
         at = np.linspace(0, horizon - 1, min(_STEPS_SAMPLED, horizon)).astype(int)
-        Z = _bounded(data.standardised(states[:, at], inputs[:, at]))
+        Z = bounded(data.standardised(states[:, at], inputs[:, at]))
         variance = most.variance(Z.reshape(-1, Z.shape[-1])).reshape(Z.shape[:2]).mean(axis=1)
         sizes = (data.sizes / data.steps)[data.learned] ** 2 * most.squares / len(most.centres)
         return np.asarray(np.sqrt(variance * sizes.mean()))
@@ -384,7 +277,7 @@ class DynamicsPosterior:
             # Adjacent components of the same hyperparameters share their pivots and are evaluated together.
             components = self._some_components(hyperparameters)
             groups = [list(group) for _, group in groupby(components, lambda one: id(one.factor))]
-            drawn = [_drawn(group, relevant, count, self.settings.pivots, rng) for group in groups]
+            drawn = [draw_functions(group, relevant, count, self.settings.pivots, rng) for group in groups]
         expansions, left_out = zip(*drawn, strict=True)
         return DynamicsDraws(self.model, self.data, expansions, left_out)
 
@@ -410,88 +303,6 @@ class DynamicsPosterior:
 
     def __repr__(self) -> str:
         return call(self, self.model, data=self.data)
-
-
-@dataclass(frozen=True, eq=False)
-class DynamicsDraws:
-    """S models ``M + r_s``, run together: a draw is the first axis of states and inputs.
-
-    Attributes:
-        model: the model M.
-        data: constants that standardise pairs and residuals.
-        expansions: functions r_s, in groups that share their centres.
-        left_out: share of the posterior variance that the draws of each group leave out between pivots.
-        limit: the largest standardised residual of each learned state, in magnitude; None if there is no limit.
-    """
-
-    model: Model
-    data: ResidualData
-    expansions: tuple[KernelExpansion, ...]
-    left_out: tuple[float, ...]
-    limit: Array | None = None
-
-    def __len__(self) -> int:
-        return sum(len(one.weights) for one in self.expansions)
-
-    def step(self, x: Array, u: Array) -> Array:
-        """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
-        with np.errstate(all="ignore"):
-            z = _bounded(self.data.standardised(x, u))
-            residuals, learned, first = np.zeros_like(x), self.data.learned, 0
-            for one in self.expansions:
-                last = first + len(one.weights)
-                residuals[first:last, :, learned] = one(z[first:last])
-                first = last
-            if self.limit is not None:
-                residuals[..., learned] = np.clip(residuals[..., learned], -self.limit, self.limit)
-            return self.model.step(x, u) + residuals * self.data.units
-
-    def between(self, first: int, last: int) -> DynamicsDraws:
-        """Return the draws from ``first`` up to and without ``last``."""
-        groups, left_out, start = [], [], 0
-        for one, left in zip(self.expansions, self.left_out, strict=True):
-            own = slice(max(first - start, 0), max(last - start, 0))
-            start += len(one.weights)
-            if len(one.weights[own]):
-                groups.append(one[own])
-                left_out.append(left)
-        return replace(self, expansions=tuple(groups), left_out=tuple(left_out))
-
-    def __getitem__(self, index: int) -> DynamicsDraws:
-        """Return one draw."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"there are {len(self)} draws.")
-        return self.between(index, index + 1)
-
-    def model_of(self, index: int) -> DrawnModel:
-        """Return one draw as a model."""
-        return DrawnModel(self[index])
-
-    def __repr__(self) -> str:
-        return call(self, self.model, draws=len(self))
-
-
-def _bounded(z: Array) -> Array:
-    """Return standardised pairs within limits, in the same array; NaN becomes 0."""
-    np.maximum(z, -_LARGEST, out=z)
-    np.minimum(z, _LARGEST, out=z)
-    z[np.isnan(z)] = 0.0
-    return z
-
-
-class DrawnModel:
-    """The model ``M + r_s`` of one draw.
-
-    Args:
-        draws: draws of the dynamics with one member.
-    """
-
-    def __init__(self, draws: DynamicsDraws) -> None:
-        self._draws = draws
-
-    def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
-        return np.asarray(self._draws.step(rows_of(x)[None], rows_of(u)[None]).reshape(x.shape))
 
 
 def learn_covariances(

@@ -17,7 +17,7 @@ from ctxval._util.representation import call
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
-from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.learning.closed_loops import LoopPlanner, loop_pairs
 from ctxval.learning.coverage import Coverage, coverage
 from ctxval.learning.dynamics_posterior import (
     DynamicsPosterior,
@@ -31,7 +31,7 @@ from ctxval.learning.execution_prediction import ExecutionPrediction, predict_ex
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.vector import predict_composed
-from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings, loop_pairs
+from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 

@@ -13,7 +13,7 @@ from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.representation import call
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.dynamics_posterior import DynamicsDraws
+from ctxval.learning.draws import DynamicsDraws
 
 _STEPS = 16
 """Largest number of steps of a trajectory that are predicted."""

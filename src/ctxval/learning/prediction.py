@@ -15,7 +15,8 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.cores import on_all_cores
 from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.dynamics_posterior import DynamicsDraws, DynamicsPosterior
+from ctxval.learning.draws import DynamicsDraws
+from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.error_vectors import executions_of
 from ctxval.searches import Prediction
 

@@ -19,7 +19,7 @@ from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.dynamics_posterior import DrawnModel, DynamicsDraws
+from ctxval.learning.draws import DrawnModel, DynamicsDraws
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.error_vectors import Executed, executions_of
 

@@ -18,13 +18,12 @@ from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.boxes import moves_to_bounds, separated_rows
 from ctxval.gp.ascent import Ascent
 from ctxval.gp.global_search import search_globally
-from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks
-from ctxval.learning.dynamics_posterior import DynamicsDraws, DynamicsPosterior
+from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks, loop_pairs
+from ctxval.learning.draws import DynamicsDraws
+from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 _DIVERGED = 1e30
 """The distance of a loop that diverges, in searches: larger than all others, and finite."""
-_FARTHEST = 1e3
-"""Standardised pairs beyond this magnitude belong to loops that diverge, which would otherwise take all pivots."""
 _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)
 """Number of tasks in the global search for 1, 2, ... task parameters; the last one holds for all higher numbers."""
 _SHARES = (0.1, 0.05, 0.02, 0.007)
@@ -365,16 +364,6 @@ class WorstCaseSearch:
         few = (rng.random(shape) < 0.5) | (rng.random((*shape[:2], 1)) < 0.5)
         random = np.clip(around + share * few * rng.normal(size=shape), 0, 1)
         return np.concatenate([to_bounds, random], axis=1)
-
-
-def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Array:
-    """Return the standardised pairs ``(N, k)`` that the mean's closed loops on tasks visit, without those far away."""
-    parts = [np.empty((0, posterior.data.pairs.shape[1]))]
-    for loops in planner.run(posterior.mean, planner.plan(tasks)):
-        visited = posterior.data.standardised(loops.states[..., :-1, :], loops.inputs)
-        parts.append(visited.reshape(-1, visited.shape[-1]))
-    pairs = np.concatenate(parts)
-    return np.asarray(pairs[(np.abs(pairs) < _FARTHEST).all(axis=1)])
 
 
 def _others(tasks: Array, order: Rows) -> Array:

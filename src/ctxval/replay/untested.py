@@ -14,7 +14,8 @@ from ctxval._util.representation import call, record
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning import DynamicsStudy, LearnedDynamics
-from ctxval.learning.worst_case import WorstCase, loop_pairs
+from ctxval.learning.closed_loops import loop_pairs
+from ctxval.learning.worst_case import WorstCase
 
 _WORST = 5
 """Number of tasks with large predicted distances that are listed."""

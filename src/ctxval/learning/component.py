@@ -1,0 +1,121 @@
+"""The posterior of the residual dynamics for one draw of the hyperparameters, and functions that are drawn from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Rows
+from ctxval.gp.cholesky import CholeskyFactor, factorise, tenfold
+from ctxval.gp.subset import pivoted_cholesky
+from ctxval.learning.hyperparameters import Hyperparameters
+from ctxval.learning.kernel_expansion import KernelExpansion
+
+_NEGLIGIBLE = 1e-6
+"""Share of the largest posterior variance below which a pivot adds nothing to those chosen before it."""
+_ROUNDING = 1e-13
+"""Posterior variances below this share of the prior variance are rounding errors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """The posterior of r for one draw of the hyperparameters.
+
+    Attributes:
+        hyperparameters: the covariance and its hyperparameters.
+        centres: standardised pairs that it is conditioned on, shape ``(M, k)``.
+        factor: Cholesky factor of their covariance with noise.
+        weights: weights of the mean, shape ``(M, n)``.
+        squares: squared size of each state's residuals, relative to the covariance, shape ``(n,)``.
+        amplitudes: standard deviations of the states' residuals, relative to the covariance, shape ``(n,)``.
+    """
+
+    hyperparameters: Hyperparameters
+    centres: Array
+    factor: CholeskyFactor
+    weights: Array
+    squares: Array
+    amplitudes: Array
+
+    @classmethod
+    def conditioned(cls, hyperparameters: Hyperparameters, Z: Array, Y: Array, rng: np.random.Generator) -> Component:
+        """Return the process conditioned on pairs ``(M, k)``, with amplitudes drawn from their posterior."""
+        kernel, theta = hyperparameters.kernel, hyperparameters.theta
+        factor = factorise(kernel(theta, Z, Z), tenfold(hyperparameters.noise))
+        weights = factor.solve(Y)
+        squares = (Y * weights).sum(axis=0)
+        return cls(hyperparameters, Z, factor, weights, squares, _amplitudes(squares, len(Z), rng))
+
+    def again(self, rng: np.random.Generator) -> Component:
+        """Return the same process with other amplitudes."""
+        return replace(self, amplitudes=_amplitudes(self.squares, len(self.centres), rng))
+
+    @property
+    def mean(self) -> KernelExpansion:
+        """The posterior mean, as one function."""
+        return KernelExpansion(self.hyperparameters, self.centres, self.weights[None])
+
+    @property
+    def noise(self) -> Array:
+        """The standard deviation of the noise of each standardised residual, shape ``(n,)``."""
+        return np.asarray(np.sqrt(self.hyperparameters.noise) * self.amplitudes)
+
+    def variance(self, Z: Array) -> Array:
+        """Return the posterior variance at pairs ``(N, k)``, relative to the amplitudes, shape ``(N,)``."""
+        return self._halved(Z)[1]
+
+    def _halved(self, Z: Array) -> tuple[Array, Array]:
+        kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
+        # For many pairs, a product with the inverse factor is several times as fast as substitution.
+        half = self.factor.whiten_many(kernel(theta, Z, self.centres).T)
+        return half, np.maximum(kernel.diagonal(theta, Z) - (half**2).sum(axis=0), 0.0)
+
+    def pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
+        """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""
+        kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
+        half, left = self._halved(relevant)
+        first = left.max(initial=0.0)
+        # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
+        rounding = _ROUNDING * kernel.diagonal(theta, relevant).max(initial=0.0)
+        towards = kernel.towards(theta, relevant)
+
+        def covariances(row: int) -> Array:
+            return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
+
+        found = pivoted_cholesky(left, covariances, count, least=max(_NEGLIGIBLE * first, rounding))
+        left_out = found.left.max() / first if first > rounding else 0.0
+        return found.rows, found.L, float(left_out)
+
+
+def _amplitudes(squares: Array, count: int, rng: np.random.Generator) -> Array:
+    """Return a draw of the amplitudes from their posterior, given ``count`` transitions."""
+    return np.asarray(np.sqrt(squares / rng.chisquare(count, len(squares))))
+
+
+def draw_functions(
+    alike: Sequence[Component], relevant: Array, count: int, pivots: int, rng: np.random.Generator
+) -> tuple[KernelExpansion, float]:
+    """Return ``count`` draws of each of some components, and the share of the variance that they leave out elsewhere.
+
+    Args:
+        alike: components that differ in their amplitudes only.
+        relevant: pairs ``(R, k)`` that closed loops visit; the pivots, at which draws are exact, are chosen from them.
+        count: number of draws.
+        pivots: largest number of pivots.
+        rng: the source of the draws.
+    """
+    own = alike[0]
+    chosen, L, left_out = own.pivots(relevant, pivots)
+    if not len(chosen):
+        return own.mean.repeated(count * len(alike)), left_out
+    kernel, theta = own.hyperparameters.kernel, own.hyperparameters.theta
+    shape = (count, len(chosen), own.weights.shape[1])
+    normal = np.concatenate([rng.standard_normal(shape) * one.amplitudes for one in alike])
+    # The values L xi at the pivots are interpolated by the posterior covariance L L', with weights L'^-1 xi.
+    weights = np.linalg.solve(L.T, normal)
+    cross = own.factor.solve(kernel(theta, own.centres, relevant[chosen]))
+    together = np.concatenate([own.weights - np.matmul(cross, weights), weights], axis=1)
+    centres = np.concatenate([own.centres, relevant[chosen]])
+    return KernelExpansion(own.hyperparameters, centres, together), left_out
