@@ -30,7 +30,7 @@ PRINTED = {
     "7_from_logs_to_a_validated_model": [
         "Three executions: falsified: trial",
         "the model of round 1 is validated",
-        "counts 4 executions under its own controllers; 3 executions under controllers of other models",
+        "executions under its own controllers; 3 executions under controllers of other models",
         "all records",
         "Report: boat.html",
     ],
