@@ -1,7 +1,7 @@
 """Whether verdicts on the crane are true, and whether its worst task can be typed again.
 
 The truth d* is the largest distance that a search with many executions finds among rounded tasks. Campaigns are judged
-at 0.9 d*, which must be falsified, and at 1.1 d*, which must not.
+at 0.9 d*, which must be falsified, and at 1.1 d*, which must not; those that run until they are decided too.
 
     python benchmarks/study_crane.py --seeds 3 --out benchmarks/results/crane.jsonl
 """
@@ -47,6 +47,13 @@ def typed(validation: Validation, task: dict[str, Any], moved: float = 0.0) -> f
     return float(validation.outcome(np.clip(point, validation.space.low, validation.space.high)).distance)
 
 
+def decided(validation: Validation, threshold: float, seed: int) -> tuple[str, int]:
+    """Return the verdict of a campaign that runs until it is decided, and its number of executions."""
+    campaign = Campaign(validation, seed=seed)
+    campaign.run_until_decided(threshold, BUDGET)
+    return campaign.verdict(threshold).answer, campaign.executions
+
+
 def study(seed: int) -> dict[str, Any]:
     """Return what is found on the crane of a seed."""
     validation = experiment(seed).validation
@@ -72,6 +79,7 @@ def study(seed: int) -> dict[str, Any]:
         "rejected": sum((trial.note or {}).get("unsteady", 0) for trial in campaign.trials),
         "executions": campaign.executions,
         "verdicts": {str(share): campaign.verdict(share * largest, certificate=options).answer for share in (0.9, 1.1)},
+        "until_decided": {str(share): decided(validation, share * largest, seed) for share in (0.9, 1.1)},
         "cpu_seconds": round(seconds, 1),
     }
 
