@@ -45,6 +45,21 @@ def test_each_trial_that_ends_is_reported() -> None:
     assert reports[-1].note.endswith(f"largest {worst.distance:.4g}")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("until_decided", [False, True])
+def test_tasks_that_are_tested_before_their_execution_are_no_executions(until_decided: bool) -> None:
+    campaign = Campaign(make_validation(), search=None if until_decided else searches.GPUCB(), seed=1)
+
+    def work() -> None:
+        if until_decided:
+            campaign.run_until_decided(1e3, 3)
+        else:
+            campaign.run(3)
+
+    reports = [report for report in reports_of(work) if report.note]
+    assert [(report.done, report.expected) for report in reports] == [(1, 3), (2, 3), (3, 3)]
+
+
 def test_an_audit_says_how_many_executions_it_needs() -> None:
     campaign = Campaign(make_validation(), search=searches.GPUCB(), seed=1).run(2)
     reports = [report for report in reports_of(lambda: campaign.audit(3)) if report.note]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
+from ctxval._util.progress import stage
 from ctxval.core.model import Model
 from ctxval.core.rollout import rollout
 from ctxval.learning.closed_loops import LoopPlanner
@@ -59,7 +60,8 @@ class Steadiness:
                 return False
             rounded = self.planner.validation.space.rounded(point)
             beside = np.where(rounded > 0.5, rounded - _BESIDE, rounded + _BESIDE)
-            self._tested[key] = self._alike(np.stack([point, rounded, beside]))
+            with stage("testing a task", unit="designs"):
+                self._tested[key] = self._alike(np.stack([point, rounded, beside]))
         return self._tested[key]
 
     def moved(self, point: Array, rng: np.random.Generator) -> Array:

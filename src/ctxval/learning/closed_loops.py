@@ -116,6 +116,7 @@ class LoopPlanner:
             advance(len(points))  # as if they were planned
             return self._kept[key][0]
         planned = list(self._planned(points, np.arange(len(points))))
+        advance(len(points))
         size = sum(map(_size, planned)) + len(key)
         self._kept[key] = planned, size
         self._size += size
@@ -147,7 +148,6 @@ class LoopPlanner:
         promised = rollout(parts.model.step, controller, task)
         if promised.batch_shape != chosen.shape[:-1]:
             raise ValueError("the task function did not return one task for each point")
-        advance(len(rows))
         return PlannedTasks(rows, task, controller, promised)
 
     def run(self, draws: DynamicsDraws, planned: Sequence[PlannedTasks]) -> list[Loops]:
