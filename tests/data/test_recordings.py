@@ -160,6 +160,15 @@ def test_a_batch_of_trajectories_in_one_npz_file_is_several_recordings(tmp_path:
     np.testing.assert_array_equal(found.runs[2].trajectory.states, run(seed=2).states)
 
 
+@pytest.mark.parametrize("shape", [(60, 1), (2, 60, 1)])
+def test_states_and_inputs_of_different_batches_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    np.savez(tmp_path / "a.npz", times=np.arange(61.0), states=np.zeros((61, 2, 1)), inputs=np.zeros(shape))
+    with pytest.raises(
+        InputError, match=r"a\.npz cannot be read: states \(61, 2, 1\) and inputs .* not those of one batch"
+    ):
+        read_recordings([tmp_path / "a.npz"])
+
+
 def test_a_log_without_times_has_one_row_for_each_step(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x0,u0\n1,5\n2,6\n4,7\n")
     found = read_recordings(

@@ -76,7 +76,12 @@ def read_npz(path: Path) -> list[Log]:
     """Return the logs in an NPZ file: one, or one for each trajectory of a batch ``(..., H + 1, n)``."""
     table = NpzTable(path)
     if {"times", "states", "inputs"} <= set(table.names()) and table.columns(["states"])["states"].ndim == 3:
-        arrays = NpzTable(path).columns(["times", "states", "inputs"])
+        arrays = table.columns(["times", "states", "inputs"])
+        if arrays["inputs"].ndim != 3 or len(arrays["inputs"]) != len(arrays["states"]):
+            raise InputError(
+                f"{path} cannot be read: states {arrays['states'].shape} and inputs {arrays['inputs'].shape} are not "
+                "those of one batch of trajectories, (batch, H + 1, n) and (batch, H, m)."
+            )
         return [
             MemoryTable(f"{path}, trajectory {k}", {"times": arrays["times"], "states": states, "inputs": inputs})
             for k, (states, inputs) in enumerate(zip(arrays["states"], arrays["inputs"], strict=True))
