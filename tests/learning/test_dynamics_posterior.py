@@ -330,3 +330,14 @@ def test_pairs_that_are_not_finite_have_a_finite_residual() -> None:
     still = models.Function(lambda x, u: x, vectorized=True)
     residuals = replace(draws, model=still).step(x, u)
     assert np.isfinite(residuals).all()
+
+
+def test_few_draws_do_not_depend_on_what_was_computed_before() -> None:
+    transitions, found = record(40, truth=models.Function(rough, vectorized=True)), []
+    for whole in (False, True):
+        posterior = learn(transitions)
+        if whole:
+            assert len(posterior.components) == posterior.settings.hyperparameters
+        draws = posterior.draw(posterior.data.pairs + 0.1, np.random.default_rng(0), 1, 8)
+        found.append(draws.step(np.ones((len(draws), 1, 2)), np.ones((len(draws), 1, 1))))
+    np.testing.assert_array_equal(*found)

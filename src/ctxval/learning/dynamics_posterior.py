@@ -283,9 +283,8 @@ class DynamicsPosterior:
 
     def _some_components(self, count: int | None) -> Sequence[Component]:
         """Return the components of about so many draws of the hyperparameters, evenly spread; all if None."""
-        if count is None or "components" in self.__dict__:
-            every = 1 if count is None else max(1, len(self.components) // count)
-            return self.components[::every]
+        if count is None:
+            return self.components
         rows = np.unique(np.linspace(1, len(self.covariances.drawn) - 1, count - 1).astype(int)).tolist()
         found = [self.most_probable]
         for row in rows:
