@@ -1,36 +1,18 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ctxval.searches import Random, Search
+from ask_and_tell import hill, run
+from ctxval.searches import Random
 from ctxval.testing import check_search
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 from annealing import Annealing, reflected
-
-Function = Callable[[np.ndarray], float]
-
-
-def hill(x: np.ndarray) -> float:
-    """Return a function whose maximum, 0, is at 0.3 on every axis."""
-    return -float(((x - 0.3) ** 2).sum())
-
-
-def run(search: Search, function: Function, budget: int, dimension: int, seed: int = 0) -> tuple[np.ndarray, ...]:
-    search.reset(dimension, seed)
-    points, values = np.empty((0, dimension)), np.empty(0)
-    for _ in range(budget):
-        point = search.ask(1)
-        value = function(point[0])
-        search.tell(point, [value])
-        points, values = np.concatenate([points, point]), np.append(values, value)
-    return points, values
 
 
 @pytest.mark.parametrize("dimension", [1, 4])

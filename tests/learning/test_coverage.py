@@ -39,7 +39,8 @@ def learn(planner: LoopPlanner, x: Array, u: Array) -> DynamicsPosterior:
 
 
 def coverage(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Coverage:
-    return coverage_of(planner, posterior, tasks, planner.plan(tasks))
+    planned = planner.plan(tasks)
+    return coverage_of(posterior, tasks, planned, planner.run(posterior.mean, planned))
 
 
 def visited(planner: LoopPlanner, posterior: DynamicsPosterior) -> Array:

@@ -87,7 +87,8 @@ def remembering() -> Remembering:
 
 
 def maxima(search: WorstCaseSearch, posterior: DynamicsPosterior, known: Array, rng: np.random.Generator) -> WorstCase:
-    return search.maxima(posterior, search.on_mean(posterior, known, rng), known, rng)
+    (of_pool,) = search.planner.distances(posterior.mean, search.plans, len(search.pool))
+    return search.maxima(posterior, search.on_mean(posterior, of_pool, known, rng), known, rng)
 
 
 def grid(dimension: int) -> Array:

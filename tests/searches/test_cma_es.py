@@ -1,32 +1,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from ask_and_tell import hill, run
 from ctxval.errors import InputError
-from ctxval.searches import CMAES, Random, Search, by_name
+from ctxval.searches import CMAES, Random, by_name
 from ctxval.testing import check_search
-
-Function = Callable[[np.ndarray], float]
-
-
-def hill(x: np.ndarray) -> float:
-    """Return a function whose maximum, 0, is at 0.3 on every axis."""
-    return -float(((x - 0.3) ** 2).sum())
-
-
-def run(search: Search, function: Function, budget: int, dimension: int, seed: int = 0) -> tuple[np.ndarray, ...]:
-    search.reset(dimension, seed)
-    points, values = np.empty((0, dimension)), np.empty(0)
-    for _ in range(budget):
-        point = search.ask(1)
-        value = function(point[0])
-        search.tell(point, [value])
-        points, values = np.concatenate([points, point]), np.append(values, value)
-    return points, values
 
 
 def resumed(points: np.ndarray, values: np.ndarray, seed: int = 0) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
-from ctxval.campaign.history import executed_trials, for_known_values
+from ctxval.campaign.history import executed_trials, for_known_values, largest_distance
 from ctxval.certificates.dynamics import MOST_DRAWS, bound_of
 from ctxval.certificates.dynamics_diagnostics import DENSE, PREDICTIONS, doubt_of, jumps
 from ctxval.certificates.dynamics_evidence import (
@@ -85,7 +85,12 @@ class CampaignDynamics:
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials teach; None if they teach nothing."""
-        executed, others = executed_trials(self._store, trials), () if alone else self.elsewhere()
+        return self._learned_from(executed_trials(self._store, trials), () if alone else self.elsewhere())
+
+    def _learned_from(
+        self, executed: Sequence[tuple[Trial, Trajectory]], others: Sequence[Trajectory]
+    ) -> LearnedDynamics | None:
+        """Return what executed trials and other recordings teach; the latest are kept."""
         if not self._study.is_current:
             self._study, self._learned = DynamicsStudy(self._study.validation, self._study.seed), {}
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
@@ -101,8 +106,9 @@ class CampaignDynamics:
     def prediction(self, trials: Sequence[Trial]) -> Prediction | None:
         """Return the distance predicted from the executed trajectories, for a search; None if there is none."""
         executed = executed_trials(self._store, trials)
+        learned = self._learned_from(executed, self.elsewhere())
         pairs = [(trial.unit_point, trajectory) for trial, trajectory in executed]
-        found = self._study.prediction_of(self.learned(trials), pairs)
+        found = self._study.prediction_of(learned, pairs)
         return None if found is None else for_known_values(found, trials, [trial for trial, _ in executed])
 
     def predict(self, trials: Sequence[Trial], point: Array, *, alone: bool = False) -> ExecutionPrediction | None:
@@ -150,7 +156,7 @@ class CampaignDynamics:
             groups=len(found.maxima) // len(learned.posterior.components),
             without_model=learned.posterior.covariances.without_model,
         )
-        best = max((trial.distance or 0.0 for trial in trials), default=0.0)
+        best = largest_distance(trials)
         bound = bound_of(found, best, confidence)
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         return found if doubt_of(found, best, bound) else _with_jumps(found, learned, bound)

@@ -38,6 +38,11 @@ def executed_trials(store: Store, trials: Sequence[Trial]) -> list[tuple[Trial, 
     return [(trial, found[trial.number]) for trial in completed if trial.number in found]
 
 
+def largest_distance(trials: Sequence[Trial]) -> float:
+    """Return the largest distance of trials; 0 if none is known."""
+    return max((trial.distance or 0.0 for trial in trials), default=0.0)
+
+
 def for_known_values(prediction: Prediction, trials: Sequence[Trial], executed: Sequence[Trial]) -> Prediction:
     """Return a prediction learned from executed trials, with one row for each known value of a search."""
     known = [trial for trial in history_of(trials) if trial.distance is not None]

@@ -15,6 +15,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import AUDIT, NEAR
+from ctxval.campaign.history import largest_distance
 from ctxval.campaign.steadiness import Steadiness
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
@@ -98,7 +99,7 @@ class UntilDecided:
         if isinstance(self.options.kind, Automatic) and self.recorder.executions >= _PATIENCE:
             return self._by_distance(trials)
         known = _points(trials, self._dimension)
-        best = max((trial.distance or 0.0 for trial in trials), default=0.0)
+        best = largest_distance(trials)
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
         point = next_task(evidence, known, best, self.threshold, self.options.confidence, steady)
@@ -127,7 +128,7 @@ class UntilDecided:
         """Return whether the whole evidence may decide: nothing that a few draws show leaves the verdict open."""
         if sum(trial.state != "open" for trial in trials) < FEWEST:
             return False
-        best = max((trial.distance or 0.0 for trial in trials), default=0.0)
+        best = largest_distance(trials)
         bound = bound_of(screened, best, self.options.confidence)
         return bound <= self.threshold and doubt_of(screened, best, bound) is None
 

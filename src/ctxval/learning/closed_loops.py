@@ -156,10 +156,8 @@ class LoopPlanner:
 
     def distances(self, draws: DynamicsDraws, planned: Sequence[PlannedTasks], tasks: int) -> Array:
         """Return the distances ``(S, q)`` of all draws on the same q tasks; NaN for a task without a finite plan."""
-        found = np.full((len(draws), tasks), np.nan)
-        for one, loops in zip(planned, self.run(draws, planned), strict=True):
-            found[:, one.rows] = loops.distances
-            advance(len(draws) * len(one.rows))
+        found = distances_of(self.run(draws, planned), planned, len(draws), tasks)
+        advance(len(draws) * sum(len(one.rows) for one in planned))
         return found
 
     def own_distances(self, draws: DynamicsDraws, points: Array) -> Array:
@@ -225,6 +223,14 @@ class LoopPlanner:
             return np.array(np.inf)
         each = (self.measured(task[k], model[k], system[k]) for k in range(model.batch_shape[0]))
         return np.array([float(one) for one in each])
+
+
+def distances_of(loops: Sequence[Loops], planned: Sequence[PlannedTasks], draws: int, tasks: int) -> Array:
+    """Return the distances ``(S, q)`` of closed loops of S draws on planned tasks; NaN for a task without a plan."""
+    found = np.full((draws, tasks), np.nan)
+    for one, of_batch in zip(planned, loops, strict=True):
+        found[:, one.rows] = of_batch.distances
+    return found
 
 
 def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Array:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import record
-from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks
+from ctxval.learning.closed_loops import Loops, PlannedTasks
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 MOST_COORDINATES = 6
@@ -67,17 +67,17 @@ class Coverage:
 
 
 def coverage(
-    planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array, planned: Sequence[PlannedTasks]
+    posterior: DynamicsPosterior, tasks: Array, planned: Sequence[PlannedTasks], loops: Sequence[Loops]
 ) -> Coverage:
     """Return how well the records cover the closed loops of tasks on the posterior mean.
 
     Args:
-        planner: runs closed loops.
         posterior: the posterior of the dynamics, with its data.
         tasks: points of the unit cube ``(q, d)``.
         planned: their plans.
+        loops: their closed loops on the posterior mean.
     """
-    visited, rows = _visited(planner, posterior, planned)
+    visited, rows = _visited(posterior, loops), np.concatenate([one.rows for one in planned])
     low, high = np.quantile(visited, [_TAIL, 1 - _TAIL], axis=(0, 1))
     width = np.maximum(high - low, 1e-9)
     recorded, scaled = posterior.data.pairs / width, visited / width
@@ -105,19 +105,16 @@ def coverage(
     )
 
 
-def _visited(planner: LoopPlanner, posterior: DynamicsPosterior, planned: Sequence[PlannedTasks]) -> tuple[Array, Rows]:
-    """Return the standardised pairs ``(q, H, k)`` on loops of the mean, and the rows of their tasks ``(q,)``.
+def _visited(posterior: DynamicsPosterior, loops: Sequence[Loops]) -> Array:
+    """Return the standardised pairs ``(q, H, k)`` on loops of the mean.
 
     The last pair of a task with a shorter horizon is repeated.
     """
-    parts = [
-        posterior.data.standardised(loops.states[0][:, :-1], loops.inputs[0])
-        for loops in planner.run(posterior.mean, planned)
-    ]
+    parts = [posterior.data.standardised(one.states[0][:, :-1], one.inputs[0]) for one in loops]
     horizon = max(part.shape[1] for part in parts)
     longest = [np.pad(part, ((0, 0), (0, horizon - part.shape[1]), (0, 0)), mode="edge") for part in parts]
     visited = np.nan_to_num(np.concatenate(longest), nan=_FARTHEST, posinf=_FARTHEST, neginf=-_FARTHEST)
-    return np.clip(visited, -_FARTHEST, _FARTHEST), np.concatenate([one.rows for one in planned])
+    return np.clip(visited, -_FARTHEST, _FARTHEST)
 
 
 def _some(count: int, most: int) -> Rows:

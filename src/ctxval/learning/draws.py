@@ -44,10 +44,11 @@ class DynamicsDraws:
             residuals, learned, first = np.zeros_like(x), self.data.learned, 0
             for one in self.expansions:
                 last = first + len(one.weights)
-                residuals[first:last, :, learned] = one(z[first:last])
+                values = one(z[first:last])
+                if self.limit is not None:
+                    np.clip(values, -self.limit, self.limit, out=values)
+                residuals[first:last, :, learned] = values
                 first = last
-            if self.limit is not None:
-                residuals[..., learned] = np.clip(residuals[..., learned], -self.limit, self.limit)
             return self.model.step(x, u) + residuals * self.data.units
 
     def between(self, first: int, last: int) -> DynamicsDraws:

@@ -17,7 +17,7 @@ from ctxval._util.representation import call
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
-from ctxval.learning.closed_loops import LoopPlanner, loop_pairs
+from ctxval.learning.closed_loops import LoopPlanner, distances_of, loop_pairs
 from ctxval.learning.coverage import Coverage, coverage
 from ctxval.learning.dynamics_posterior import (
     DynamicsPosterior,
@@ -85,12 +85,15 @@ class DynamicsStudy:
         return WorstCaseSearch(self.planner, self.seed, settings)
 
     @functools.cached_property
-    def _loops(self) -> Trajectory | None:
+    def _timed_loops(self) -> tuple[Trajectory | None, float]:
+        """Closed loops on M, and the seconds that they took."""
         with single_threaded():
             started = time.perf_counter()
-            found = closed_loops_on_model(self.validation)
-            self._slow = found is not None and not found.batch_shape and time.perf_counter() - started > _SLOW
-            return found
+            return closed_loops_on_model(self.validation), time.perf_counter() - started
+
+    @property
+    def _loops(self) -> Trajectory | None:
+        return self._timed_loops[0]
 
     @functools.cached_property
     def unseen_parameters(self) -> tuple[int, ...]:
@@ -127,24 +130,28 @@ class DynamicsStudy:
         """
         if self._parts is None:
             self._parts = self._state_of_parts()
+        recorded = self._recorded(executed, logged)
+        if recorded is None:
+            return None
         some = _scheduled(len(executed))
-        covariances = self._learned_covariances(executed[:some], logged)
+        covariances = self._learned_covariances(executed[:some], logged, recorded if some == len(executed) else None)
         if covariances is None and some < len(executed):
             # If nothing could be learned when it was scheduled, it is learned now.
-            covariances = self._learned_covariances(executed, logged)
-        recorded = self._recorded(executed, logged)
-        posterior = None if covariances is None or recorded is None else condition(covariances, *recorded)
+            covariances = self._learned_covariances(executed, logged, recorded)
+        posterior = None if covariances is None else condition(covariances, *recorded)
         if posterior is None or not np.isfinite(posterior.most_probable.weights).all():
             return None
         points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)
         return LearnedDynamics(self, posterior, points)
 
-    def _learned_covariances(self, executed: Executed, logged: Sequence[Trajectory]) -> LearnedCovariances | None:
-        """Return the covariances learned from some executions; the latest ones are kept."""
+    def _learned_covariances(
+        self, executed: Executed, logged: Sequence[Trajectory], recorded: tuple[Transitions, Rows] | None
+    ) -> LearnedCovariances | None:
+        """Return the covariances learned from some executions, whose transitions may be known; the latest are kept."""
         together = [*(one for _, one in executed), *logged]
         key = b"".join(part.tobytes() for one in together for part in (one.states, one.inputs))
         if key not in self._covariances:
-            recorded = self._recorded(executed, logged)
+            recorded = self._recorded(executed, logged) if recorded is None else recorded
             if recorded is None or self._loops is None:
                 return None
             model, seed = before_refinement(self.validation.model), (self.seed, len(executed), 0)
@@ -179,7 +186,9 @@ class DynamicsStudy:
         with single_threaded():
             if learned is None:
                 return self._predict_vectors(executed)
-            found = predict_distance(self.planner, learned.posterior, learned.executed, self._slow)
+            loops, seconds = self._timed_loops
+            in_parallel = loops is not None and not loops.batch_shape and seconds > _SLOW
+            found = predict_distance(self.planner, learned.posterior, learned.executed, in_parallel)
             return replace(found, otherwise=lambda: self._predict_vectors(executed))
 
     def _predict_vectors(self, executed: Executed) -> Prediction | None:
@@ -224,7 +233,7 @@ class LearnedDynamics:
     def screened(self) -> WorstCase:
         """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""
         search = self.study.search
-        of_mean = search.on_mean(self.posterior, self.executed, self._rng(4), globally=False)
+        of_mean = search.on_mean(self.posterior, self._on_pool[0], self.executed, self._rng(4), globally=False)
         return search.screened(self.posterior, of_mean, self.executed, self._rng(5))
 
     def worst_case_of(self, draws: int) -> WorstCase:
@@ -232,7 +241,7 @@ class LearnedDynamics:
         functions = max(self.posterior.settings.functions, -(-draws // len(self.posterior.components)))
         if functions not in self._worst_cases:
             search, known, rng = self.study.search, self.executed, self._rng(1)
-            of_mean = search.on_mean(self.posterior, known, rng)
+            of_mean = search.on_mean(self.posterior, self._on_pool[0], known, rng)
             self._worst_cases[functions] = search.maxima(self.posterior, of_mean, known, rng, functions)
         return self._worst_cases[functions]
 
@@ -260,12 +269,19 @@ class LearnedDynamics:
         task[j] = value
         return j, gap, task
 
-    @functools.cached_property
+    @property
     def coverage(self) -> Coverage:
         """How well the records cover the closed loops of the tasks, in states and inputs."""
+        return self._on_pool[1]
+
+    @functools.cached_property
+    def _on_pool(self) -> tuple[Array, Coverage]:
+        """The distances of the pool's tasks on the posterior mean, and the coverage of their closed loops."""
+        search = self.study.search
         with single_threaded():
-            search = self.study.search
-            return coverage(self.study.planner, self.posterior, search.pool, search.plans)
+            loops = self.study.planner.run(self.posterior.mean, search.plans)
+            (distances,) = distances_of(loops, search.plans, 1, len(search.pool))
+            return distances, coverage(self.posterior, search.pool, search.plans, loops)
 
     def predict(self, point: Array) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.arrays import Array, Mask
 from ctxval.gp.cholesky import factorise, tenfold
 from ctxval.learning.hyperparameters import Hyperparameters
 
@@ -51,7 +51,7 @@ class KernelExpansion:
         """Return the only function of this expansion, ``count`` times."""
         return replace(self, weights=np.repeat(self.weights, count, axis=0))
 
-    def __getitem__(self, rows: slice | Rows) -> KernelExpansion:
+    def __getitem__(self, rows: slice) -> KernelExpansion:
         """Return some of the functions."""
         return replace(self, weights=self.weights[rows])
 

@@ -215,21 +215,27 @@ class WorstCaseSearch:
         return 1 - planned / len(self.pool)
 
     def on_mean(
-        self, posterior: DynamicsPosterior, known: Array, rng: np.random.Generator, *, globally: bool = True
+        self,
+        posterior: DynamicsPosterior,
+        of_pool: Array,
+        known: Array,
+        rng: np.random.Generator,
+        *,
+        globally: bool = True,
     ) -> WorstOfMean:
         """Return the largest distance on the posterior mean.
 
         Args:
             posterior: the posterior of the dynamics.
+            of_pool: the distances of the pool's tasks on the posterior mean, shape ``(N,)``.
             known: tasks to look at in any case, such as those of earlier maxima, points ``(k, d)``.
             rng: the source of the tasks that are tried.
             globally: whether large distances on a small share of the tasks are looked for.
         """
-        mean, settings = posterior.mean, self.settings
-        distance = functools.partial(self._distances, mean)
+        settings, distance = self.settings, functools.partial(self._distances, posterior.mean)
+        best = self.pool[np.argsort(-_finite(of_pool), kind="stable")[: settings.elites * 4]]
+        starts = np.concatenate([known, best])
         with single_threaded():
-            of_pool = _finite(self.planner.distances(mean, self.plans, len(self.pool)))[0]
-            starts = np.concatenate([known, self.pool[np.argsort(-of_pool, kind="stable")[: settings.elites * 4]]])
             if not globally:
                 budget = min(_SCREENED[1], settings.evaluations)
                 ascent = Ascent(distance, np.zeros(self.dimension), np.ones(self.dimension), budget)
