@@ -94,7 +94,7 @@ def suggestion_seconds(path: Path, system: str) -> list[float]:
         seconds = []
         for _ in range(SUGGESTIONS):
             started = time.process_time()
-            campaign.run(campaign.executions + 1, progress=False)
+            campaign.run(campaign.executions + 1, explore=True, progress=False)
             seconds.append(time.process_time() - started)
         campaign.store.close()
     return seconds

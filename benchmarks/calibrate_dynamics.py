@@ -67,7 +67,7 @@ def decide(one: Run) -> dict[str, Any]:
     options = CertificateOptions(Dynamics())
     with single_threaded():
         campaign = Campaign(validation, seed=one.seed)
-        campaign.run_until_decided(threshold, BUDGETS[one.group], certificate=options)
+        campaign.run(BUDGETS[one.group], threshold, certificate=options)
         verdict = campaign.verdict(threshold, certificate=options)
     return {
         "rule": RULE,

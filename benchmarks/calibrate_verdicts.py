@@ -144,7 +144,7 @@ def _of_system(one: Decision) -> dict[str, Any]:
     experiment = cases.by_name(system.case, one.seed, **dict(system.options))
     threshold, budget = one.share * best_known, BUDGETS[one.dimension]
     campaign = Campaign(experiment.validation, search=searches.by_name(one.search), seed=one.seed)
-    campaign.run_until_decided(threshold, budget, certificate=CertificateOptions.posterior())
+    campaign.run(budget, threshold, certificate=CertificateOptions.posterior())
     return _summary(
         list(campaign.trials), threshold, decided=StoppingRule(threshold).decide(campaign.trials, 0).decided
     )

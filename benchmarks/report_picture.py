@@ -22,7 +22,7 @@ def write_report(folder: Path) -> Path:
     """Write the report of a campaign on the running example, and return its path."""
     experiment = cases.by_name("pendulum", seed=0)
     campaign = Campaign(experiment.validation, seed=0, name="pendulum", store=folder / "pendulum.sqlite")
-    campaign.run_until_decided(threshold=0.5, budget=12)
+    campaign.run(budget=12, threshold=0.5)
     return report.write(campaign, folder / "report.html", threshold=0.5)
 
 

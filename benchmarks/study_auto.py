@@ -81,7 +81,7 @@ def campaign(validation: Validation, search: searches.Search, seed: int, budget:
 
     running = Campaign(validation, search=search, seed=seed)
     started = time.process_time()
-    running.run(budget, until=is_found)
+    running.run(budget, explore=True, until=is_found)
     return {
         "truth": best_known,
         "budget": budget,

@@ -50,7 +50,7 @@ def typed(validation: Validation, task: dict[str, Any], moved: float = 0.0) -> f
 def decided(validation: Validation, threshold: float, seed: int) -> tuple[str, int]:
     """Return the verdict of a campaign that runs until it is decided, and its number of executions."""
     campaign = Campaign(validation, seed=seed)
-    campaign.run_until_decided(threshold, BUDGET)
+    campaign.run(BUDGET, threshold)
     return campaign.verdict(threshold).answer, campaign.executions
 
 
@@ -62,7 +62,7 @@ def study(seed: int) -> dict[str, Any]:
     told = [converged_of(plan.controller) for plan in validation.plans(points)]
     largest = truth(validation)
     begun = time.process_time()
-    campaign = Campaign(validation, search=searches.Auto("thorough"), seed=seed).run(BUDGET)
+    campaign = Campaign(validation, search=searches.Auto("thorough"), seed=seed).run(BUDGET, explore=True)
     seconds = time.process_time() - begun
     worst = campaign.worst
     assert worst is not None

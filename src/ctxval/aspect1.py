@@ -217,7 +217,12 @@ def _simulate(campaign: Campaign, tasks: int) -> None:
             warnings.simplefilter("ignore", GoalWarning)  # which is what the report says in detail
             if done < tasks // 2:
                 campaign.audit(tasks // 2, lambda _: advance(), progress=False)
-            campaign.run(campaign.executions + tasks - len(campaign.trials), lambda _: advance(), progress=False)
+            campaign.run(
+                campaign.executions + tasks - len(campaign.trials),
+                on_trial=lambda _: advance(),
+                explore=True,
+                progress=False,
+            )
 
 
 def _share(campaign: Campaign, threshold: float | None) -> float | None:

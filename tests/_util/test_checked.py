@@ -102,9 +102,9 @@ CAMPAIGN = ctxval.Campaign(VALIDATION)
     ("function", "arguments"),
     [
         (CAMPAIGN.run, {"budget": 1}),
-        (CAMPAIGN.run_until_decided, {"threshold": 1.0, "budget": 1}),
+        (CAMPAIGN.run, {"threshold": 1.0, "budget": 1}),
         (CAMPAIGN.audit, {"draws": 1}),
-        (CAMPAIGN.ask_until_decided, {"threshold": 1.0, "budget": 1}),
+        (CAMPAIGN.ask_for_verdict, {"threshold": 1.0, "budget": 1}),
         (CAMPAIGN.verdict, {"threshold": 1.0}),
         (CAMPAIGN.tell, {"opened": 0, "distance": 1.0}),
         (CAMPAIGN.add, {"parameters": {"goal": 0.5}, "distance": 1.0}),

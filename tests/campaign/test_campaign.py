@@ -449,7 +449,7 @@ def test_a_campaign_executes_what_nothing_came_near_to_before_it_validates(tmp_p
         return Campaign(make_validation(), search=OneCorner(), seed=1, store=tmp_path / name)
 
     # The search alone would never leave its corner.
-    decided = campaign("a").run_until_decided(1e3, 20)
+    decided = campaign("a").run(20, 1e3)
     origins = [trial.origin for trial in decided.trials]
     assert decided.verdict(1e3).answer == "validated"
     assert 0 < origins.count("covering") < decided.executions < 20
@@ -462,12 +462,12 @@ def test_a_campaign_executes_what_nothing_came_near_to_before_it_validates(tmp_p
 
     for _ in range(decided.executions):
         with pytest.raises(KeyboardInterrupt):
-            campaign("b").run_until_decided(1e3, 20, on_trial=interrupt)
-    assert facts(campaign("b").run_until_decided(1e3, 20).trials) == facts(decided.trials)
+            campaign("b").run(20, 1e3, on_trial=interrupt)
+    assert facts(campaign("b").run(20, 1e3).trials) == facts(decided.trials)
 
 
 def test_a_campaign_ends_at_its_counterexample(validation: Validation) -> None:
-    falsified = Campaign(validation, seed=1).run_until_decided(1e-6, 9)
+    falsified = Campaign(validation, seed=1).run(9, 1e-6)
     assert falsified.executions == 1
     assert falsified.verdict(1e-6).answer == "falsified"
 
@@ -475,7 +475,7 @@ def test_a_campaign_ends_at_its_counterexample(validation: Validation) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 def test_workers_decide_together(validation: Validation) -> None:
-    decided = Campaign(validation, search=OneCorner(), seed=1).run_until_decided(1e3, 20, workers=2)
+    decided = Campaign(validation, search=OneCorner(), seed=1).run(20, 1e3, workers=2)
     assert decided.verdict(1e3).answer == "validated"
     assert decided.executions < 20
 
@@ -557,7 +557,7 @@ def test_independent_draws_know_how_many_there_were_to_be(validation: Validation
     assert all(trial.note is None for trial in campaign.trials[:3])
     campaign.tell(campaign.ask(draw=True), distance=0.1)
     assert campaign.trials[-1].note is None
-    drawn = Campaign(validation, search=searches.Random()).run(2).run_until_decided(90.0, 4, resolution=1.0)
+    drawn = Campaign(validation, search=searches.Random()).run(2).run(4, 90.0, resolution=1.0)
     assert [(trial.note or {}).get("draws") for trial in drawn.trials] == [2, 2, 0, 0]
     assert Campaign(validation, search=searches.Random()).run(2, until=lambda _: False).trials[0].note == {"draws": 0}
 

@@ -52,7 +52,7 @@ def test_tasks_that_are_tested_before_their_execution_are_no_executions(until_de
 
     def work() -> None:
         if until_decided:
-            campaign.run_until_decided(1e3, 3)
+            campaign.run(3, 1e3)
         else:
             campaign.run(3)
 

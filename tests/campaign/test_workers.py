@@ -422,7 +422,7 @@ if __name__ == "__main__":
                     os.kill(pids[0], signal.SIGKILL)
                     print("killed a worker after", running.executions, flush=True)
 
-            running.run(16, kill_once, executor=client.get_executor(pure=False), workers=2)
+            running.run(16, on_trial=kill_once, executor=client.get_executor(pure=False), workers=2)
 """
 
 

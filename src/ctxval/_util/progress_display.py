@@ -70,14 +70,14 @@ class InLog:
         self._started.setdefault(progress.depth, now)
         if progress.note or (now - self._last > _SILENCE and not progress.ended):
             self._last = now
-            text = ", ".join(filter(None, [amount(progress, now - self._started[progress.depth]), progress.note]))
-            self._console.print(f"{progress.stage}: {_in_one_line(text)}", soft_wrap=True)
+            text = progress.note or f"{progress.stage}: {amount(progress, now - self._started[progress.depth])}"
+            self._console.print(_in_one_line(text), soft_wrap=True)
         if progress.ended:
             del self._started[progress.depth]
 
 
 class OnScreen:
-    """Shows one bar for each stage. The bar of a stage with notes stays on the screen when all is done.
+    """Shows one bar for each stage while it lasts. Notes stay on the screen, one line for each.
 
     Args:
         console: the console of rich.
@@ -91,35 +91,26 @@ class OnScreen:
     def __call__(self, progress: Progress) -> None:
         """Show a report."""
         bars = self._bars = self._bars or self._started()
+        if progress.note:
+            bars.console.print(_in_one_line(progress.note), soft_wrap=True)
         if progress.depth not in self._rows:
-            self._rows[progress.depth] = bars.add_task(progress.stage, text="", note="", lasts=False)
+            self._rows[progress.depth] = bars.add_task(progress.stage, text="")
         row = self._rows[progress.depth]
         task = bars.tasks[bars.task_ids.index(row)]
-        note = _in_one_line(progress.note) or task.fields["note"]
-        bars.update(
-            row,
-            completed=progress.done,
-            total=progress.expected,
-            text=amount(progress, task.elapsed or 0.0),
-            note=note,
-            lasts=bool(note),
-        )
+        text = amount(progress, task.elapsed or 0.0)
+        bars.update(row, completed=progress.done, total=progress.expected, text=text)
         if progress.ended:
-            self._end(progress.depth, lasts=bool(note))
+            self._end(progress.depth)
 
     def _started(self) -> Bars:
         bars = _bars(self._console)
         bars.start()
         return bars
 
-    def _end(self, depth: int, lasts: bool) -> None:
+    def _end(self, depth: int) -> None:
         assert self._bars is not None
-        row = self._rows.pop(depth)
-        self._bars.stop_task(row)
-        if not lasts:
-            self._bars.remove_task(row)
+        self._bars.remove_task(self._rows.pop(depth))
         if not self._rows:
-            self._bars.live.transient = not self._bars.tasks
             self._bars.stop()
             self._bars = None
 
@@ -133,20 +124,21 @@ def _bars(console: Console) -> Bars:
         """Bars of the stages that have lasted for some time."""
 
         def get_renderables(self) -> Iterable[RenderableType]:
-            shown = [task for task in self.tasks if task.fields["lasts"] or (task.elapsed or 0.0) > _DELAY]
+            shown = [task for task in self.tasks if (task.elapsed or 0.0) > _DELAY]
             yield self.make_tasks_table(shown)
 
     return Delayed(
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=20),
-        TextColumn("{task.fields[text]}  {task.fields[note]}", markup=False),
+        TextColumn("{task.fields[text]}", markup=False),
         TimeElapsedColumn(),
         console=console,
+        transient=True,
     )
 
 
 def _in_one_line(text: str) -> str:
-    return visible(" ".join(shortened(text).split()))
+    return visible(" ".join(shortened(text).splitlines()))
 
 
 def amount(progress: Progress, elapsed: float) -> str:

@@ -12,12 +12,12 @@ from ctxval.campaign import display, remeasuring
 from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.identity import description_of, identify, search_of
+from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.operated import OperatedCampaign
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.campaign.until_decided import UntilDecided
 from ctxval.campaign.workers import WorkerPool, worker_pool
 from ctxval.certificates import RESOLUTION, CertificateOptions
-from ctxval.certificates.options import CONFIDENCE
+from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.distance import Distance
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
@@ -78,8 +78,16 @@ class Campaign(OperatedCampaign):
     def run(
         self,
         budget: PositiveInt,
+        threshold: PositiveFloat | None = None,
         on_trial: Callable[[Trial], None] | None = None,
         *,
+        explore: bool | None = None,
+        within: PositiveFloat = WITHIN,
+        confidence: float = CONFIDENCE,
+        stochastic: bool = False,
+        resolution: float = RESOLUTION,
+        certificate: CertificateOptions | None = None,
+        audited: bool = False,
         until: Callable[[Campaign], bool] | None = None,
         workers: PositiveInt | None = None,
         executor: cf.Executor | None = None,
@@ -88,7 +96,13 @@ class Campaign(OperatedCampaign):
         retry_failures: NonNegativeInt = 0,
         progress: bool | None = None,
     ) -> Campaign:
-        """Execute tasks until the total number of executions is ``budget``, including earlier ones.
+        """Execute the tasks that narrow the interval of d*, until it decides or the budget is spent.
+
+        The interval is that from the largest executed distance to a bound on d*. With a threshold, the campaign ends
+        when the threshold lies outside of it: the model is falsified or validated. Without one, it ends when the bound
+        is close to the largest executed distance. If trajectories teach the dynamics, the bound is that from learned
+        dynamics, and each execution is predicted beforehand; the prediction is stored with the trial. Otherwise it is
+        the posterior bound of the distance. To explore is to spend the whole budget on the tasks of the search.
 
         A failed execution is a failed trial. It counts, and the campaign continues. With several workers, a new task is
         chosen as soon as a worker is free. The search knows the tasks that are being executed, and its choice depends
@@ -96,8 +110,18 @@ class Campaign(OperatedCampaign):
         Ctrl-C stops it at once; in both cases, the campaign can be resumed.
 
         Args:
-            budget: total number of executions of S.
+            budget: largest total number of executions of S, including earlier ones.
+            threshold: tau, in the units of the distance.
             on_trial: called with each trial that has ended.
+            explore: whether the search alone chooses the tasks, and the whole budget is spent; None if this holds
+                unless there is a threshold or the search is ``auto``.
+            within: without a threshold, the share by which the bound may exceed the largest executed distance at the
+                end.
+            confidence, stochastic, resolution, certificate: as in :meth:`verdict`; unless the campaign explores, the
+                kind of the certificate must be ``auto``, ``dynamics``, ``posterior`` or, with an acceptable volume,
+                ``anytime``.
+            audited: before the bound from learned dynamics decides, predict and execute eight fresh random tasks, half
+                of them with parameters at their bounds. If a distance exceeds its prediction, the bound is withdrawn.
             until: called before each execution; the campaign stops early if it returns True.
             workers: number of processes, each with its own copy of the system; with an executor, the number of
                 executions that it has at a time.
@@ -110,65 +134,30 @@ class Campaign(OperatedCampaign):
 
         Raises:
             InputError: if a value cannot be used, or the system cannot be sent to the workers.
+            CertificateError: if an option of the certificate is not valid.
             ModelError, DesignError, DistanceError: if the task, the model or the distance cannot be used. All
                 executions are stored, and running again continues after the trial that failed.
             CampaignError: if there are no workers any more.
         """
+        options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
+        if explore is None:
+            explore = threshold is None and not self._recorder.search.uses_prediction
+        decides = None
+        if not explore:
+            decides = IntervalSearch(self._recorder, options, budget, threshold, within, audited)
         by_search = Choice(planned_draws=budget if until is None else 0)
 
         def rule() -> Choice | None:
-            return None if until is not None and until(self) else by_search
+            if until is not None and until(self):
+                return None
+            return by_search if decides is None else decides.choose()
 
         pool, retry = self._pool(workers, executor, timeout), RetryPolicy(retries, retry_failures)
         if retry_failures and pool is None:
             raise InputError("retry_failures needs workers, an executor or a timeout.")
-        with progress_shown(progress):
+        predicts = decides is not None and decides.predicts
+        with self._recorder.predicting(predicts), progress_shown(progress):
             return self._execute(Schedule(self._recorder, rule, budget), pool, on_trial, retry)
-
-    @checked
-    def run_until_decided(
-        self,
-        threshold: PositiveFloat,
-        budget: PositiveInt,
-        on_trial: Callable[[Trial], None] | None = None,
-        *,
-        confidence: float = CONFIDENCE,
-        stochastic: bool = False,
-        resolution: float = RESOLUTION,
-        certificate: CertificateOptions | None = None,
-        audited: bool = False,
-        workers: PositiveInt | None = None,
-        executor: cf.Executor | None = None,
-        timeout: Seconds | None = None,
-        progress: bool | None = None,
-    ) -> Campaign:
-        """Execute tasks until the model is validated or falsified for a threshold, or the budget is spent.
-
-        By default the certificate is the one that is expected to decide first. If trajectories teach the dynamics, it
-        is the bound from learned dynamics, and each execution is predicted beforehand; the prediction is stored with
-        the trial. Otherwise it is the posterior bound: if it is at most the threshold but some tasks are too far from
-        all trials, and if the budget suffices for all of these tasks, then they are executed; if it is above the
-        threshold, the search chooses the next task.
-
-        Args:
-            threshold: tau, in the units of the distance.
-            budget: largest total number of executions of S, including earlier ones.
-            on_trial: called with each trial that has ended.
-            confidence, stochastic, resolution, certificate: as in :meth:`verdict`; the kind of the certificate must be
-                ``auto``, ``dynamics``, ``posterior`` or, with an acceptable volume, ``anytime``.
-            audited: before the bound from learned dynamics decides, predict and execute eight fresh random tasks, half
-                of them with parameters at their bounds. If a distance exceeds its prediction, the bound is withdrawn.
-            workers, executor, timeout, progress: as in :meth:`run`.
-
-        Raises:
-            InputError, ModelError, DesignError, DistanceError, CampaignError: as in :meth:`run`.
-            CertificateError: if an option of the certificate is not valid.
-        """
-        by = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
-        decision = UntilDecided(self._recorder, threshold, by, budget, audited)
-        pool = self._pool(workers, executor, timeout)
-        with self._recorder.predicting(decision.predicts), progress_shown(progress):
-            return self._execute(Schedule(self._recorder, decision.choose, budget), pool, on_trial)
 
     @checked
     def audit(

@@ -134,10 +134,25 @@ class CampaignDynamics:
 
     def evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
         """Return what the learned dynamics say about d*; None if nothing can be learned."""
+        known = self.kept_evidence(trials, confidence)
+        if known is not None:
+            return known
         draws = min(MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
         with stage("searching the learned dynamics", self._study.search.expected_loops(draws), "closed loops"):
             learned = self.learned(trials)
             return None if learned is None else self._guarded(lambda: self._whole(learned, trials, draws, confidence))
+
+    def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
+        """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""
+        if self.elsewhere() or len(trials) != self._store.signature()[0]:
+            return None
+        return DynamicsEvidence.from_json(self._store.computed(f"evidence {confidence}"))
+
+    def keep_evidence(self, found: DynamicsEvidence, confidence: float, digest: str) -> None:
+        """Keep evidence in the store, which had this digest when it was computed."""
+        key = f"evidence {confidence}"
+        if not self.elsewhere() and self._store.computed(key) is None:
+            self._store.keep_computed(key, found.to_json(), digest)
 
     def _guarded(self, function: Callable[[], DynamicsEvidence]) -> DynamicsEvidence | None:
         try:
@@ -211,7 +226,7 @@ class CampaignDynamics:
         found = []
         for place, trial in enumerate(completed):
             before = completed[:place]
-            stored = self._stored(trial)
+            stored = self.stored_prediction(trial)
             prediction = stored
             if stored is None and place >= len(completed) - _RECOMPUTED:
                 if self.learned(before, alone=True) is None:
@@ -240,7 +255,7 @@ class CampaignDynamics:
         z2, rank = (np.nan, np.nan) if score is None else (score.z2, score.rank)
         return CheckedPrediction(trial.number, rank, prediction.median, prediction.upper, distance, z2, **how)
 
-    def _stored(self, trial: Trial) -> ExecutionPrediction | None:
+    def stored_prediction(self, trial: Trial) -> ExecutionPrediction | None:
         """Return the prediction that was stored before an execution, if it is one of the present distance."""
         note = (trial.note or {}).get(PREDICTION)
         if not isinstance(note, dict) or note.get("experiment") != self.experiment:

@@ -9,14 +9,19 @@ from dataclasses import dataclass
 from ctxval._util.checked import NonNegativeInt, checked
 from ctxval._util.interrupts import Interrupts, exits_as_exceptions
 from ctxval._util.progress import advance, is_heard, stage
+from ctxval._util.representation import named
 from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.remeasuring import remeasure
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import ExecutionResult, WorkerPool, execute_task
+from ctxval.certificates.bounds import with_error
 from ctxval.core.plan import Measurement, Plan
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, ExecutionError, InputError
+
+_SLOW = 1.0
+"""Seconds from which on the duration of an execution is said."""
 
 OnTrial = Callable[[Trial], None]
 """Called with each trial that has ended."""
@@ -88,15 +93,23 @@ def _report(recorder: TrialRecorder, ended: Trial, on_trial: OnTrial | None) -> 
 
 
 def _result(recorder: TrialRecorder, ended: Trial) -> str:
-    """Return the result of a trial in one sentence."""
-    pace = "" if ended.seconds is None else f" in {ended.seconds:.2g} s"
-    design = "" if (ended.note or {}).get(CONVERGED) is not False else "; the design of its controller did not converge"
+    """Return a trial in one line: its task, what was predicted, and what was executed."""
+    validation, predicted = recorder.validation, recorder.dynamics.stored_prediction(ended)
+    parts = [f"trial {ended.number:<2}", str(named(ended.parameters, validation.space.units))]
+    if predicted is not None:
+        parts.append(f"predicted {with_error(predicted.median, predicted.deviation)}")
     if ended.distance is None:
-        return f"trial {ended.number} failed{pace}: {ended.failure}{design}"
-    largest = max(trial.distance for trial in recorder.trials if trial.distance is not None)
+        parts.append(f"failed: {ended.failure}")
+    else:
+        parts.append(f"executed {ended.distance:.4g} {validation.labels.units}".rstrip())
+    if ended.seconds is not None and ended.seconds >= _SLOW:
+        parts.append(f"{ended.seconds:.2g} s")
     offset = recorder.start_offset(ended)
-    start = f"; its start was off by {offset.text}" if offset is not None and offset.size else ""
-    return f"trial {ended.number} has distance {ended.distance:.4g}{pace}, largest {largest:.4g}{start}{design}"
+    if offset is not None and offset.size:
+        parts.append(f"its start was off by {offset.text}")
+    if (ended.note or {}).get(CONVERGED) is False:
+        parts.append("the design of its controller did not converge")
+    return "   ".join(parts)
 
 
 def _execute_in_turn(schedule: Schedule, on_trial: OnTrial | None, interrupts: Interrupts) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, checked
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign.choices import Choice, OpenTrial
+from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.known import KnownExecution, TrialResult, check_known, measurement_of
 from ctxval.campaign.results import CampaignResults
-from ctxval.campaign.until_decided import UntilDecided
 from ctxval.certificates import RESOLUTION, CertificateOptions
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.trajectory import Trajectory
@@ -65,7 +65,7 @@ class OperatedCampaign(CampaignResults):
             return self._recorder.open(Choice(self._recorder.draw(), "iid") if draw else Choice())
 
     @checked
-    def ask_until_decided(
+    def ask_for_verdict(
         self,
         threshold: PositiveFloat,
         budget: PositiveInt,
@@ -78,14 +78,14 @@ class OperatedCampaign(CampaignResults):
         wait: NonNegativeFloat = 0.0,
         progress: bool | None = None,
     ) -> OpenTrial | None:
-        """Open the trial that :meth:`ctxval.Campaign.run_until_decided` would execute next, for people who execute it.
+        """Open the trial that :meth:`ctxval.Campaign.run` would execute next for a threshold, if people execute it.
 
         Returns None if the model is validated or falsified for the threshold, or if the budget is spent. Open trials
         count for the budget.
 
         Args:
             threshold, budget, confidence, stochastic, resolution, certificate, audited: as in
-                :meth:`ctxval.Campaign.run_until_decided`.
+                :meth:`ctxval.Campaign.run`.
             wait, progress: as in :meth:`ask`.
 
         Raises:
@@ -95,10 +95,10 @@ class OperatedCampaign(CampaignResults):
         by = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         with progress_shown(progress), self.store.sole_writer(wait):
             self._recorder.refresh()
-            decision = UntilDecided(self._recorder, threshold, by, budget, audited)
+            search = IntervalSearch(self._recorder, by, budget, threshold, audited=audited)
             waiting = sum(trial.state == "open" for trial in self.trials)
-            with self._recorder.predicting(decision.predicts):
-                choice = decision.choose() if self.executions + waiting < budget else None
+            with self._recorder.predicting(search.predicts):
+                choice = search.choose() if self.executions + waiting < budget else None
                 return None if choice is None else self._recorder.open(choice)
 
     def reopen(self, number: int, *, ended: bool = False) -> OpenTrial:

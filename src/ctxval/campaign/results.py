@@ -15,7 +15,7 @@ from ctxval.campaign import display
 from ctxval.campaign.history import executed_trials
 from ctxval.campaign.learned import LearnedFromTrials
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates import RESOLUTION, CertificateOptions, Provenance, Verdict, judge
+from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.preflight import StartOffset, start_offset
 from ctxval.core.trajectory import Trajectory
@@ -134,6 +134,31 @@ class CampaignResults:
         chosen = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         with progress_shown(progress), stage("certifying"):
             return judge(self.trials, threshold, chosen, self.provenance)
+
+    @checked
+    def certify(
+        self,
+        confidence: float = CONFIDENCE,
+        *,
+        stochastic: bool = False,
+        resolution: float = RESOLUTION,
+        certificate: CertificateOptions | None = None,
+        progress: bool | None = None,
+    ) -> Certificate:
+        """Return the bound on d*, which needs no threshold.
+
+        Args:
+            confidence, stochastic, resolution, certificate, progress: as in :meth:`verdict`.
+
+        Raises:
+            InputError: if the confidence is below 0.5.
+            CertificateError: if an option of the certificate is not valid, or its theory refuses the trials.
+        """
+        chosen = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
+        with progress_shown(progress), stage("certifying"):
+            found = assess(self.trials, chosen, provenance=self.provenance).certificate
+        assert found is not None  # without a threshold, a refusal is raised
+        return found
 
     @property
     def provenance(self) -> Provenance:

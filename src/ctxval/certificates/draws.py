@@ -26,7 +26,7 @@ def countable_draws(sample: Sample, kind: str) -> Sample:
     drawn = everything.rows([row for row, planned in enumerate(everything.planned) if plans and planned == plans[-1]])
     if not len(drawn):
         raise CertificateError(
-            f"the {len(everything)} independent draws ended with the verdict (--until-decided), so their number "
+            f"the {len(everything)} independent draws ended with the verdict, so their number "
             f"depended on their distances and none counts; certify --audit N draws until there are N in all, and "
             f"counts only those after the first {len(everything)}."
         )

@@ -212,7 +212,7 @@ def _coverage_gap_of_pairs(evidence: DynamicsEvidence, best: float, bound: float
 def _gap(gap: StateInputGap, what: str) -> str:
     return (
         f"closed loops of the tasks lead {100 * gap.size:.2g} % {what} {' and '.join(gap.coordinates)}, such as to "
-        f"{with_units(gap.place)}; an execution of a task that leads there helps (--until-decided executes it)"
+        f"{with_units(gap.place)}; an execution of a task that leads there helps (`ctxval run` executes it)"
     )
 
 
@@ -230,7 +230,7 @@ def untried_parameter(evidence: DynamicsEvidence, best: float, bound: float) -> 
             f"the parameter {untried.name} hardly changes the closed loops of the model, so what it changes in the "
             "system cannot be learned from states and inputs, and some of its values are "
             f"{100 * untried.gap:.0f} % of its range away from every executed one; an execution there helps "
-            "(--until-decided executes it)"
+            "(`ctxval run` executes it)"
         )
     return None
 
@@ -244,7 +244,7 @@ def _largest_untested(evidence: DynamicsEvidence, best: float, bound: float) -> 
         return (
             f"the largest distance is predicted to be {evidence.highest:.4g}, but the largest executed one is "
             f"{best:.4g}: the prediction is not tested where it matters; an execution of that task helps "
-            "(--until-decided executes it)"
+            "(`ctxval run` executes it)"
         )
     return None
 
@@ -258,7 +258,7 @@ def _only_small_distances(evidence: DynamicsEvidence, best: float, bound: float)
         return None
     return (
         f"no prediction held at a distance of at least {100 * MATTERS:g} % of the bound: small distances hardly "
-        "test it; an execution of another task with a large distance helps (--until-decided executes it)"
+        "test it; an execution of another task with a large distance helps (`ctxval run` executes it)"
     )
 
 
@@ -305,7 +305,7 @@ def _searches_disagree(evidence: DynamicsEvidence, best: float, bound: float) ->
     return (
         f"searches of the learned dynamics find largest distances that differ by {100 * share:.0f} %, because the "
         "controllers or the closed loop change abruptly from task to task; an execution of the task of the largest one "
-        "helps (--until-decided executes it), or use a smoother model, or an audit"
+        "helps (`ctxval run` executes it), or use a smoother model, or an audit"
     )
 
 

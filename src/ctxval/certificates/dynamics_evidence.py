@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -180,8 +180,44 @@ class DynamicsEvidence:
         resampled = np.sort(blocks[rows].reshape(_RESAMPLES, -1), axis=1)[:, self.rank(confidence)]
         return float(resampled.std(ddof=1)) if np.isfinite(resampled).all() else np.inf
 
+    def to_json(self) -> dict[str, Any]:
+        """Return all attributes in types that JSON has; numbers may be infinite."""
+        found: dict[str, Any] = _plain(asdict(self))
+        return found
+
+    @classmethod
+    def from_json(cls, values: Any) -> Self | None:
+        """Return the evidence that :meth:`to_json` returned; None if these are not its values."""
+        try:
+            coverage, untried = values["coverage"], values["untried"]
+            gaps = {name: _gap(coverage[name]) for name in ("marginal", "beyond", "pair")}
+            arrays = {name: np.array(values[name], dtype=np.float64) for name in ("maxima", "points", "elites")}
+            parts = {
+                "predictions": tuple(CheckedPrediction(**one) for one in values["predictions"]),
+                "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),
+                "untried": untried and UntriedParameter(**{**untried, "task": np.array(untried["task"])}),
+            }
+            return cls(**{**values, **arrays, **parts})
+        except (KeyError, TypeError, ValueError):
+            return None
+
     def __repr__(self) -> str:
         return call(self, draws=len(self.maxima), executions=self.executions, evaluations=self.evaluations)
+
+
+def _plain(value: Any) -> Any:
+    match value:
+        case np.ndarray() | np.generic():
+            return value.tolist()
+        case dict():
+            return {name: _plain(item) for name, item in value.items()}
+        case tuple() | list():
+            return [_plain(item) for item in value]
+    return value
+
+
+def _gap(values: Any) -> Any:
+    return values and StateInputGap(**{**values, "coordinates": tuple(values["coordinates"])})
 
 
 def with_units(values: dict[str, float]) -> str:

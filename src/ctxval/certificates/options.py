@@ -15,6 +15,9 @@ from ctxval.errors import InputError
 CONFIDENCE = 0.95
 """Default confidence of a verdict."""
 
+WITHIN = 0.05
+"""Default share by which a bound may exceed the largest executed distance where a search without a threshold ends."""
+
 LEAST_CONFIDENCE = 0.5
 """Least confidence of a verdict: below it, a statement is wrong more often than right."""
 

@@ -105,7 +105,7 @@ def _uncovered(X: Array, farthest: float, resolution: float) -> str:
     return (
         f"some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the resolution of "
         f"{resolution:g}, so the bound is withdrawn; {many} more executions would come near to every task "
-        "(--until-decided makes them), or an audit bounds how many tasks are worse"
+        "(`ctxval run` makes them), or an audit bounds how many tasks are worse"
     )
 
 
@@ -135,7 +135,7 @@ def _bare(bare: Array, d: int) -> str:
     where = "ends of the task parameter's range" if d == 1 else "corners of the task space"
     return (
         f"no trial is at or next to {len(bare)} of the {2**d} {where}, towards which the distance may rise unseen, so "
-        f"the bound is withdrawn; {len(bare)} more executions would be there (--until-decided makes them)"
+        f"the bound is withdrawn; {len(bare)} more executions would be there (`ctxval run` makes them)"
     )
 
 

@@ -50,9 +50,7 @@ class Verdict:
     @property
     def bound(self) -> float | None:
         """The bound on d* of its certificate; None if there is none, it is withdrawn, or it leaves out a volume."""
-        found = self.certificate
-        usable = found is not None and found.doubt is None and not found.volume and np.isfinite(found.upper_bound)
-        return found.upper_bound if found is not None and usable else None
+        return usable_bound(self.certificate)
 
     def __str__(self) -> str:
         return f"{self.answer}: {self.reason}"
@@ -70,6 +68,12 @@ class Verdict:
             "rests_on": self.rests_on,
             "threshold": self.threshold,
         }
+
+
+def usable_bound(found: Certificate | None) -> float | None:
+    """Return the bound on d* of a certificate; None if there is none, it is withdrawn, or it leaves out a volume."""
+    usable = found is not None and found.doubt is None and not found.volume and np.isfinite(found.upper_bound)
+    return found.upper_bound if found is not None and usable else None
 
 
 @checked

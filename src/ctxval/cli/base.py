@@ -10,7 +10,6 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
-from dataclasses import asdict
 from json import dumps  # code of users may replace what is in a module
 from typing import Annotated, Any
 
@@ -181,16 +180,6 @@ def say_error(sentence: str) -> None:
     err.say(("error:", "bold red"), f" {sentence}")
 
 
-def certificate_of(verdict: Verdict | None) -> dict[str, Any]:
-    """Return the certificate of a verdict and the forecast of further executions."""
-    if verdict is None:
-        return {"certificate": None, "expected": None}
-    return {
-        "certificate": None if verdict.certificate is None else verdict.certificate.to_json(),
-        "expected": None if verdict.expected is None else asdict(verdict.expected),
-    }
-
-
 def worst_of(trial: Trial | None) -> dict[str, Any] | None:
     """Return the task and the distance of a trial."""
     return None if trial is None else {"task": trial.parameters, "distance": trial.distance}
@@ -216,6 +205,8 @@ def print_failures(failures: list[dict[str, Any]]) -> None:
     if len(failures) > _REASONS:
         err.say(f"and {len(failures) - _REASONS} other reasons; `ctxval export` lists them.")
 
+
+_COLOURS = {"validated": "green", "falsified": "red", "undecided": "yellow"}
 
 _REASONS = 3
 """Largest number of reasons that are printed."""
@@ -252,8 +243,9 @@ def print_other_stores(others: list[str]) -> None:
         out.say(f"{sentence} The best result of several campaigns is wrong more often than its confidence states.")
 
 
-def print_verdict(verdict: Verdict) -> None:
+def print_verdict(verdict: Verdict, units: str = "") -> None:
     """Print the verdict, its reason and its assumptions."""
-    out.say((verdict.answer, "bold"), f" against {verdict.threshold:g}: {verdict.reason}", wrap=True)
+    answer = (verdict.answer.upper(), f"bold {_COLOURS[verdict.answer]}")
+    out.say(answer, f" against {f'{verdict.threshold:g} {units}'.rstrip()}: {verdict.reason}", wrap=True)
     if verdict.rests_on is not None:
         out.say(verdict.rests_on, wrap=True)

@@ -126,7 +126,7 @@ def init(
         quoted = shlex.quote(str(file))
         out.say(" and ".join(map(str, contents)))
         out.say(f"next: ctxval check {quoted}")
-        out.say(f"then: ctxval run {quoted} --until-decided")
+        out.say(f"then: ctxval run {quoted}")
     return {"files": [str(path) for path in contents]}
 
 

@@ -18,7 +18,7 @@ from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sent
 from ctxval.cli.base import FALSIFIED, app, command, out, print_verdict
 from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, Threshold, named_values
 from ctxval.cli.outputs import Force, require_folder
-from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, open_store, require_limit, require_target
+from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, limit_of, open_store, require_target
 from ctxval.config.settings import read_settings
 from ctxval.core.exchange import TASK_FORMAT
 from ctxval.core.trial import CONVERGED, Trial
@@ -62,19 +62,20 @@ Because = Annotated[
         "--again.",
     ),
 ]
-UntilDecided = Annotated[
+Explore = Annotated[
     bool,
     typer.Option(
-        "--until-decided",
-        help="Choose the task that is expected to decide the verdict soonest, as `ctxval run --until-decided` does. If "
-        "the verdict is reached, no trial is opened and the verdict is printed.",
+        "--explore",
+        help="Choose the task by the search alone. Without this option, and with a threshold, the task is the one that "
+        "`ctxval run` would execute to decide the verdict soonest; if the verdict is reached, no trial is opened and "
+        "the verdict is printed.",
     ),
 ]
 Budget = Annotated[
     int | None,
     typer.Option(
-        help="Maximum number of executions that may be planned with --until-decided, including earlier ones (default: "
-        "the budget of the experiment)."
+        help="Maximum number of executions that may be planned for a verdict, including earlier ones (default: the "
+        "budget of the experiment)."
     ),
 ]
 Reopened = Annotated[int | None, typer.Option(help="Write the files of this open trial again.")]
@@ -104,7 +105,7 @@ def ask(
     again: Again = None,
     because: Because = None,
     trial: Reopened = None,
-    until_decided: UntilDecided = False,
+    explore: Explore = False,
     threshold: Threshold = None,
     budget: Budget = None,
     search: SearchName = None,
@@ -117,23 +118,27 @@ def ask(
     option: PartOptions = None,
 ) -> Any:
     """Open the next trial of a system that people operate, and write its task and controller to files."""
-    if sum((bool(parameters), draw, again is not None, trial is not None, until_decided)) > 1:
-        raise InputError("--set, --draw, --again, --trial and --until-decided cannot be combined.")
-    if not until_decided and (threshold is not None or budget is not None):
-        raise InputError("--threshold and --budget need --until-decided.")
+    stated = sum((bool(parameters), draw, again is not None, trial is not None, explore))
+    if stated > 1:
+        raise InputError("--set, --draw, --again, --trial and --explore cannot be combined.")
+    if stated and (threshold is not None or budget is not None):
+        raise InputError(
+            "--threshold and --budget are for a trial that decides a verdict; --set, --draw, --again, --trial and "
+            "--explore open another one."
+        )
     if because is not None and again is None:
         raise InputError("--because needs --again TRIAL: it states why the task is executed again.")
     if out_folder is not None:
         require_folder(out_folder, TRIAL_FILES, TASK_FORMAT, force=force)
     overrides = {"store": store, "search": search, "seed": seed, "options": named_values(option) or None}
     opened = _opened(target, overrides, experiment, trust, accept_change)
+    limit = limit_of(opened.experiment, opened.settings, threshold)
     if trial is not None:
         found = opened.campaign.reopen(trial)
-    elif until_decided:
-        limit = require_limit(opened.experiment, opened.settings, threshold, "--until-decided")
+    elif limit is not None and not stated and not opened.settings.explores:
         totals = (budget, opened.settings.budget, opened.experiment.budget)
         total, options = next(one for one in totals if one is not None), opened.settings.certificate_options
-        asked = opened.campaign.ask_until_decided(limit, total, certificate=options, wait=_WAIT)
+        asked = opened.campaign.ask_for_verdict(limit, total, certificate=options, wait=_WAIT)
         if asked is None:
             return _decided(opened, limit, as_json)
         found = asked
@@ -301,6 +306,10 @@ def _decided(opened: Opened, limit: float, as_json: bool) -> tuple[dict[str, Any
     verdict = opened.campaign.verdict(limit, certificate=opened.settings.certificate_options)
     if not as_json:
         print_verdict(verdict)
+        if verdict.answer == "undecided":
+            out.say(
+                "the budget is spent: --budget plans more executions, and --explore opens a trial without a verdict."
+            )
     report = {
         "trial": None,
         "executions": opened.campaign.executions,

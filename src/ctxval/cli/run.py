@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from ctxval import plot
-from ctxval._util.texts import reason_of
+from ctxval._util.texts import reason_of, shortened
 from ctxval.campaign.campaign import Campaign
-from ctxval.certificates.verdict import Verdict
+from ctxval.certificates.base import Certificate
+from ctxval.certificates.verdict import Verdict, usable_bound
 from ctxval.cli.base import (
     CANNOT_GO_ON,
     FALSIFIED,
     app,
-    certificate_of,
     command,
     err,
     failures_of,
@@ -45,15 +45,18 @@ from ctxval.cli.options import (
     named_values,
 )
 from ctxval.cli.report import page_path
-from ctxval.cli.trust import AcceptChange, limit_of, require_limit
+from ctxval.cli.trust import AcceptChange, limit_of
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment
 from ctxval.core.trial import designs_sentence
 from ctxval.core.truth import Truth
-from ctxval.errors import InputError
+from ctxval.errors import CertificateError, InputError
 from ctxval.report.context import context_of_campaign
 from ctxval.report.page import write_page
 from ctxval.storage.other_stores import other_stores
+
+RUN = "run"
+"""Key under which a store keeps the verdict of its last run, and the files that were written."""
 
 Target = Annotated[
     str,
@@ -69,21 +72,26 @@ Budget = Annotated[
     ),
 ]
 SearchName = Annotated[str | None, typer.Option(help=f"Search method: {SEARCH_METHODS} (default: auto).")]
-UntilDecided = Annotated[
-    bool,
+Explore = Annotated[
+    bool | None,
     typer.Option(
-        "--until-decided",
-        help="Execute the tasks that decide fastest, and stop as soon as the model is validated or falsified, or when "
-        "the budget is spent. The executions are chosen for the bound from learned dynamics if trajectories teach "
-        "them, and otherwise for the posterior bound of the distance.",
+        "--explore/--decide",
+        help="Spend the whole budget on the tasks of the search, or stop as soon as the verdict is reached (default: "
+        "--decide, and --explore if --search names another search than auto).",
+    ),
+]
+Within = Annotated[
+    float | None,
+    typer.Option(
+        help="Largest share by which the bound may exceed the largest executed distance when a campaign without a "
+        "threshold stops (default: 0.05)."
     ),
 ]
 Audited = Annotated[
     bool,
     typer.Option(
         "--audited",
-        help="Before learned dynamics validate the model, predict and execute eight fresh random tasks. Only with "
-        "--until-decided.",
+        help="Before learned dynamics validate the model, predict and execute eight fresh random tasks.",
     ),
 ]
 Seed = Annotated[
@@ -119,7 +127,8 @@ def run(
     search: SearchName = None,
     threshold: Threshold = None,
     confidence: Confidence = None,
-    until_decided: UntilDecided = False,
+    explore: Explore = None,
+    within: Within = None,
     audited: Audited = False,
     stochastic: Stochastic = None,
     resolution: Resolution = None,
@@ -137,18 +146,20 @@ def run(
     model: ModelName = None,
     dim: Dimension = None,
 ) -> Any:
-    """Search for the task at which the system differs most from its model.
+    """Execute the tasks that decide whether the model can be trusted, and give the verdict.
 
-    If the store exists, the campaign is resumed. Options that are not given have the values in the experiment file.
+    The campaign stops when the threshold lies outside of the interval of the largest distance, or when the budget is
+    spent. If the store exists, the campaign is resumed. Options that are not given have the values in the experiment
+    file.
     """
     options = named_values(option, variant=variant, model=model, dim=dim)
     given = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence, "seed": seed}
-    loop = {"until_decided": until_decided or None, "audited": audited or None}
-    settings = read_settings(target, {**given, **loop, "store": store, "options": options})
+    ending = {"explore": explore, "within": within, "audited": audited or None}
+    settings = read_settings(target, {**given, **ending, "store": store, "options": options})
     settings = settings.certified_as({"stochastic": stochastic, "resolution": resolution})
     experiment = settings.load()
-    if settings.audited and not settings.until_decided:
-        raise InputError("--audited needs --until-decided.")
+    if settings.audited and settings.explores:
+        raise InputError("--audited tests the bound that ends a campaign; an exploration ends with its budget.")
     certificate = settings.certificate_options
     if truth:
         _require_truth(experiment)  # before executions are paid for
@@ -158,23 +169,38 @@ def run(
     total = experiment.budget if settings.budget is None else settings.budget
     if limit is not None:
         certificate.kind.require_usable(certificate.confidence, total)  # before executions are paid for
-    execute: Callable[..., Campaign] = campaign.run
-    if settings.until_decided:
-        wanted = require_limit(experiment, settings, None, "--until-decided")
-        execute = functools.partial(
-            campaign.run_until_decided, wanted, certificate=certificate, audited=settings.audited
-        )
+    if not as_json:
+        _print_parts(experiment, limit)
     with worker_options(workers, dask, timeout) as execution:
-        execute(budget=total, **execution)
+        campaign.run(
+            total,
+            limit,
+            explore=settings.explores,
+            within=settings.within,
+            certificate=certificate,
+            audited=settings.audited,
+            **execution,
+        )
     known = experiment.truth() if truth and experiment.truth is not None else None
     verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
-    report = _report(campaign, experiment, settings, total, path, verdict, known)
-    report["pictures"] = [str(picture) for picture in _save_pictures(campaign, experiment, path, verdict)]
-    if with_report:
-        report["report"] = _save_report(campaign, verdict, total, path)
+    bound = None if verdict is None else verdict.certificate
+    if verdict is None and not settings.explores:
+        with suppress(CertificateError):
+            bound = campaign.certify(certificate=certificate)
+    report = _report(campaign, experiment, settings, total, path, verdict, bound, known)
+    report |= _written(campaign, experiment, verdict, total, path, with_report)
     if not as_json:
-        _print_report(report, verdict)
+        _print_report(report, verdict, bound)
     return report, _status(campaign, verdict)
+
+
+def _print_parts(experiment: Experiment, limit: float | None) -> None:
+    """Print what is compared, before anything is executed."""
+    parts, units = experiment.validation, experiment.units
+    texts = [f"S {type(parts.system).__name__}", f"M {shortened(repr(parts.model), 60)}"]
+    texts.append(f"controllers {type(parts.synthesizer).__name__}")
+    wanted = [] if limit is None else [f"threshold {limit:g} {units}".rstrip()]
+    out.say((experiment.name, "bold"), f": {', '.join([*texts, *wanted])}", wrap=True)
 
 
 def _status(campaign: Campaign, verdict: Verdict | None) -> int:
@@ -200,6 +226,7 @@ def _report(
     budget: int,
     path: Path,
     verdict: Verdict | None,
+    bound: Certificate | None,
     truth: Truth | None,
 ) -> dict[str, Any]:
     report: dict[str, Any] = {
@@ -214,12 +241,14 @@ def _report(
         "controllers": designs_sentence(campaign.trials),
         "worst": worst_of(campaign.worst),
         "estimate": campaign.estimate,
+        "interval": None if campaign.worst is None else [campaign.worst.distance, usable_bound(bound)],
         "units": experiment.units,
         "verdict": None if verdict is None else verdict.answer,
         "reason": None if verdict is None else verdict.reason,
         "rests_on": None if verdict is None else verdict.rests_on,
         "threshold": None if verdict is None else verdict.threshold,
-        **certificate_of(verdict),
+        "certificate": None if bound is None else bound.to_json(),
+        "expected": None if verdict is None or verdict.expected is None else asdict(verdict.expected),
         "store": str(path),
         "other_stores": [str(other) for other in other_stores(path)],
     }
@@ -229,6 +258,24 @@ def _report(
         estimate = campaign.estimate
         report["error_percent"] = None if estimate is None else 100 * (truth.distance - estimate) / truth.distance
     return report
+
+
+def _written(
+    campaign: Campaign, experiment: Experiment, verdict: Verdict | None, budget: int, path: Path, with_report: bool
+) -> dict[str, Any]:
+    """Write the pictures and the report, unless those of a run before are the same; return their paths."""
+    digest, answer = campaign.store.digest(), None if verdict is None else verdict.to_json()
+    match campaign.store.computed(RUN):
+        case {"verdict": said, "budget": spent, "pictures": [*drawn], "report": str(page)} if (said, spent) == (
+            answer,
+            budget,
+        ) and all(Path(str(file)).exists() for file in (*drawn, page)):
+            return {"pictures": drawn, **({"report": page} if with_report else {})}
+    pictures = [str(picture) for picture in _save_pictures(campaign, experiment, path, verdict)]
+    report = _save_report(campaign, verdict, budget, path) if with_report else None
+    kept = {"verdict": answer, "budget": budget, "pictures": pictures, "report": report}
+    campaign.store.keep_computed(RUN, kept, digest)
+    return {"pictures": pictures, **({"report": report} if with_report else {})}
 
 
 def _save_pictures(campaign: Campaign, experiment: Experiment, path: Path, verdict: Verdict | None) -> list[Path]:
@@ -270,24 +317,18 @@ def _true_curve(experiment: Experiment) -> plot.Curve | None:
     return plot.Curve(points[:, 0], experiment.validation.distances(points))
 
 
-def _print_report(report: dict[str, Any], verdict: Verdict | None) -> None:
-    apart = (
-        "controllers",
-        "failures",
-        "verdict",
-        "reason",
-        "rests_on",
-        "threshold",
-        "units",
-        "certificate",
-        "expected",
-        "other_stores",
-    )
-    shown = {key: value for key, value in report.items() if key not in apart}
-    print_table(shown, units=report["units"])
-    if verdict is None and report["controllers"]:  # a verdict says it
+def _print_report(report: dict[str, Any], verdict: Verdict | None, bound: Certificate | None) -> None:
+    if verdict is not None:
+        print_verdict(verdict, report["units"])
+    elif bound is not None:
+        print_table({"certificate": bound.doubt or bound.statement})
+    elif report["controllers"]:  # a verdict says it
         out.say(f"{report['controllers']}.", wrap=True)
     print_failures(report["failures"])
+    executions = f"{report['executions']} of at most {report['budget']}"
+    failed = f", of which {report['failed']} failed" if report["failed"] else ""
+    rows: dict[str, Any] = {"executions": f"{executions}{failed}"}
+    rows |= {name: report[name] for name in ("worst", "truth", "error_percent", "store", "report") if name in report}
+    print_table(rows, units=report["units"])
     if verdict is not None:
-        print_verdict(verdict)
         print_other_stores(report["other_stores"])

@@ -12,6 +12,7 @@ from ctxval._util.files import MADE_BY
 from ctxval.cli.base import app, command, failures_of, out, print_failures, print_table, worst_of
 from ctxval.cli.options import AsJson, StoreArgument
 from ctxval.cli.outputs import Force, require_folder
+from ctxval.cli.run import RUN
 from ctxval.errors import StoreAccessError
 from ctxval.storage.recovery import export, recover
 from ctxval.storage.store import Store
@@ -27,6 +28,7 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
     opened = Store.existing(store)
     with opened.snapshot():
         description, trials, changes = opened.description(), opened.trials(), opened.history()
+        kept = opened.computed(RUN)
     search = description.get("search")
     report: dict[str, Any] = {
         "case": description.get("name"),
@@ -40,6 +42,7 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
         "worst": worst_of(
             max((t for t in trials if t.distance is not None), key=lambda t: t.distance or 0, default=None)
         ),
+        "verdict": _verdict_of(kept),
         "changes": [asdict(change) for change in changes],
         "store": str(store),
     }
@@ -49,6 +52,14 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
             out.say(f"{change['at'][:19]} {change['what']}: {change['why']}")
         print_failures(report["failures"])
     return report
+
+
+def _verdict_of(kept: Any) -> str | None:
+    """Return the verdict of the last run on these trials as a sentence; None if there is none."""
+    match kept:
+        case {"verdict": {"verdict": str(answer), "threshold": float(threshold), "reason": str(reason)}}:
+            return f"{answer} against {threshold:g}: {reason}"
+    return None
 
 
 @app.command("export")

@@ -20,7 +20,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
-from ctxval.campaign.until_decided import UntilDecided
+from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.certificates import CertificateOptions
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.bounds import ERRORS
@@ -138,7 +138,7 @@ class WorstQuestion:
             if self._needs_fact(better, worse, expected):
                 self._execute(worse, *self._raising(worse, *expected[worse.name]))
                 return True
-            rule = UntilDecided(better.recorder, worse.largest, self.options, self.budget)
+            rule = IntervalSearch(better.recorder, self.options, self.budget, worse.largest)
             choice = rule.choose()
             if choice is None and self._certified(better):
                 continue
@@ -199,7 +199,7 @@ class WorstQuestion:
 
     def _execute(self, candidate: Candidate, choice: Choice, predicted: float | None = None) -> None:
         note = TrialNote(self.executions.steps, "worst", predicted=predicted)
-        rule = UntilDecided(candidate.recorder, 1.0, self.options, self.budget)  # predictions need no threshold
+        rule = IntervalSearch(candidate.recorder, self.options, self.budget)
         self.executions.execute(candidate, choice, note, predicts=rule.predicts)
 
     def kept(self) -> tuple[dict[str, Any], ...]:

@@ -14,8 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ctxval.aspect1 import Aspect1Report
 from ctxval.aspect1 import check as check_aspect1
 from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.interval_search import is_decisive
 from ctxval.certificates import CertificateOptions
-from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE
+from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, WITHIN
 from ctxval.config.aspect1_table import Aspect1Table
 from ctxval.config.certificate_table import CertificateTable
 from ctxval.config.experiments import named_experiment
@@ -80,7 +81,7 @@ class Settings(BaseModel):
             experiment.
         longest: the largest horizon that is planned; None for that of the experiment.
         seed: the seed of the data, the model and the search.
-        until_decided, audited: as the options of ``ctxval run``, so that a store knows the command that made it.
+        explore, within, audited: as the options of ``ctxval run``, so that a store knows the command that made it.
         confidence: the confidence level of the certificate.
         certificate: the certificate for the verdict.
         search: the search, and its options.
@@ -110,7 +111,8 @@ class Settings(BaseModel):
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     longest: int | None = Field(default=None, ge=1, strict=True)
-    until_decided: bool = False
+    explore: bool | None = None
+    within: float = Field(default=WITHIN, gt=0, allow_inf_nan=False, strict=True)
     audited: bool = False
     confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
     certificate: CertificateTable = Field(default_factory=CertificateTable)
@@ -214,6 +216,16 @@ class Settings(BaseModel):
     def certificate_options(self) -> CertificateOptions:
         """The kind, the options and the confidence of the certificate for the verdict."""
         return self.certificate.options(self.confidence)
+
+    @property
+    def explores(self) -> bool:
+        """Whether the search alone chooses the tasks, and spends the budget.
+
+        Unless that is stated, it does if a search other than ``auto`` or a certificate that ends no campaign is named.
+        """
+        if self.explore is not None:
+            return self.explore
+        return self.search.name != DEFAULT_SEARCH or not is_decisive(self.certificate_options)
 
     def aspect1_of(self, experiment: Experiment, tasks: int | None, threshold: float | None) -> Aspect1Report:
         """Return whether the model of an experiment completes its tasks; S is never executed."""

@@ -157,7 +157,7 @@ class _Loop:
         left = self.budget - sum(one.executions for one in self.rounds if one.campaign is not campaign)
         if known or getattr(campaign.validation.system, "manual", False) or left < 1:
             return
-        campaign.run_until_decided(self.threshold, left, certificate=options, **self.execution)
+        campaign.run(left, self.threshold, certificate=options, **self.execution)
 
     def _verdict(self, campaign: Campaign, options: CertificateOptions) -> Verdict:
         return campaign.verdict(self.threshold, certificate=options)

@@ -94,7 +94,8 @@ def _search(job: Job) -> Result:
         unit = search.ask(job.budget)
         points = experiment.validation.space.from_unit(unit)
         return {"executions": job.budget, "records": records(experiment.validation.distances(points))}
-    campaign = Campaign(experiment.validation, search=search, seed=job.seed, name=experiment.name).run(job.budget)
+    campaign = Campaign(experiment.validation, search=search, seed=job.seed, name=experiment.name)
+    campaign.run(job.budget, explore=True)
     points = experiment.validation.space.from_unit(np.array([trial.unit_point for trial in campaign.trials]))
     distances = [np.nan if trial.distance is None else trial.distance for trial in campaign.trials]
     return {"points": points.tolist(), "distances": distances}

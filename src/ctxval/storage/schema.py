@@ -22,7 +22,7 @@ from ctxval.errors import ForeignStoreError, StoreAccessError
 APPLICATION = 0x63747876
 """SQLite's application_id of a store, the letters "ctxv"; it marks a file as a store of ctxval."""
 
-VERSION = 7
+VERSION = 8
 """SQLite's user_version of a store; it changes with :data:`TABLES`."""
 
 TABLES = """
@@ -55,6 +55,7 @@ CREATE TABLE settings (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE history (
     number INTEGER PRIMARY KEY, at TEXT NOT NULL, what TEXT NOT NULL, why TEXT NOT NULL, content TEXT NOT NULL
 );
+CREATE TABLE computed (key TEXT PRIMARY KEY, digest TEXT NOT NULL, value TEXT NOT NULL);
 """
 """The statements that make the tables of a store, with which those of a file are compared."""
 

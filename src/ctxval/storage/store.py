@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import os
 from collections.abc import Iterable, Sequence
@@ -19,9 +20,17 @@ from ctxval.storage import rows, schema
 from ctxval.storage.database import Database, now
 from ctxval.storage.rows import COLUMNS, checksum_of, read_trial, real, row_of
 from ctxval.storage.trajectories import Side, StoredTrajectories
+from ctxval.version import VERSION
 
 _DRAWS = "draws"
 """Key in the table experiment that is not part of the description of the experiment."""
+
+_CONTENT = (
+    "SELECT key, value FROM experiment ORDER BY key",
+    "SELECT number, checksum FROM trials ORDER BY number",
+    "SELECT trial, side, checksum FROM trajectories ORDER BY trial, side",
+    "SELECT number, what, why, content FROM history ORDER BY number",
+)
 
 _ENDED = "state = ?, distance = ?, failure = ?, executed = ?, checksum = ?"
 """The assignments that take the values of :func:`_ended`."""
@@ -323,6 +332,31 @@ class Store:
                 "SELECT count(*), coalesce(sum(state = 'open'), 0), (SELECT count(*) FROM history) FROM trials"
             ).fetchone()
         return int(row[0]), int(row[1]), int(row[2])
+
+    def digest(self) -> str:
+        """Return a digest of all that results follow from: trials, trajectories, the experiment, and this version."""
+        found = hashlib.sha256(VERSION.encode())
+        with self._database.snapshot():
+            for query in _CONTENT:
+                with self._database.rows(query) as content:
+                    for row in content:
+                        found.update(repr(row).encode())
+        return found.hexdigest()
+
+    def computed(self, key: str) -> Any:
+        """Return what was computed from the present content and kept under a key; None if nothing was."""
+        query = "SELECT value FROM computed WHERE key = ? AND digest = ?"
+        with self._database.translated_errors():
+            row = self._database.execute(query, (key, self.digest())).fetchone()
+        try:
+            return None if row is None else rows.read_json(row[0], finite=False)
+        except InputError:
+            return None  # it can be computed again
+
+    def keep_computed(self, key: str, value: Any, digest: str) -> None:
+        """Keep what was computed from the content with a digest; later processes need not compute it again."""
+        with self._database.transaction():
+            self._database.execute("INSERT OR REPLACE INTO computed VALUES (?, ?, ?)", (key, digest, json.dumps(value)))
 
     def trajectory(self, number: int, side: Side) -> Trajectory | None:
         """Return a stored trajectory of a trial, whose arrays may be changed. Returns None if there is none.

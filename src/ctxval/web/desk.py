@@ -12,8 +12,8 @@ from typing import TypeVar
 import numpy as np
 
 from ctxval._util.texts import reason_of
+from ctxval.campaign.interval_search import require_decisive
 from ctxval.campaign.telling import ToldResult, tell_result
-from ctxval.campaign.until_decided import require_decisive
 from ctxval.core.labels import labels_of
 from ctxval.core.space import TaskSpace
 from ctxval.core.task import Task

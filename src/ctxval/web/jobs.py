@@ -113,20 +113,20 @@ def _ask(served: ServedCampaign, request: TaskRequest) -> OpenTrial:
                 "one more task, ask again."
             )
         if request.decides:
-            return _ask_until_decided(served)
+            return _ask_for_verdict(served)
         parameters = request.parameters
         if request.again is not None:
             parameters = parameters_of_trial(campaign, request.again)
         return campaign.ask(parameters, draw=request.draw, because=request.because)
 
 
-def _ask_until_decided(served: ServedCampaign) -> OpenTrial:
+def _ask_for_verdict(served: ServedCampaign) -> OpenTrial:
     campaign, threshold = served.campaign, served.threshold
     if threshold is None:
         raise InputError("there is no threshold, so no task decides a verdict: start the server with --threshold.")
     # At a rig people decide when to stop, so the budget is never what ends the campaign.
     budget = len(campaign.trials) + _FURTHER
-    opened = campaign.ask_until_decided(threshold, budget, certificate=served.certificate)
+    opened = campaign.ask_for_verdict(threshold, budget, certificate=served.certificate)
     if opened is None:
         raise InputError(
             f"the verdict against {threshold:g} is reached, so no further execution is needed for it. For more "

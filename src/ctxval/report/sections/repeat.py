@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from ctxval._util.representation import call
 from ctxval.certificates import RESOLUTION
-from ctxval.certificates.options import CONFIDENCE
+from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.trial import Trial
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.markup import code, heading, joined, number, paragraph, table
@@ -112,11 +112,12 @@ def command_of(context: ReportContext) -> str:
         "--threshold": settings.get("threshold"),
         "--confidence": _unless(CONFIDENCE, settings.get("confidence")),
         "--resolution": _unless(RESOLUTION, certificate.get("resolution")),
+        "--within": _unless(WITHIN, settings.get("within")),
     }
     for option, value in given.items():
         words += [option, str(value)] if value is not None else []
     flags = {
-        "--until-decided": settings.get("until_decided"),
+        "--explore": settings.get("explore"),
         "--audited": settings.get("audited"),
         "--stochastic": certificate.get("stochastic"),
     }

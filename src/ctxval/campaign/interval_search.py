@@ -1,8 +1,9 @@
-"""The choices of a campaign that runs until its verdict, by the certificate that is expected to decide first.
+"""What to execute next, or that it is enough: the interval from the largest executed distance to a bound on d*.
 
-If trajectories teach the dynamics, this is the bound from learned dynamics. It needs executions where a draw of the
-dynamics exceeds the threshold, where states and inputs are not covered by records, and where predictions are tested.
-If no dynamics can be learned, or if most predictions fail, it is the posterior bound of the distance.
+Each choice narrows the interval, until a threshold lies outside of it or, without a threshold, until it is narrow. If
+trajectories teach the dynamics, the bound is that from learned dynamics. It needs executions where a draw of the
+dynamics exceeds the limit, where states and inputs are not covered by records, and where predictions are tested. If no
+dynamics can be learned, or if most predictions fail, it is the posterior bound of the distance.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from ctxval.certificates.dynamics_diagnostics import (
     untested,
     untried_parameter,
 )
+from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
-from ctxval.certificates.verdict import counterexample
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
@@ -46,30 +47,39 @@ _EXPLORE = 3
 
 
 @dataclass(frozen=True, eq=False)
-class UntilDecided:
-    """Chooses the next task until the verdict is reached.
+class IntervalSearch:
+    """Chooses the next task until the interval of d* decides.
 
     Attributes:
         recorder: the recorder of the trials.
-        threshold: tau, in the distance's units.
-        options: the certificate of the verdict: ``auto``, ``dynamics``, ``posterior`` or ``anytime``.
+        options: the certificate that bounds d*: ``auto``, ``dynamics``, ``posterior`` or ``anytime``.
         budget: the largest total number of executions.
+        threshold: tau, in the distance's units; None if there is none.
+        within: without a threshold, the share by which the bound may exceed the largest executed distance at the end.
         audited: whether the bound from learned dynamics must also pass a prediction audit.
 
     Raises:
-        InputError: if the threshold is not a positive number, the certificate cannot be used, or an anytime audit may
-            leave out no volume.
+        InputError: if the certificate cannot be used, or an anytime audit may leave out no volume or has no threshold.
     """
 
     recorder: TrialRecorder
-    threshold: float
     options: CertificateOptions
     budget: int
+    threshold: float | None = None
+    within: float = WITHIN
     audited: bool = False
 
     def __post_init__(self) -> None:
         require_decisive(self.options)
+        if self.threshold is None and isinstance(self.options.kind, AnytimeAudit):
+            raise InputError("an anytime audit ends by its threshold; state one, or run another certificate.")
         self.options.kind.require_usable(self.options.confidence, self.budget)
+
+    @property
+    def limit(self) -> float:
+        """The value that the bound must not exceed at the end: the threshold, or a little more than was executed."""
+        largest = largest_distance(self.recorder.trials)
+        return (1 + self.within) * largest if self.threshold is None else self.threshold
 
     @property
     def predicts(self) -> bool:
@@ -81,9 +91,9 @@ class UntilDecided:
         return isinstance(kind, Dynamics)
 
     def choose(self) -> Choice | None:
-        """Return the next task; None if the verdict is reached."""
-        trials = self.recorder.trials
-        if counterexample(trials, self.threshold) is not None:
+        """Return the next task; None if the interval decides."""
+        trials, limit = self.recorder.trials, self.limit
+        if largest_distance(trials) > limit:
             return None
         if isinstance(self.options.kind, AnytimeAudit):
             return self._by_draws(trials, self.options.kind)
@@ -91,9 +101,11 @@ class UntilDecided:
         if evidence is None or self._fails(evidence):
             return self._by_distance(trials)
         if self._may_decide(trials, evidence):
+            digest = self.recorder.store.digest()
             evidence = self.recorder.dynamics.evidence(trials, self.options.confidence)
             if evidence is None:
                 return self._by_distance(trials)
+            self.recorder.dynamics.keep_evidence(evidence, self.options.confidence, digest)
             if self._decides(trials, evidence):
                 return self._audit(evidence) if self.audited else None
         if isinstance(self.options.kind, Automatic) and self.recorder.executions >= _PATIENCE:
@@ -102,7 +114,7 @@ class UntilDecided:
         best = largest_distance(trials)
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
-        point = next_task(evidence, known, best, self.threshold, self.options.confidence, steady)
+        point = next_task(evidence, known, best, limit, self.options.confidence, steady)
         # The results decide when the campaign ends, so the number of independent draws is not planned.
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
@@ -111,17 +123,21 @@ class UntilDecided:
         return self.recorder.validation.space.dimension
 
     def _evidence(self, trials: Sequence[Trial]) -> DynamicsEvidence | None:
-        """Return what a few draws of the learned dynamics say; None if the certificate does not use them."""
+        """Return what the store keeps, or else what a few draws of the learned dynamics say.
+
+        It is None if the certificate does not use them.
+        """
         if not self.predicts or any(trial.state == "failed" for trial in trials):
             return None
-        return self.recorder.dynamics.screening(trials)
+        dynamics = self.recorder.dynamics
+        return dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
 
     def _fails(self, evidence: DynamicsEvidence) -> bool:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
         if isinstance(self.options.kind, Dynamics):
             return False
         last = evidence.predictions[-_FAILING:]
-        bound = min(evidence.upper(self.options.confidence), self.threshold)
+        bound = min(evidence.upper(self.options.confidence), self.limit)
         return len(last) == _FAILING and 2 * sum(held(one, bound) for one in last) < _FAILING
 
     def _may_decide(self, trials: Sequence[Trial], screened: DynamicsEvidence) -> bool:
@@ -130,7 +146,7 @@ class UntilDecided:
             return False
         best = largest_distance(trials)
         bound = bound_of(screened, best, self.options.confidence)
-        return bound <= self.threshold and doubt_of(screened, best, bound) is None
+        return bound <= self.limit and doubt_of(screened, best, bound) is None
 
     def _decides(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> bool:
         ended = [trial for trial in trials if trial.state != "open"]
@@ -138,7 +154,7 @@ class UntilDecided:
             found = certify_dynamics(Sample.of(ended), evidence, self.options.confidence)
         except CertificateError:
             return False
-        return found.covers(self.threshold)
+        return found.covers(self.limit)
 
     def _audit(self, evidence: DynamicsEvidence) -> Choice | None:
         """Return the next fresh task whose prediction is tested; None if there were enough."""
@@ -155,8 +171,8 @@ class UntilDecided:
         """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
         ended = [trial for trial in trials if trial.state != "open"]
         if any(trial.origin == "iid" for trial in ended):
-            found, _ = kind.certify_against(Sample.of(ended), self.threshold, self.options.confidence)
-            if found.covers(self.threshold, self.options.volume):
+            found, _ = kind.certify_against(Sample.of(ended), self.limit, self.options.confidence)
+            if found.covers(self.limit, self.options.volume):
                 return None
         return Choice(self.recorder.draw(), "iid", planned_draws=0)
 
@@ -164,35 +180,43 @@ class UntilDecided:
         kind = self.options.kind
         if isinstance(kind, Dynamics):
             return Choice(planned_draws=0)
+        if not self.limit > 0:
+            return Choice(planned_draws=0)  # no distance is known, or all are 0
         posterior = kind.posterior if isinstance(kind, Automatic) else kind
-        rule = StoppingRule(self.threshold, replace(self.options, kind=posterior))
+        rule = StoppingRule(self.limit, replace(self.options, kind=posterior))
         now = rule.decide(trials, self.budget - self.recorder.executions)
         return None if now.decided else Choice(now.next_point, "covering", planned_draws=0)
 
 
+def is_decisive(options: CertificateOptions) -> bool:
+    """Return whether executions can be chosen for a certificate."""
+    return isinstance(options.kind, Automatic | Dynamics | Posterior | AnytimeAudit)
+
+
 def require_decisive(options: CertificateOptions) -> None:
-    """Check that executions can be chosen for a certificate."""
+    """Refuse a certificate for which no executions can be chosen."""
     kind = options.kind
-    if not isinstance(kind, Automatic | Dynamics | Posterior | AnytimeAudit):
+    if not is_decisive(options):
         raise InputError(
-            f"--until-decided needs one of the certificates auto, dynamics, posterior and anytime, got {kind.name!r}."
+            "executions are chosen for one of the certificates auto, dynamics, posterior and anytime, got "
+            f"{kind.name!r}; --explore (explore=True in Python) executes the tasks of the search."
         )
     if isinstance(kind, AnytimeAudit) and not options.volume:
-        raise InputError("--until-decided with an anytime audit needs the volume that may exceed the threshold.")
+        raise InputError("a verdict by an anytime audit needs the volume that may exceed the threshold.")
 
 
 def next_task(
     evidence: DynamicsEvidence,
     known: Array,
     best: float,
-    threshold: float,
+    limit: float,
     confidence: float,
     steady: Callable[[Array], bool] = lambda point: True,
 ) -> Array | None:
     """Return the task to execute next, a point ``(d,)``; None if the search is to choose it.
 
-    These come first: a task whose predicted distance exceeds the threshold; the task of the draw that sets the bound,
-    while the bound exceeds the threshold; the task that leads farthest from the records, while they leave gaps; and
+    These come first: a task whose predicted distance exceeds the limit; the task of the draw that sets the bound,
+    while the bound exceeds the limit; the task that leads farthest from the records, while they leave gaps; and
     the task with the largest predicted distance, while no similar distance was executed or a deeper search found it.
     Further tasks test the predictions.
 
@@ -200,7 +224,7 @@ def next_task(
         evidence: what the learned dynamics say.
         known: executed and open tasks, points ``(n, d)``.
         best: the largest executed distance.
-        threshold: tau, in the distance's units.
+        limit: what the bound must not exceed, in the distance's units.
         confidence: the probability with which the bound holds.
         steady: whether a task may be executed, because its distance is that of its neighbours.
     """
@@ -208,18 +232,18 @@ def next_task(
     rank = evidence.rank(confidence)
     highest = evidence.points[[*order[rank::-1], *order[:rank:-1]]]
     farthest, largest = evidence.coverage.task[None], evidence.elites
-    exceeds = evidence.upper(confidence) > threshold
+    exceeds = evidence.upper(confidence) > limit
     if exceeds and len(known) % _EXPLORE == _EXPLORE - 1:
         candidates = [farthest, highest]
-    elif evidence.highest > threshold:
+    elif evidence.highest > limit:
         candidates = [largest, highest, farthest]
     elif exceeds:
         candidates = [highest, farthest]
-    elif uncovered(evidence, best, threshold) is not None:
+    elif uncovered(evidence, best, limit) is not None:
         candidates = [farthest, highest, largest]
-        if evidence.untried is not None and untried_parameter(evidence, best, threshold) is not None:
+        if evidence.untried is not None and untried_parameter(evidence, best, limit) is not None:
             candidates = [evidence.untried.task[None], *candidates]
-    elif evidence.missed > 1 or untested(evidence, best, threshold) is not None:
+    elif evidence.missed > 1 or untested(evidence, best, limit) is not None:
         candidates = [largest, highest, farthest]
     else:
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]

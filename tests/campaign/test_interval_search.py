@@ -11,7 +11,7 @@ import pytest
 from conftest import interrupt_at_once, make_validation, make_validation_without_inputs
 from ctxval import Campaign, cases
 from ctxval.campaign.dynamics import AUDIT, PREDICTION
-from ctxval.campaign.until_decided import next_task
+from ctxval.campaign.interval_search import next_task
 from ctxval.certificates import (
     AnytimeAudit,
     Audit,
@@ -41,7 +41,7 @@ def linear(dim: int = 1, seed: int = 0):  # type: ignore[no-untyped-def]
 @pytest.mark.slow
 def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true() -> None:
     validation, largest = linear(2)
-    campaign = Campaign(validation).run_until_decided(1.1 * largest, 12)
+    campaign = Campaign(validation).run(12, 1.1 * largest)
     verdict = campaign.verdict(1.1 * largest)
     assert verdict.answer == "validated"
     assert "by a prior on the dynamics" in verdict.reason
@@ -53,7 +53,7 @@ def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true(
 @pytest.mark.slow
 def test_a_threshold_below_the_maximum_is_falsified() -> None:
     validation, largest = linear(2)
-    campaign = Campaign(validation).run_until_decided(0.95 * largest, 12)
+    campaign = Campaign(validation).run(12, 0.95 * largest)
     assert campaign.verdict(0.95 * largest).answer == "falsified"
     assert campaign.executions <= 6
 
@@ -63,7 +63,7 @@ def test_a_threshold_below_the_maximum_is_falsified() -> None:
 def test_a_system_without_inputs_is_validated(batched: bool) -> None:
     validation = make_validation_without_inputs(batched)
     campaign = Campaign(validation)
-    verdict = campaign.run_until_decided(1.0, 6).verdict(1.0)
+    verdict = campaign.run(6, 1.0).verdict(1.0)
     assert verdict.answer == "validated"
     assert verdict.certificate is not None
     assert verdict.certificate.kind == "dynamics"
@@ -74,12 +74,12 @@ def test_a_system_without_inputs_is_validated(batched: bool) -> None:
 @pytest.mark.slow
 def test_it_resumes_with_the_same_choices_and_the_same_predictions(tmp_path: Path) -> None:
     validation, largest = linear()
-    whole = Campaign(validation, seed=3).run_until_decided(1.1 * largest, 12)
+    whole = Campaign(validation, seed=3).run(12, 1.1 * largest)
     store = tmp_path / "a.sqlite"
     for _ in range(20):
         pieces = Campaign(linear()[0], seed=3, store=store)
         try:
-            pieces.run_until_decided(1.1 * largest, 12, on_trial=lambda trial: interrupt_at_once())
+            pieces.run(12, 1.1 * largest, on_trial=lambda trial: interrupt_at_once())
         except KeyboardInterrupt:
             continue
         break
@@ -90,7 +90,7 @@ def test_it_resumes_with_the_same_choices_and_the_same_predictions(tmp_path: Pat
 @pytest.mark.slow
 def test_predictions_are_stored_before_executions_and_equal_those_computed_afterwards() -> None:
     validation, largest = linear()
-    campaign = Campaign(validation, seed=1).run_until_decided(1.1 * largest, 12)
+    campaign = Campaign(validation, seed=1).run(12, 1.1 * largest)
     dynamics = campaign._recorder.dynamics
     stored = dynamics.evidence(campaign.trials, 0.95)
     without = [replace(trial, note=None) for trial in campaign.trials]
@@ -117,17 +117,17 @@ def test_a_plain_run_is_certified_by_predictions_that_are_computed_afterwards() 
 def test_an_audit_of_a_planned_number_cannot_end_it() -> None:
     validation, _ = linear()
     with pytest.raises(InputError, match="auto, dynamics, posterior and anytime, got 'audit'"):
-        Campaign(validation).run_until_decided(1.0, 5, certificate=CertificateOptions(Audit(), volume=0.1))
+        Campaign(validation).run(5, 1.0, certificate=CertificateOptions(Audit(), volume=0.1))
     with pytest.raises(InputError, match="needs the volume"):
-        Campaign(validation).run_until_decided(1.0, 5, certificate=CertificateOptions(AnytimeAudit()))
+        Campaign(validation).run(5, 1.0, certificate=CertificateOptions(AnytimeAudit()))
 
 
 def test_an_anytime_audit_ends_as_soon_as_its_volume_is_small_enough() -> None:
     validation, largest = linear()
     options = CertificateOptions(AnytimeAudit(), volume=0.2)
-    campaign = Campaign(validation).run_until_decided(1.1 * largest, 60, certificate=options)
+    campaign = Campaign(validation).run(60, 1.1 * largest, certificate=options)
     assert campaign.verdict(1.1 * largest, certificate=options).answer == "validated"
-    fewer = Campaign(validation).run_until_decided(1.1 * largest, campaign.executions - 1, certificate=options)
+    fewer = Campaign(validation).run(campaign.executions - 1, 1.1 * largest, certificate=options)
     assert fewer.verdict(1.1 * largest, certificate=options).answer == "undecided"
     assert 14 <= campaign.executions <= 30
     assert {trial.origin for trial in campaign.trials} == {"iid"}
@@ -136,8 +136,8 @@ def test_an_anytime_audit_ends_as_soon_as_its_volume_is_small_enough() -> None:
 @pytest.mark.slow
 def test_a_prediction_audit_executes_eight_fresh_tasks() -> None:
     validation, largest = linear()
-    plain = Campaign(validation, seed=2).run_until_decided(1.1 * largest, 12)
-    audited = Campaign(validation, seed=2).run_until_decided(1.1 * largest, 30, audited=True)
+    plain = Campaign(validation, seed=2).run(12, 1.1 * largest)
+    audited = Campaign(validation, seed=2).run(30, 1.1 * largest, audited=True)
     assert audited.executions == plain.executions + AUDITED
     assert sum(AUDIT in (trial.note or {}) for trial in audited.trials) == AUDITED
     verdict = audited.verdict(1.1 * largest)
@@ -150,7 +150,7 @@ def test_a_prediction_audit_executes_eight_fresh_tasks() -> None:
 @pytest.mark.usefixtures("few_draws")
 def test_the_posterior_bound_predicts_nothing() -> None:
     campaign = Campaign(make_validation(), seed=1)
-    campaign.run_until_decided(1e3, 20, certificate=CertificateOptions(Posterior()))
+    campaign.run(20, 1e3, certificate=CertificateOptions(Posterior()))
     assert campaign.verdict(1e3).answer == "validated"
     assert not any(PREDICTION in (trial.note or {}) for trial in campaign.trials)
 
@@ -210,4 +210,4 @@ def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: fl
 
 def test_a_threshold_must_be_positive() -> None:
     with pytest.raises(InputError, match="threshold"):
-        Campaign(linear()[0]).run_until_decided(-1.0, 5)
+        Campaign(linear()[0]).run(5, -1.0)
