@@ -11,7 +11,7 @@ export OMP_NUM_THREADS = 1
 .PHONY: demo test quick check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate parts pictures posterior-ranks clean
 
 demo: .venv/.installed
-	$(BIN)/ctxval run pendulum --until-decided
+	$(BIN)/ctxval run pendulum
 
 test: check
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal

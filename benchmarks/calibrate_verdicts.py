@@ -1,7 +1,7 @@
 """How often is `validated` false, and what does a verdict cost? Campaigns that run until they are decided.
 
 ``python benchmarks/calibrate_verdicts.py`` runs what is not stored yet. Each campaign is given a threshold of a known
-share of d*: 0.95, which must not be validated, or 1.1, which should be, and runs as ``--until-decided`` does. Stored
+share of d*: 0.95, which must not be validated, or 1.1, which should be, and runs as ``ctxval run`` does. Stored
 lines with ``rule`` 1 are from before corners were asked for and bounds were put to the test.
 """
 

@@ -21,7 +21,7 @@ from study_time_varying import rows as time_varying_rows
 
 TEXT = """## Verdicts by learned dynamics
 
-These campaigns run as `--until-decided` does with the certificate `dynamics`, and at most {budget} executions. The
+These campaigns run as `ctxval run` does with the certificate `dynamics`, and at most {budget} executions. The
 thresholds of the certificate were chosen on the development systems: a prediction holds within {accurate:.0%} of the
 bound, the last {predictions} predictions must hold, the largest gap of the records is {gap:.0%}, and the largest excess
 over the records is {beyond:.0%}. The reporting systems (`benchmarks/dynamics_reporting.py`) were written down before

@@ -31,7 +31,7 @@ dimension, such a gap is a quarter of the range. Tests find those peaks and jump
 
 TEXT = """## Verdicts of campaigns that run until decided
 
-These campaigns run as `--until-decided` does. Before anything is validated, they execute the corners and the tasks that
+These campaigns run as `ctxval run` does. Before anything is validated, they execute the corners and the tasks that
 are far from all trials, and they test the bound twice. The budget is at most {budgets}. One threshold is below d*, so
 `validated` is false. The other threshold is above d*, so nothing can be falsified.
 

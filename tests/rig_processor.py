@@ -21,5 +21,5 @@ def kernels() -> str:
 if __name__ == "__main__":
     store, search, budget = sys.argv[1:]
     campaign = Campaign(make_validation(), search=searches.by_name(search), store=store, seed=1, name="processors")
-    campaign.run(int(budget))
+    campaign.run(int(budget), explore=True)
     print(kernels())

@@ -59,7 +59,7 @@ def test_the_trajectories_are_those_of_the_worst_task(campaign: Campaign) -> Non
 
 
 def test_more_dimensions_are_shown_as_slices() -> None:
-    figure = plot.surrogate(Campaign(make_plane()).run(8))
+    figure = plot.surrogate(Campaign(make_plane()).run(8, explore=True))
     assert [axes.get_xlabel() for axes in figure.axes] == ["x [m]", "y [m]"]
 
 
@@ -106,7 +106,7 @@ def test_one_slice_of_the_surrogate_is_drawn_into_given_axes(campaign: Campaign,
 
 
 def test_the_convergence_shows_each_distance_the_largest_so_far_and_what_failed(ax: Axes) -> None:
-    campaign = Campaign(make_plane(), seed=1).run(7)
+    campaign = Campaign(make_plane(), seed=1).run(7, explore=True)
     assert plot.convergence(campaign, units="m", ax=ax) is ax
     lines = {line.get_label(): line for line in ax.lines}
     so_far = lines["largest so far"].get_ydata()

@@ -94,7 +94,7 @@ def no_execution(controller: Any, task: Task) -> Any:
 
 @functools.cache
 def campaign() -> Campaign:
-    return Campaign(make_validation(), seed=1, name="pendulum").run(7)
+    return Campaign(make_validation(), seed=1, name="pendulum").run(7, explore=True)
 
 
 @functools.cache

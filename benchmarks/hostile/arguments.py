@@ -21,7 +21,7 @@ _COMMANDS: dict[str, tuple[str, ...]] = {
         "--model",
         "--dim",
         "--stochastic",
-        "--until-decided",
+        "--explore",
         "--truth",
         "--json",
     ),
@@ -70,7 +70,7 @@ _COMMANDS: dict[str, tuple[str, ...]] = {
     "cases": ("--json",),
     "reproduce": ("--quick", "--out"),
 }
-_FLAGS = ("--stochastic", "--until-decided", "--truth", "--json", "--draw", "--resample", "--quick")
+_FLAGS = ("--stochastic", "--explore", "--truth", "--json", "--draw", "--resample", "--quick")
 _PLACES = (
     "a.sqlite",
     FILE,

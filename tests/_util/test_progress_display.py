@@ -36,8 +36,8 @@ def test_a_log_has_a_line_for_each_note() -> None:
     log = console(terminal=False)
     executions(["trial 0 has distance 1", "trial 1 failed: \x1b[2Jbad\nexecutions: 3/3"], log)
     assert text(log).splitlines() == [
-        "executions: 1/3, trial 0 has distance 1",
-        r"executions: 2/3, trial 1 failed: \x1b[2Jbad executions: 3/3",
+        "trial 0 has distance 1",
+        r"trial 1 failed: \x1b[2Jbad executions: 3/3",
     ]
 
 
@@ -53,16 +53,22 @@ def test_a_log_says_that_long_work_goes_on(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(lines) == 2
 
 
-def test_a_screen_keeps_the_last_result_and_forgets_other_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_screen_keeps_all_notes_and_forgets_the_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress_display, "_DELAY", 0.0)
     screen = console(terminal=True)
     with progress_shown(True, screen), stage("executions", 3):
         with stage("choosing a task", 10, "designs"):
             advance(4)
         advance(1, "trial 0 has distance 1")
-    last = text(screen).rstrip().splitlines()[-1]
-    assert "executions" in last
-    assert "1/3  trial 0 has distance 1" in last
+        advance(1, "trial 1 has distance 2")
+    shown = text(screen)
+    assert [line.strip() for line in shown.splitlines() if "distance" in line] == [
+        "trial 0 has distance 1",
+        "trial 1 has distance 2",
+    ]
+    assert isinstance(screen.file, io.StringIO)
+    erased = screen.file.getvalue().rpartition("executions")[2]
+    assert "\x1b[2K" in erased
 
 
 def test_a_short_stage_is_not_shown() -> None:

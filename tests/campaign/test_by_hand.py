@@ -183,12 +183,12 @@ def test_asking_by_command_chooses_what_a_campaign_chooses(invoke: Any) -> None:
         (["a.sqlite", "--set", "goal=one"], "goal must be a number, got 'one'"),
         (
             ["a.sqlite", "--set", "goal=1", "--draw"],
-            "--set, --draw, --again, --trial and --until-decided cannot be combined",
+            "--set, --draw, --again, --trial and --explore cannot be combined",
         ),
-        (["a.sqlite", "--until-decided", "--draw"], "--trial and --until-decided cannot be combined"),
-        (["a.sqlite", "--threshold", "1"], "--threshold and --budget need --until-decided"),
-        (["a.sqlite", "--until-decided", "--threshold", "nan"], "threshold must be a positive number"),
-        (["a.sqlite", "--until-decided", "--budget", "0"], "budget must be a positive integer"),
+        (["a.sqlite", "--explore", "--draw"], "--trial and --explore cannot be combined"),
+        (["a.sqlite", "--draw", "--threshold", "1"], "are for a trial that decides a verdict"),
+        (["a.sqlite", "--threshold", "nan"], "threshold must be a positive number"),
+        (["a.sqlite", "--budget", "0"], "budget must be a positive integer"),
         (["a.sqlite", "--trial", "9"], "there is no trial 9"),
         (["a.sqlite", "--seed", "3"], "is a store and keeps its own settings"),
         (["none.sqlite"], "there is no store at none.sqlite; `ctxval ask FILE.toml --store none.sqlite` creates one"),
@@ -609,7 +609,7 @@ def test_the_search_knows_what_was_imported(invoke: Any) -> None:
     new(invoke)
     Path("runs.csv").write_text("goal,distance\n" + "".join(f"{g},{0.1 * g}\n" for g in (0.6, 0.9, 1.2, 1.5, 1.8)))
     assert invoke("import", "a.sqlite", "runs.csv").exit_code == 0
-    assert asked(invoke, "a.sqlite")["origin"] == "acquisition"
+    assert asked(invoke, "a.sqlite", "--explore")["origin"] == "acquisition"
     assert plain[0] == Store("a.sqlite").trials()[0].parameters
 
 
@@ -739,25 +739,25 @@ def test_logs_of_earlier_runs_are_imported(invoke: Any) -> None:
     assert json.loads(result.stdout)["imported"][0]["distance"] == pytest.approx(0, abs=1e-12)
 
 
-def test_asking_until_decided_ends_with_the_verdict(invoke: Any) -> None:
-    first = asked(invoke, "my_rig:experiment", "--store", "a.sqlite", "--until-decided")
+def test_asking_ends_with_the_verdict(invoke: Any) -> None:
+    first = asked(invoke, "my_rig:experiment", "--store", "a.sqlite")
     assert first["trial"] == 0
     record(first["folder"])
     told = invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv", "--json")
     assert told.exit_code == 0, told.stderr
-    second = asked(invoke, "a.sqlite", "--until-decided", "--budget", "9")
+    second = asked(invoke, "a.sqlite", "--budget", "9")
     assert second["trial"] == 1
     assert invoke("tell", "a.sqlite", "1", "--distance", "2.5").exit_code == 0
-    ended = invoke("ask", "a.sqlite", "--until-decided", "--json")
+    ended = invoke("ask", "a.sqlite", "--json")
     report = json.loads(ended.stdout)
     assert (ended.exit_code, report["trial"], report["verdict"]) == (1, None, "falsified")
-    shown = invoke("ask", "a.sqlite", "--until-decided", "--threshold", "2")
-    assert "falsified against 2: trial 1 was executed and its distance 2.5 exceeds 2" in " ".join(shown.stdout.split())
+    shown = invoke("ask", "a.sqlite", "--threshold", "2")
+    assert "FALSIFIED against 2: trial 1 was executed and its distance 2.5 exceeds 2" in " ".join(shown.stdout.split())
     assert len(Store("a.sqlite").trials()) == 2
 
 
 def test_a_budget_that_is_spent_opens_no_trial(invoke: Any) -> None:
-    asked(invoke, "my_rig:experiment", "--store", "a.sqlite", "--until-decided", "--budget", "1")
+    asked(invoke, "my_rig:experiment", "--store", "a.sqlite", "--budget", "1")
     assert invoke("tell", "a.sqlite", "0", "--distance", "0.5").exit_code == 0
-    ended = invoke("ask", "a.sqlite", "--until-decided", "--budget", "1", "--json")
+    ended = invoke("ask", "a.sqlite", "--budget", "1", "--json")
     assert (ended.exit_code, json.loads(ended.stdout)["verdict"]) == (0, "undecided")

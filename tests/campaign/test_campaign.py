@@ -75,9 +75,9 @@ def test_running_in_pieces_equals_running_at_once(validation: Validation, tmp_pa
 
 @pytest.mark.slow
 def test_the_budget_is_a_total(validation: Validation) -> None:
-    campaign = Campaign(validation).run(5)
-    assert len(campaign.run(5).trials) == 5
-    assert len(campaign.run(3).trials) == 5
+    campaign = Campaign(validation).run(5, explore=True)
+    assert len(campaign.run(5, explore=True).trials) == 5
+    assert len(campaign.run(3, explore=True).trials) == 5
 
 
 @pytest.mark.parametrize("draw", [lambda c: c.run(5), lambda c: c.audit(5)])
@@ -187,7 +187,7 @@ def test_a_trial_can_be_told_later_by_its_number(validation: Validation, tmp_pat
 def test_running_leaves_trials_that_were_asked_by_hand_open(validation: Validation) -> None:
     campaign = Campaign(validation)
     opened = campaign.ask()
-    campaign.run(4)
+    campaign.run(4, explore=True)
     assert campaign.trials[0].state == "open"
     assert campaign.executions == 4
     campaign.tell(opened, failed="the battery was empty")
@@ -573,7 +573,7 @@ def test_a_resumed_random_search_keeps_its_plan(validation: Validation, tmp_path
 
 @pytest.mark.slow
 def test_options_beside_a_certificate_are_refused() -> None:
-    campaign = Campaign(make_validation(), seed=1).run(3)
+    campaign = Campaign(make_validation(), seed=1).run(3, explore=True)
     by = CertificateOptions(confidence=0.9)
     for options in ({"confidence": 0.99}, {"stochastic": True}, {"resolution": 0.5}):
         with pytest.raises(InputError, match="options of certificate=; state them there"):

@@ -75,13 +75,15 @@ def test_an_interrupted_execution_and_failures_change_nothing_that_is_chosen(tmp
 
     whole = Campaign(
         make_validation(system=Rig(make_validation().system, {2: "raise"})), search=searches.Auto("thorough")
-    ).run(6)
+    ).run(6, explore=True)
     rig = Rig(make_validation().system, {2: "raise"})
     rig.interrupt = True
     with pytest.raises(KeyboardInterrupt):
-        Campaign(make_validation(system=rig), search=searches.Auto("thorough"), store=tmp_path / "a.sqlite").run(6)
+        Campaign(make_validation(system=rig), search=searches.Auto("thorough"), store=tmp_path / "a.sqlite").run(
+            6, explore=True
+        )
     resumed = Campaign(make_validation(system=rig), search=searches.Auto("thorough"), store=tmp_path / "a.sqlite").run(
-        6
+        6, explore=True
     )
     assert facts(resumed) == facts(whole)
     assert [t.attempts for t in resumed.trials] == [1] * 4 + [2] + [1]

@@ -107,7 +107,7 @@ def test_predictions_are_stored_before_executions_and_equal_those_computed_after
 @pytest.mark.slow
 def test_a_plain_run_is_certified_by_predictions_that_are_computed_afterwards() -> None:
     validation, largest = linear()
-    campaign = Campaign(validation).run(5)
+    campaign = Campaign(validation).run(5, explore=True)
     verdict = campaign.verdict(1.2 * largest, certificate=CertificateOptions(Dynamics()))
     assert verdict.certificate is not None
     assert verdict.certificate.details["predictions"]["stored_beforehand"] == 0

@@ -74,7 +74,7 @@ def test_a_campaign_keeps_its_number_of_designs_when_it_is_resumed(tmp_path: Pat
         return Campaign(validation(design, 0.0), seed=1, store=tmp_path / "a.sqlite", accept_change=reason)
 
     campaign(0.02).run(2).store.close()
-    assert designs_of(campaign(0.0, "the same design, computed faster").run(4)) == [22]
+    assert designs_of(campaign(0.0, "the same design, computed faster").run(4, explore=True)) == [22]
 
 
 @pytest.mark.slow
@@ -110,6 +110,6 @@ def test_people_cost_more_than_all_thinking_and_untimed_executions_cost_nothing_
 
 @pytest.mark.slow
 def test_a_number_of_designs_makes_the_same_choices_each_time() -> None:
-    campaigns = [Campaign(make_validation(), search=searches.Auto(60), seed=4).run(3) for _ in range(2)]
+    campaigns = [Campaign(make_validation(), search=searches.Auto(60), seed=4).run(3, explore=True) for _ in range(2)]
     points = [[trial.unit_point for trial in campaign.trials] for campaign in campaigns]
     np.testing.assert_array_equal(*points)

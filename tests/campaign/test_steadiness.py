@@ -73,7 +73,7 @@ def test_a_task_is_steady_if_its_neighbours_are_like_it(predicted: bool) -> None
 
 @pytest.mark.parametrize("search", [searches.GPUCB(), searches.CMAES(), searches.Auto("fast")])
 def test_the_tasks_of_a_search_are_steady(search: searches.Search) -> None:
-    campaign = Campaign(accidental(), search=search, seed=2).run(6)
+    campaign = Campaign(accidental(), search=search, seed=2).run(6, explore=True)
     steady = Steadiness(LoopPlanner(campaign.validation))
     rejected = [(trial.note or {}).get(UNSTEADY, 0) for trial in campaign.trials]
     assert sum(rejected) > 0 or isinstance(search, searches.Auto)  # which executes bounds here
@@ -90,9 +90,10 @@ def test_a_resumed_campaign_chooses_the_same_tasks(search: searches.Search, tmp_
     def tasks(campaign: Campaign) -> list[Any]:
         return [(trial.parameters, trial.unit_point.tolist(), trial.note) for trial in campaign.trials]
 
-    whole = Campaign(accidental(0.2), search=search, seed=1).run(6)
+    whole = Campaign(accidental(0.2), search=search, seed=1).run(6, explore=True)
     for budget in range(1, 7):
-        campaign = Campaign(accidental(0.2), search=search, store=tmp_path / "a.sqlite", seed=1).run(budget)
+        campaign = Campaign(accidental(0.2), search=search, store=tmp_path / "a.sqlite", seed=1)
+        campaign.run(budget, explore=True)
         campaign.store.close()
     assert tasks(campaign) == tasks(whole)
 

@@ -90,7 +90,7 @@ def test_every_text_says_that_a_volume_is_a_probability_under_it(kind: Certifica
 
 @pytest.mark.slow
 def test_the_expected_distance_is_that_under_it() -> None:
-    campaign = Campaign(narrow(), search=searches.Auto(), seed=2).run(6).audit(40)
+    campaign = Campaign(narrow(), search=searches.Auto(), seed=2).run(6, explore=True).audit(40)
     found = campaign.verdict(1e3, certificate=CertificateOptions(Mean())).certificate
     assert found is not None
     assert found.to_json()["distribution"].startswith("goal normal")
@@ -103,7 +103,7 @@ def test_the_expected_distance_is_that_under_it() -> None:
 
 @pytest.mark.slow
 def test_predicted_tasks_follow_it_too() -> None:
-    campaign = Campaign(narrow(), search=searches.Auto(), seed=2).run(6).audit(30)
+    campaign = Campaign(narrow(), search=searches.Auto(), seed=2).run(6, explore=True).audit(30)
     learned = campaign.provenance.learned
     assert learned is not None
     tasks = campaign.validation.space.from_unit(learned.tasks(2000, 6))[:, 0]

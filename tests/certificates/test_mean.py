@@ -98,7 +98,7 @@ def test_what_cannot_be_certified_says_why() -> None:
 
 @pytest.mark.slow
 def test_on_a_campaign_the_prediction_leaves_little_of_the_variance() -> None:
-    campaign = Campaign(make_validation(), search=searches.Auto(), seed=5).run(6).audit(40)
+    campaign = Campaign(make_validation(), search=searches.Auto(), seed=5).run(6, explore=True).audit(40)
     verdict = campaign.verdict(1e3, certificate=CertificateOptions(Mean()))
     assert verdict.answer == "undecided"
     assert verdict.certificate is not None

@@ -71,7 +71,7 @@ def test_an_audit_for_a_region_is_drawn_and_certified_in_one_command(searched: P
 def test_a_region_speaks_to_a_person_and_executes_nothing(store: str) -> None:
     before = Store.existing(Path(store)).trials()
     text = " ".join(invoke("certify", store, "--kind", "region", "--threshold", "0.38").stdout.split())
-    assert "undecided against 0.38: the region bound of 30 trials leaves out" in text
+    assert "UNDECIDED against 0.38: the region bound of 30 trials leaves out" in text
     assert "because of the number of draws, and the rest because the prediction plus its margin exceeds" in text
     assert "region: With confidence 0.95, the distance exceeds the predicted one by at most" in text
     assert "of the task space (an estimate from 1000 predicted tasks), so that the distance exceeds 0.38 on at" in text
@@ -106,7 +106,7 @@ def test_the_mean_and_its_quantile(store: str) -> None:
     assert report["details"]["quantile_low"] < report["details"]["quantile_high"]
     assert report["volume"] == 1
     text = " ".join(invoke("certify", store, "--kind", "mean", "--threshold", "9").stdout.split())
-    assert "undecided against 9: the mean certificate is about the expected distance" in text
+    assert "UNDECIDED against 9: the mean certificate is about the expected distance" in text
     assert "as far as a normal approximation for 30 draws holds, the expected distance of a task" in text
 
 

@@ -57,8 +57,8 @@ def store(invoke: Any) -> Path:
 @pytest.mark.parametrize(
     "options",
     [
-        ["--until-decided", "--threshold", "5", "--confidence", "0.9"],
-        ["--until-decided", "--audited", "--budget", "3"],
+        ["--decide", "--threshold", "5", "--confidence", "0.9"],
+        ["--decide", "--audited", "--budget", "3"],
         ["--resolution", "1", "--budget", "3", "--stochastic"],
     ],
     ids=" ".join,

@@ -61,14 +61,14 @@ def sentence(result: Result) -> str:
 
 @pytest.mark.slow
 def test_the_file_of_init_reaches_a_verdict_as_it_is(invoke: Any) -> None:
-    result = invoke("run", "experiment.toml", "--until-decided", "--json")
+    result = invoke("run", "experiment.toml", "--json")
     assert result.exit_code == 0, result.stderr
     report = json.loads(result.stdout)
     assert (report["case"], report["search"], report["units"]) == ("cart", "auto", "m")
     assert report["verdict"] == "validated"
     assert 4 <= report["executions"] < 40
     assert report["worst"]["distance"] > 0.01
-    again = json.loads(invoke("run", "experiment.toml", "--until-decided", "--json").stdout)
+    again = json.loads(invoke("run", "experiment.toml", "--json").stdout)
     assert again == report
 
 
@@ -193,7 +193,7 @@ def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: An
     assert (run["verdict"], run["certificate"]["kind"]) == ("validated", "scenario")
     certified = json.loads(invoke("certify", run["store"], "--threshold", "0.5", "--json").stdout)
     assert (certified["kind"], certified["verdict"]) == ("scenario", "validated")
-    assert "needs one of the certificates" in sentence(invoke("run", target, "--until-decided"))
+    assert "needs one of the certificates" in sentence(invoke("run", target, "--decide"))
     adaptive = changed(scenario, ('name = "auto"', 'name = "gp-ucb"'))
     refused = json.loads(invoke("run", adaptive, "--store", "b.sqlite", "--json").stdout)
     assert refused["verdict"] == "undecided"

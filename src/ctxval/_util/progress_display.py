@@ -92,7 +92,7 @@ class OnScreen:
         """Show a report."""
         bars = self._bars = self._bars or self._started()
         if progress.note:
-            bars.console.print(_in_one_line(progress.note), soft_wrap=True)
+            bars.console.print(_in_one_line(progress.note), soft_wrap=True, markup=False, highlight=False)
         if progress.depth not in self._rows:
             self._rows[progress.depth] = bars.add_task(progress.stage, text="")
         row = self._rows[progress.depth]

@@ -198,7 +198,7 @@ def require_decisive(options: CertificateOptions) -> None:
     kind = options.kind
     if not is_decisive(options):
         raise InputError(
-            "executions are chosen for one of the certificates auto, dynamics, posterior and anytime, got "
+            "a campaign that decides needs one of the certificates auto, dynamics, posterior and anytime, got "
             f"{kind.name!r}; --explore (explore=True in Python) executes the tasks of the search."
         )
     if isinstance(kind, AnytimeAudit) and not options.volume:

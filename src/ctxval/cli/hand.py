@@ -135,7 +135,7 @@ def ask(
     limit = limit_of(opened.experiment, opened.settings, threshold)
     if trial is not None:
         found = opened.campaign.reopen(trial)
-    elif limit is not None and not stated and not opened.settings.explores:
+    elif limit is not None and not stated and (threshold is not None or not opened.settings.explores):
         totals = (budget, opened.settings.budget, opened.experiment.budget)
         total, options = next(one for one in totals if one is not None), opened.settings.certificate_options
         asked = opened.campaign.ask_for_verdict(limit, total, certificate=options, wait=_WAIT)

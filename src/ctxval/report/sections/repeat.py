@@ -118,6 +118,7 @@ def command_of(context: ReportContext) -> str:
         words += [option, str(value)] if value is not None else []
     flags = {
         "--explore": settings.get("explore"),
+        "--decide": settings.get("explore") is False,
         "--audited": settings.get("audited"),
         "--stochastic": certificate.get("stochastic"),
     }
