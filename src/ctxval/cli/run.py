@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -9,7 +10,6 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval import plot
 from ctxval._util.texts import reason_of, shortened
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates.base import Certificate
@@ -56,7 +56,7 @@ from ctxval.report.page import write_page
 from ctxval.storage.other_stores import other_stores
 
 RUN = "run"
-"""Key under which a store keeps the verdict of its last run, and the files that were written."""
+"""Key under which a store keeps the verdict of its last run and the report that was written."""
 
 Target = Annotated[
     str,
@@ -182,13 +182,20 @@ def run(
             **execution,
         )
     known = experiment.truth() if truth and experiment.truth is not None else None
+    digest = campaign.store.digest()
     verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
     bound = None if verdict is None else verdict.certificate
     if verdict is None and not settings.explores:
         with suppress(CertificateError):
             bound = campaign.certify(certificate=certificate)
     report = _report(campaign, experiment, settings, total, path, verdict, bound, known)
-    report |= _written(campaign, experiment, verdict, total, path, with_report)
+    said = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
+    page = page_path(path) if with_report else None
+    if page is not None:
+        report["report"] = (
+            str(page) if _is_current(page, campaign, said) else _write_report(page, campaign, verdict, total)
+        )
+    campaign.store.keep_computed(RUN, {**said, "report": report.get("report")}, digest)
     if not as_json:
         _print_report(report, verdict, bound)
     return report, _status(campaign, verdict)
@@ -260,61 +267,19 @@ def _report(
     return report
 
 
-def _written(
-    campaign: Campaign, experiment: Experiment, verdict: Verdict | None, budget: int, path: Path, with_report: bool
-) -> dict[str, Any]:
-    """Write the pictures and the report, unless those of a run before are the same; return their paths."""
-    digest, answer = campaign.store.digest(), None if verdict is None else verdict.to_json()
-    match campaign.store.computed(RUN):
-        case {"verdict": said, "budget": spent, "pictures": [*drawn], "report": str(page)} if (said, spent) == (
-            answer,
-            budget,
-        ) and all(Path(str(file)).exists() for file in (*drawn, page)):
-            return {"pictures": drawn, **({"report": page} if with_report else {})}
-    pictures = [str(picture) for picture in _save_pictures(campaign, experiment, path, verdict)]
-    report = _save_report(campaign, verdict, budget, path) if with_report else None
-    kept = {"verdict": answer, "budget": budget, "pictures": pictures, "report": report}
-    campaign.store.keep_computed(RUN, kept, digest)
-    return {"pictures": pictures, **({"report": report} if with_report else {})}
+def _is_current(page: Path, campaign: Campaign, said: Mapping[str, Any]) -> bool:
+    """Return whether an earlier run has written the same report."""
+    return page.is_file() and campaign.store.computed(RUN) == {**said, "report": str(page)}
 
 
-def _save_pictures(campaign: Campaign, experiment: Experiment, path: Path, verdict: Verdict | None) -> list[Path]:
+def _write_report(page: Path, campaign: Campaign, verdict: Verdict | None, budget: int) -> str | None:
+    """Write the report and return its path; None if it cannot be written."""
     try:
-        if campaign.worst is None:
-            return []
-        drawn = [plot.save(plot.worst_trajectories(campaign), path.with_suffix(".worst.png"))]
-        if len(campaign.completed) >= 2:
-            figure = plot.surrogate(
-                campaign,
-                truth=_true_curve(experiment),
-                threshold=None if verdict is None else verdict.threshold,
-                bound=None if verdict is None else verdict.bound,
-            )
-            drawn.append(plot.save(figure, path.with_suffix(".surrogate.png")))
-        return drawn
+        return str(write_page(context_of_campaign(campaign, verdict, budget=budget), page))
     except Exception as error:
-        # An error in a figure must not hide the verdict, for which executions were paid.
-        err.say(f"no pictures: {reason_of(error)}")
-        return []
-
-
-def _save_report(campaign: Campaign, verdict: Verdict | None, budget: int, path: Path) -> str | None:
-    """Write the report next to the store and return its path; None if it cannot be written."""
-    try:
-        return str(write_page(context_of_campaign(campaign, verdict, budget=budget), page_path(path)))
-    except Exception as error:
-        # The same holds for an error in the report.
+        # An error in the report must not hide the verdict, for which executions were paid.
         err.say(f"no report: {reason_of(error)}")
         return None
-
-
-def _true_curve(experiment: Experiment) -> plot.Curve | None:
-    """Return the distance on a grid if this is cheap, that is, for a simulated system and one task parameter."""
-    space = experiment.validation.space
-    if experiment.truth is None or space.dimension > 1:
-        return None
-    points = space.grid(401)
-    return plot.Curve(points[:, 0], experiment.validation.distances(points))
 
 
 def _print_report(report: dict[str, Any], verdict: Verdict | None, bound: Certificate | None) -> None:
