@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import interrupt_at_once, make_validation, make_validation_without_inputs
-from ctxval import Campaign, cases
+from ctxval import Campaign, cases, searches
 from ctxval.campaign.dynamics import AUDIT, PREDICTION
 from ctxval.campaign.interval_search import next_task
 from ctxval.certificates import (
@@ -26,6 +28,8 @@ from ctxval.certificates import (
 )
 from ctxval.certificates.dynamics_diagnostics import AUDITED
 from ctxval.errors import InputError
+from ctxval.learning import dynamics_study
+from ctxval.learning.dynamics_posterior import condition
 
 
 def facts(campaign: Campaign) -> list[tuple[object, ...]]:
@@ -206,6 +210,66 @@ def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: fl
     point = next_task(found, known, best, threshold, 0.95)
     assert point is not None
     return list(point.tolist())
+
+
+@pytest.mark.slow
+def test_without_a_threshold_it_ends_when_the_interval_is_narrow() -> None:
+    validation, largest = linear(2)
+    campaign = Campaign(validation).run(12)
+    bound = campaign.certify().upper_bound
+    assert campaign.executions < 12
+    assert campaign.estimate is not None
+    assert campaign.estimate <= largest * (1 + 1e-6)
+    assert largest * (1 - 1e-6) <= bound <= 1.05 * campaign.estimate
+    assert Campaign(validation).run(12, within=10.0).executions <= campaign.executions
+
+
+def test_another_search_spends_its_budget_unless_a_threshold_is_stated() -> None:
+    validation, _ = linear()
+    assert Campaign(validation, search=searches.Random()).run(6).executions == 6
+    assert Campaign(validation, search=searches.Random()).run(6, 1e-9).executions == 1
+    assert Campaign(validation, search=searches.Random()).run(6, 1e-9, explore=True).executions == 6
+
+
+@pytest.mark.slow
+def test_what_is_learned_of_the_same_executions_is_learned_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    conditioned = Counter[int]()
+
+    def counted(covariances, transitions, rows):  # type: ignore[no-untyped-def]
+        conditioned[len(transitions.x)] += 1
+        return condition(covariances, transitions, rows)
+
+    monkeypatch.setattr(dynamics_study, "condition", counted)
+    validation, largest = linear(2)
+    campaign = Campaign(validation).run(12, 1.1 * largest)
+    assert campaign.verdict(1.1 * largest).answer == "validated"
+    assert campaign.ask() is not None  # the search predicts by the same posterior
+    assert len(conditioned) >= campaign.executions
+    assert set(conditioned.values()) == {1}
+
+
+@pytest.mark.slow
+def test_a_decided_campaign_that_is_run_again_computes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    validation, largest = linear()
+    store = tmp_path / "a.sqlite"
+    first = Campaign(validation, store=store).run(12, 1.1 * largest)
+    verdict = first.verdict(1.1 * largest)
+    monkeypatch.setattr(dynamics_study.DynamicsStudy, "learn", lambda *_: pytest.fail("it learned again"))
+    again = Campaign(linear()[0], store=store).run(12, 1.1 * largest)
+    assert facts(again) == facts(first)
+    assert again.verdict(1.1 * largest).to_json() == verdict.to_json()
+
+
+def test_evidence_is_the_same_after_it_was_kept() -> None:
+    load = UntriedParameter("load", 0.5, np.array([0.3, 0.4]))
+    checked = (CheckedPrediction(3, np.nan, np.inf, np.inf, 0.9),)
+    found = replace(evidence(), untried=load, predictions=checked, maxima=np.array([0.1, np.inf] * 20))
+    kept = DynamicsEvidence.from_json(json.loads(json.dumps(found.to_json())))
+    assert kept is not None
+    assert json.dumps(kept.to_json()) == json.dumps(found.to_json())
+    assert isinstance(kept.coverage.marginal.coordinates, tuple)
+    for wrong in (None, 3, {}, {**found.to_json(), "coverage": None}, {**found.to_json(), "more": 1}):
+        assert DynamicsEvidence.from_json(wrong) is None
 
 
 def test_a_threshold_must_be_positive() -> None:

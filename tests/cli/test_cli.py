@@ -77,7 +77,7 @@ def quick(*arguments: str) -> list[str]:
 
 @pytest.mark.slow
 def test_the_default_search_learns_from_trajectories(invoke) -> None:  # type: ignore[no-untyped-def]
-    result = CliRunner().invoke(app, ["run", "rig:experiment", "--budget", "3", "--json"])
+    result = CliRunner().invoke(app, ["run", "rig:experiment", "--explore", "--budget", "3", "--json"])
     report = json.loads(result.stdout)
     assert (report["search"], report["store"]) == ("auto", "runs/short-auto-seed0.sqlite")
     assert Store(Path(report["store"])).trials()[-1].note["engine"] == "climb"  # type: ignore[index]
@@ -544,7 +544,10 @@ def test_status_and_cases_speak_to_people_and_to_programs(invoke) -> None:  # ty
 
 @pytest.mark.slow
 def test_a_store_is_certified_against_the_threshold_of_its_file(invoke) -> None:  # type: ignore[no-untyped-def]
-    Path("e.toml").write_text('experiment = "pendulum"\nbudget = 5\nthreshold = 0.01\nstore = "e.sqlite"')
+    Path("e.toml").write_text(
+    settings = "budget = 5\nthreshold = 0.01\nexplore = true"
+    Path("e.toml").write_text(f'experiment = "pendulum"\nstore = "e.sqlite"\n{settings}')
+    )
     assert invoke("run", "e.toml").exit_code == 1
     result = invoke("certify", "e.sqlite", "--json")
     assert result.exit_code == 1

@@ -105,7 +105,7 @@ def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
         Store(path)
 
 
-@pytest.mark.parametrize(("version", "age"), [(99, "a newer"), (6, "an older"), (1, "an older")])
+@pytest.mark.parametrize(("version", "age"), [(99, "a newer"), (7, "an older"), (1, "an older")])
 def test_another_schema_is_refused_in_one_sentence(tmp_path: Path, version: int, age: str) -> None:
     path = tmp_path / "a.sqlite"
     Store(path).close()
@@ -113,7 +113,7 @@ def test_another_schema_is_refused_in_one_sentence(tmp_path: Path, version: int,
         connection.execute("DROP TABLE history")
         connection.execute(f"PRAGMA user_version = {version}")
     before = path.read_bytes()
-    with pytest.raises(ForeignStoreError, match=f"has schema version {version} of {age} ctxval; this one reads only 7"):
+    with pytest.raises(ForeignStoreError, match=f"has schema version {version} of {age} ctxval; this one reads only 8"):
         Store(path)
     assert path.read_bytes() == before
 
@@ -153,3 +153,22 @@ def test_settings_do_not_change_which_experiment_it_is() -> None:
     store.describe_first({"seed": 1})
     store.keep_settings({"budget": 5})
     assert store.description() == {"seed": 1}
+
+
+def test_what_was_computed_is_kept_until_the_content_changes(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    store.open_trial(trial(), TRAJECTORY)
+    digest = store.digest()
+    store.keep_computed("verdict", {"bound": np.inf}, digest)
+    assert Store(tmp_path / "a.sqlite").computed("verdict") == {"bound": np.inf}
+    assert store.computed("other") is None
+    store.close_trial(replace(trial(), state="completed", executed=True, distance=1.0), TRAJECTORY)
+    assert store.computed("verdict") is None
+    store.keep_computed("verdict", 1, digest)  # by a process that has not seen the change
+    assert store.computed("verdict") is None
+    store.keep_computed("verdict", 2, store.digest())
+    with closing(sqlite3.connect(tmp_path / "a.sqlite")) as connection:
+        assert connection.execute("SELECT value FROM computed").fetchall() == [("2",)]
+        connection.execute("UPDATE computed SET value = '{'")
+        connection.commit()
+    assert store.computed("verdict") is None

@@ -144,13 +144,11 @@ class CampaignDynamics:
 
     def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
         """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""
-        if self.elsewhere() or len(trials) != self._store.signature()[0]:
-            return None
-        return DynamicsEvidence.from_json(self._store.computed(f"evidence {confidence}"))
+        return None if self.elsewhere() else DynamicsEvidence.from_json(self._store.computed(_key(trials, confidence)))
 
-    def keep_evidence(self, found: DynamicsEvidence, confidence: float, digest: str) -> None:
+    def keep_evidence(self, found: DynamicsEvidence, trials: Sequence[Trial], confidence: float, digest: str) -> None:
         """Keep evidence in the store, which had this digest when it was computed."""
-        key = f"evidence {confidence}"
+        key = _key(trials, confidence)
         if not self.elsewhere() and self._store.computed(key) is None:
             self._store.keep_computed(key, found.to_json(), digest)
 
@@ -265,6 +263,12 @@ class CampaignDynamics:
     def to_note(self, prediction: ExecutionPrediction) -> dict[str, Any]:
         """Return a prediction as it is stored, with what identifies the experiment that it belongs to."""
         return {PREDICTION: {**prediction.to_json(), "experiment": self.experiment}}
+
+
+def _key(trials: Sequence[Trial], confidence: float) -> str:
+    """Return the key of the evidence of some trials in the store."""
+    text = json.dumps([(trial.number, trial.state, trial.distance, trial.note) for trial in trials])
+    return f"evidence {confidence} {hashlib.sha256(text.encode()).hexdigest()}"
 
 
 def _with_jumps(found: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:

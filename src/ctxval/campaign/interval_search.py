@@ -105,7 +105,7 @@ class IntervalSearch:
             evidence = self.recorder.dynamics.evidence(trials, self.options.confidence)
             if evidence is None:
                 return self._by_distance(trials)
-            self.recorder.dynamics.keep_evidence(evidence, self.options.confidence, digest)
+            self.recorder.dynamics.keep_evidence(evidence, trials, self.options.confidence, digest)
             if self._decides(trials, evidence):
                 return self._audit(evidence) if self.audited else None
         if isinstance(self.options.kind, Automatic) and self.recorder.executions >= _PATIENCE:

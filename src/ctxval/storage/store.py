@@ -354,8 +354,9 @@ class Store:
             return None  # it can be computed again
 
     def keep_computed(self, key: str, value: Any, digest: str) -> None:
-        """Keep what was computed from the content with a digest; later processes need not compute it again."""
+        """Keep what was computed from the content with a digest, and forget what other content gave."""
         with self._database.transaction():
+            self._database.execute("DELETE FROM computed WHERE digest != ?", (digest,))
             self._database.execute("INSERT OR REPLACE INTO computed VALUES (?, ?, ?)", (key, digest, json.dumps(value)))
 
     def trajectory(self, number: int, side: Side) -> Trajectory | None:
