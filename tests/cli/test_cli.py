@@ -544,10 +544,8 @@ def test_status_and_cases_speak_to_people_and_to_programs(invoke) -> None:  # ty
 
 @pytest.mark.slow
 def test_a_store_is_certified_against_the_threshold_of_its_file(invoke) -> None:  # type: ignore[no-untyped-def]
-    Path("e.toml").write_text(
     settings = "budget = 5\nthreshold = 0.01\nexplore = true"
     Path("e.toml").write_text(f'experiment = "pendulum"\nstore = "e.sqlite"\n{settings}')
-    )
     assert invoke("run", "e.toml").exit_code == 1
     result = invoke("certify", "e.sqlite", "--json")
     assert result.exit_code == 1
