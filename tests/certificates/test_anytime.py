@@ -117,7 +117,7 @@ def test_the_command_line_says_it_also_of_a_falsified_model(tmp_path, monkeypatc
     Campaign(make_validation(), search=searches.Random(), store="a.sqlite", seed=2).run(40)
     shown = CliRunner().invoke(app, ["certify", "a.sqlite", "--kind", "anytime", "--threshold", "1.0"])
     assert shown.exit_code == 1, shown.output
-    assert "falsified" in shown.output
+    assert "FALSIFIED" in shown.output
     assert "has a distance above 1 or fails" in " ".join(shown.output.split())
     refused = CliRunner().invoke(app, ["certify", "a.sqlite", "--kind", "anytime"])
     assert refused.exit_code == 2
