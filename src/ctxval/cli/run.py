@@ -16,7 +16,6 @@ from ctxval.certificates.verdict import Verdict
 from ctxval.cli.base import (
     CANNOT_GO_ON,
     FALSIFIED,
-    app,
     certificate_of,
     command,
     err,
@@ -30,6 +29,7 @@ from ctxval.cli.base import (
     worker_options,
     worst_of,
 )
+from ctxval.cli.commands import app
 from ctxval.cli.options import (
     SEARCH_METHODS,
     TARGET,
