@@ -393,10 +393,12 @@ def _warm() -> None:
     import rosbags.rosbag2
     import rosbags.typesys
 
-    import ctxval.cli
     import ctxval.plot
     import ctxval.reproduce
+    from ctxval.cli.commands import MODULES
 
+    for module in MODULES.values():
+        importlib.import_module(module)
     with contextlib.suppress(ImportError):
         importlib.import_module(
             "mujoco"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typer.cli import get_docs_for_click
 from typer.main import get_command
 
 from ctxval.cli import app
+from ctxval.cli.commands import MODULES
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "command-line.md"
 
@@ -25,6 +27,8 @@ print, and [exit statuses](exit-statuses.md) how they end.
 
 def page() -> str:
     """Return the whole page: a list of the commands, and a section for each of them."""
+    for module in MODULES.values():
+        importlib.import_module(module)
     group = get_command(app)
     text = get_docs_for_click(obj=group, ctx=Context(group, info_name="ctxval"), name="ctxval")
     sections = text[text.index("## `ctxval ") :]

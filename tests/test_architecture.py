@@ -117,8 +117,37 @@ def test_importing_ctxval_loads_nothing_heavy() -> None:
 
 
 @pytest.mark.slow
-def test_the_command_line_starts_without_what_is_slow_to_load() -> None:
+def test_the_commands_load_nothing_that_is_slow_to_load() -> None:
     heavy = ["matplotlib", "scipy.stats", "mujoco", "sklearn", "torch"]
-    code = f"import sys, ctxval.cli; print([m for m in {heavy} if m in sys.modules])"
+    code = (
+        "import importlib, sys; from ctxval.cli.commands import MODULES; "
+        "[importlib.import_module(module) for module in MODULES.values()]; "
+        f"print([m for m in {heavy} if m in sys.modules])"
+    )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.strip() == "[]"
+
+
+def loaded_by(code: str) -> set[str]:
+    """Return the modules that a fresh interpreter has loaded after it has run a statement."""
+    code += "; import sys; print(*sys.modules, file=sys.stderr)"
+    return {*subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stderr.split()}
+
+
+def test_importing_ctxval_alone_loads_nothing_else() -> None:
+    loaded = loaded_by("import ctxval")
+    assert not loaded & {"numpy", "scipy", "typer", "rich", "starlette", "pydantic", "jinja2"}
+    assert {name for name in loaded if name.startswith("ctxval.")} == {"ctxval.version"}
+
+
+def test_the_help_loads_no_command_and_nothing_that_computes() -> None:
+    loaded = loaded_by("from ctxval.cli import app; app(['--help'], standalone_mode=False)")
+    assert not loaded & {"numpy", "scipy", "starlette", "pydantic", "jinja2"}
+    ours = {name.removeprefix("ctxval.") for name in loaded if name.startswith("ctxval.")}
+    assert {room(name) for name in ours} == {"_util", "cli", "version"}
+    assert {name for name in ours if room(name) == "cli"} == {"cli", "cli.commands", "cli.screen"}
+
+
+def test_tasks_validations_and_stores_are_there_without_the_parts_of_scipy() -> None:
+    loaded = loaded_by("from ctxval import Experiment, Store, Task, TaskSpace, Trajectory, Validation")
+    assert not loaded & {"scipy.linalg", "scipy.optimize", "scipy.spatial", "scipy.special"}

@@ -55,12 +55,18 @@ def test_the_part_packages_are_usable_after_importing_ctxval_alone() -> None:
         _ = ctxval.nothing  # type: ignore[attr-defined]
 
 
-def test_a_type_checker_sees_the_same_part_packages() -> None:
+def test_a_type_checker_sees_the_same_names() -> None:
     tree = ast.parse((ROOT / "src" / "ctxval" / "__init__.py").read_text())
     guarded = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
-    seen = [alias.asname for node in guarded for each in node.body for alias in each.names]  # type: ignore[attr-defined]
-    assert tuple(name for name in seen if name not in ctxval._LAZY) == ctxval._SUBMODULES
-    assert {*ctxval._LAZY} <= {*seen}
+    seen = {
+        alias.name: each.module.removeprefix("ctxval").lstrip(".")  # type: ignore[attr-defined]
+        for node in guarded
+        for each in node.body
+        for alias in each.names  # type: ignore[attr-defined]
+    }
+    assert tuple(name for name, module in seen.items() if not module) == ctxval._SUBMODULES
+    assert {name: module for name, module in seen.items() if module} == ctxval._LAZY
+    assert list(ctxval._LAZY) == ctxval.__all__
 
 
 @pytest.mark.parametrize("name", list(ctxval.__all__))

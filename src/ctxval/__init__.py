@@ -3,29 +3,12 @@
 An implementation of CuSTOM, *Context-Specific Validation of Data-Driven Models* (Bansal, Ghosh,
 Sangiovanni-Vincentelli, Seshia and Tomlin).
 
-The part packages, such as ``ctxval.controllers``, are imported when they are first used.
+All names, and the part packages, such as ``ctxval.controllers``, are imported when they are first used.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from ctxval._util.arrays import Array
-from ctxval._util.registry import part
-from ctxval.campaign import Campaign, OpenTrial
-from ctxval.certificates.verdict import Verdict
-from ctxval.comparison import Comparison, compare
-from ctxval.core.experiment import Experiment
-from ctxval.core.labels import Labels
-from ctxval.core.plan import Outcome, Plan
-from ctxval.core.rollout import rollout
-from ctxval.core.space import Parameters, TaskSpace
-from ctxval.core.task import Task
-from ctxval.core.task_distribution import Normal
-from ctxval.core.trajectory import Trajectory, Transitions
-from ctxval.core.trial import Trial
-from ctxval.core.truth import Truth, cached_truth, grid_truth, search_truth
-from ctxval.core.validation import Validation
-from ctxval.storage.store import Store
 from ctxval.version import VERSION
 
 if TYPE_CHECKING:
@@ -48,7 +31,24 @@ if TYPE_CHECKING:
     from ctxval import searches as searches
     from ctxval import systems as systems
     from ctxval import testing as testing
-    from ctxval.refinement import refine as refine
+    from ctxval._util.arrays import Array
+    from ctxval._util.registry import part
+    from ctxval.campaign import Campaign, OpenTrial
+    from ctxval.certificates.verdict import Verdict
+    from ctxval.comparison import Comparison, compare
+    from ctxval.core.experiment import Experiment
+    from ctxval.core.labels import Labels
+    from ctxval.core.plan import Outcome, Plan
+    from ctxval.core.rollout import rollout
+    from ctxval.core.space import Parameters, TaskSpace
+    from ctxval.core.task import Task
+    from ctxval.core.task_distribution import Normal
+    from ctxval.core.trajectory import Trajectory, Transitions
+    from ctxval.core.trial import Trial
+    from ctxval.core.truth import Truth, cached_truth, grid_truth, search_truth
+    from ctxval.core.validation import Validation
+    from ctxval.refinement import refine
+    from ctxval.storage.store import Store
 
 __version__ = VERSION
 
@@ -104,8 +104,35 @@ _SUBMODULES = (
 )
 """The public modules, which ``import ctxval`` alone makes usable: each is imported when it is first used."""
 
-_LAZY = {"refine": "refinement"}
-"""Public names that stand on upper floors, and the modules that have them."""
+_LAZY = {
+    "Array": "_util.arrays",
+    "Campaign": "campaign",
+    "Comparison": "comparison",
+    "Experiment": "core.experiment",
+    "Labels": "core.labels",
+    "Normal": "core.task_distribution",
+    "OpenTrial": "campaign",
+    "Outcome": "core.plan",
+    "Parameters": "core.space",
+    "Plan": "core.plan",
+    "Store": "storage.store",
+    "Task": "core.task",
+    "TaskSpace": "core.space",
+    "Trajectory": "core.trajectory",
+    "Transitions": "core.trajectory",
+    "Trial": "core.trial",
+    "Truth": "core.truth",
+    "Validation": "core.validation",
+    "Verdict": "certificates.verdict",
+    "cached_truth": "core.truth",
+    "compare": "comparison",
+    "grid_truth": "core.truth",
+    "part": "_util.registry",
+    "refine": "refinement",
+    "rollout": "core.rollout",
+    "search_truth": "core.truth",
+}
+"""The public names, and the modules that have them: each module is imported when its name is first used."""
 
 
 if not TYPE_CHECKING:  # a type checker, which reads the imports above, would take any name for granted
@@ -114,7 +141,8 @@ if not TYPE_CHECKING:  # a type checker, which reads the imports above, would ta
         if name in _SUBMODULES:
             return importlib.import_module(f"{__name__}.{name}")
         if name in _LAZY:
-            return getattr(importlib.import_module(f"{__name__}.{_LAZY[name]}"), name)
+            value = globals()[name] = getattr(importlib.import_module(f"{__name__}.{_LAZY[name]}"), name)
+            return value
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

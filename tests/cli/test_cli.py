@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib
 import itertools
 import json
 import os
@@ -8,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -16,7 +18,7 @@ from typer.testing import CliRunner, Result
 from conftest import make_validation
 from ctxval import Campaign, Store, TaskSpace, Validation, __version__, searches
 from ctxval.cli import app
-from ctxval.cli.screen import PANELS
+from ctxval.cli.commands import MODULES, PANELS
 
 EXPERIMENT = """
 import sys
@@ -588,10 +590,26 @@ def test_a_reader_that_goes_away_is_no_error(tmp_path: Path) -> None:
     assert "error" not in done.stderr
 
 
+def every_command() -> dict[str, Any]:
+    """Return the commands with their options, from their modules."""
+    for module in MODULES.values():
+        importlib.import_module(module)
+    return dict(typer.main.get_group(app).commands)
+
+
+def test_the_help_says_of_each_command_what_its_module_says() -> None:
+    commands = every_command()
+    assert list(commands) == list(MODULES)
+    assert len(app.registered_commands) == len(MODULES)
+    for names in PANELS.values():
+        for name, (module, sentence) in names.items():
+            assert commands[name].callback.__module__ == f"ctxval.cli.{module}"
+            assert commands[name].help.split("\n\n")[0] == sentence
+
+
 def test_every_command_has_an_example() -> None:
     examples = (Path(__file__).parents[2] / "docs" / "how-to" / "commands.md").read_text()
-    commands = [c.name or (c.callback.__name__ if c.callback else "") for c in app.registered_commands]
-    for command in commands:
+    for command in MODULES:
         assert f"ctxval {command}" in examples
 
 
@@ -614,15 +632,14 @@ def test_user_code_that_leaves_python_is_not_taken_for_done(invoke) -> None:  # 
 
 def test_the_help_lists_every_command_in_a_group_and_names_the_glossary(invoke) -> None:  # type: ignore[no-untyped-def]
     text = invoke("--help").stdout
-    grouped = [name for names in PANELS.values() for name in names]
-    assert sorted(grouped) == sorted(typer.main.get_group(app).commands)
+    assert all(re.search(rf"^│ {name} +[A-Z]", text, re.MULTILINE) for name in MODULES)
     places = [text.index(f"─ {panel} ─") for panel in PANELS]
     assert places == sorted(places)
     assert "docs/glossary.md" in text
 
 
 def test_every_help_text_is_a_sentence() -> None:
-    for name, command in typer.main.get_group(app).commands.items():
+    for name, command in every_command().items():
         texts = [command.help, *(parameter.help for parameter in command.params if parameter.name != "help")]
         for text in texts:
             assert text, name

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ctxval._util.arrays import Array
 
@@ -44,7 +44,9 @@ def climb(
     bounds = list(zip(np.tile(low, count), np.tile(high, count), strict=True))
     limits = {"maxiter": iterations, "maxfun": evaluations}
     options = {key: value for key, value in limits.items() if value is not None}
-    found = minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    found = scipy.optimize.minimize(
+        negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=options
+    )
     return np.asarray(np.clip(found.x.reshape(starts.shape), low, high)), -float(found.fun) * scale
 
 

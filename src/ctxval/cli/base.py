@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from json import dumps  # code of users may replace what is in a module
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.table import Table
@@ -22,43 +22,18 @@ from ctxval._util.texts import reason_of, shortened
 from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.certificates.bounds import as_text
 from ctxval.certificates.verdict import Verdict
-from ctxval.cli.screen import Commands, Screen, line
+from ctxval.cli.screen import Screen, line
 from ctxval.core.experiment import UnitsWarning
 from ctxval.core.preflight import CostWarning, DistanceWarning
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
 from ctxval.storage.disks import StoreWarning
-from ctxval.version import VERSION
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 _BAD = (InputError, StoreError, CertificateError)
 
-app = typer.Typer(
-    name="ctxval",
-    cls=Commands,
-    help="Find the task at which a system differs most from its learned model, and decide whether the difference stays "
-    "below a threshold.",
-    epilog="The glossary in docs/glossary.md explains the words and numbers that these commands print.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
 out = Screen()
 err = Screen(stderr=True)
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        out.say(f"ctxval {VERSION}")
-        raise typer.Exit
-
-
-@app.callback()
-def _options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
-    ] = False,
-) -> None:
-    """Print the version, if that is asked for."""
 
 
 def command(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -11,7 +11,8 @@ import typer
 from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.progress import stage
 from ctxval.certificates import KINDS, Assessment, Provenance, assess
-from ctxval.cli.base import FALSIFIED, app, command, out, print_other_stores, print_verdict
+from ctxval.cli.base import FALSIFIED, command, out, print_other_stores, print_verdict
+from ctxval.cli.commands import app
 from ctxval.cli.options import (
     AsJson,
     Confidence,

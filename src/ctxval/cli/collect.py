@@ -7,7 +7,8 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-from ctxval.cli.base import CANNOT_GO_ON, app, command, err, out
+from ctxval.cli.base import CANNOT_GO_ON, command, err, out
+from ctxval.cli.commands import app
 from ctxval.cli.options import TARGET, AsJson, PartOptions, named_values, parsed
 from ctxval.config.settings import read_settings
 from ctxval.core.experiment import Experiment

@@ -14,7 +14,8 @@ from ctxval import plot
 from ctxval._util.files import write_text
 from ctxval._util.texts import reason_of
 from ctxval.certificates.options import CONFIDENCE
-from ctxval.cli.base import app, command, err, failures_of, out, print_failures
+from ctxval.cli.base import command, err, failures_of, out, print_failures
+from ctxval.cli.commands import app
 from ctxval.cli.options import AsJson, Confidence, PartOptions, named_values
 from ctxval.cli.outputs import Force, require_outputs
 from ctxval.cli.screen import line

@@ -13,7 +13,8 @@ import typer
 from ctxval._util.files import write_text
 from ctxval.aspect1 import TASKS
 from ctxval.cli.aspect1_findings import aspect1_findings
-from ctxval.cli.base import BAD_INPUT, FALSIFIED, app, command, out
+from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, out
+from ctxval.cli.commands import app
 from ctxval.cli.options import TARGET, AsJson, PartOptions, named_values
 from ctxval.config.check import check_experiment
 from ctxval.config.settings import read_settings

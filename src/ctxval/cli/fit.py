@@ -9,7 +9,8 @@ import typer
 from rich.table import Table
 
 from ctxval._util.texts import shortened
-from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, app, command, err, out
+from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, out
+from ctxval.cli.commands import app
 from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingFile, States, TimeField, print_breaks
 from ctxval.cli.model_options import Vectorized, print_parameters, require_model_file, step_function
 from ctxval.cli.options import AsJson, named_values

@@ -15,7 +15,8 @@ from ctxval.campaign.by_hand import TRIAL_FILES, KnownRun, parameters_from, read
 from ctxval.campaign.campaign import OpenTrial
 from ctxval.campaign.known import KnownExecution
 from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
-from ctxval.cli.base import FALSIFIED, app, command, out, print_verdict
+from ctxval.cli.base import FALSIFIED, command, out, print_verdict
+from ctxval.cli.commands import app
 from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, Threshold, named_values
 from ctxval.cli.outputs import Force, require_folder
 from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, limit_of, open_store, require_target

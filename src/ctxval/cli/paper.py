@@ -9,8 +9,9 @@ import typer
 from rich.progress import Progress, TextColumn
 
 from ctxval import cases as known_cases
-from ctxval.cli.base import app, command, err, print_table
+from ctxval.cli.base import command, err, print_table
 from ctxval.cli.base import out as screen
+from ctxval.cli.commands import app
 from ctxval.cli.options import AsJson
 from ctxval.config.experiments import plain_options
 from ctxval.errors import InputError

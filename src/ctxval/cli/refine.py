@@ -11,7 +11,8 @@ from rich.table import Table
 
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions
-from ctxval.cli.base import FALSIFIED, app, command, out
+from ctxval.cli.base import FALSIFIED, command, out
+from ctxval.cli.commands import app
 from ctxval.cli.model_options import Vectorized, print_parameters, require_model_file, step_function
 from ctxval.cli.options import (
     TARGET,

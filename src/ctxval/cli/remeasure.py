@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from ctxval.cli.base import app, command, out, worst_of
+from ctxval.cli.base import command, out, worst_of
+from ctxval.cli.commands import app
 from ctxval.cli.options import AsJson, StoreArgument
 from ctxval.cli.trust import AcceptChange, Named, Trust, open_store
 from ctxval.storage.store import Store

@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from ctxval.cli.base import app, command, out
+from ctxval.cli.base import command, out
+from ctxval.cli.commands import app
 from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingFile, States, TimeField, print_breaks
 from ctxval.cli.options import AsJson, named_values
 from ctxval.cli.outputs import Force, require_outputs

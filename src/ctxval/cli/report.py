@@ -12,8 +12,9 @@ from ctxval import report as reports
 from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.files import write_text
 from ctxval.certificates import KINDS, CertificateOptions
-from ctxval.cli.base import FALSIFIED, app, command, out
+from ctxval.cli.base import FALSIFIED, command, out
 from ctxval.cli.certify import KindOptions, Volume
+from ctxval.cli.commands import app
 from ctxval.cli.options import AsJson, Confidence, StoreArgument, Threshold, named_values
 from ctxval.cli.outputs import Force, require_outputs
 from ctxval.cli.trust import Named, Trust, open_store

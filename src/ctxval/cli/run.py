@@ -1,4 +1,4 @@
-"""``ctxval run``: search for the worst task and give the verdict."""
+"""``ctxval run``: execute the tasks that decide, and give the verdict."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from ctxval.certificates.verdict import Verdict, usable_bound
 from ctxval.cli.base import (
     CANNOT_GO_ON,
     FALSIFIED,
-    app,
     command,
     err,
     failures_of,
@@ -30,6 +29,7 @@ from ctxval.cli.base import (
     worker_options,
     worst_of,
 )
+from ctxval.cli.commands import app
 from ctxval.cli.options import (
     SEARCH_METHODS,
     TARGET,

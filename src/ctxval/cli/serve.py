@@ -9,7 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval.cli.base import app, command, out
+from ctxval.cli.base import command, out
+from ctxval.cli.commands import app
 from ctxval.cli.options import StoreArgument, Threshold
 from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, limit_of, open_store, settings_of
 from ctxval.config.settings import Settings

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.controller import Limits, Synthesizer
@@ -60,7 +60,7 @@ def flips(points: Array, inputs: Sequence[Array]) -> Flips | None:
         points: tasks, points of the unit cube ``(N, d)``.
         inputs: the inputs on M of each task, shape ``(H, m)``.
     """
-    near = KDTree(points / np.sqrt(points.shape[1])).query_pairs(NEAR)
+    near = scipy.spatial.KDTree(points / np.sqrt(points.shape[1])).query_pairs(NEAR)
     pairs = [(i, j) for i, j in sorted(near) if inputs[i].shape == inputs[j].shape and inputs[i].size]
     if not pairs:
         return None

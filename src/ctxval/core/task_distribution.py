@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+import scipy
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats
 from ctxval._util.describe import describe
@@ -64,19 +64,19 @@ class Normal:
 
     def cdf(self, x: ArrayLike) -> Array:
         """Return the probability of values up to x."""
-        return np.asarray(ndtr(self._standard(x)))
+        return np.asarray(scipy.special.ndtr(self._standard(x)))
 
     def sf(self, x: ArrayLike) -> Array:
         """Return the probability of values above x."""
-        return np.asarray(ndtr(-self._standard(x)))
+        return np.asarray(scipy.special.ndtr(-self._standard(x)))
 
     def ppf(self, q: ArrayLike) -> Array:
         """Return the value that is exceeded with probability 1 - q."""
-        return np.asarray(self._floats[0] + self._floats[1] * ndtri(q))
+        return np.asarray(self._floats[0] + self._floats[1] * scipy.special.ndtri(q))
 
     def isf(self, q: ArrayLike) -> Array:
         """Return the value that is exceeded with probability q."""
-        return np.asarray(self._floats[0] - self._floats[1] * ndtri(q))
+        return np.asarray(self._floats[0] - self._floats[1] * scipy.special.ndtri(q))
 
     @property
     def _floats(self) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import Bounds, differential_evolution
+import scipy
 
 from ctxval._util.arrays import Array
 from ctxval._util.boxes import climb
@@ -169,9 +169,9 @@ class _TruthSearch:
         def losses(columns: Array) -> Any:
             return -self.values(columns.T)
 
-        evolved = differential_evolution(
+        evolved = scipy.optimize.differential_evolution(
             losses,
-            Bounds(np.zeros(self.dimension), np.ones(self.dimension)),
+            scipy.optimize.Bounds(np.zeros(self.dimension), np.ones(self.dimension)),
             popsize=self.population,
             maxiter=self.generations,
             tol=1e-4,
