@@ -53,6 +53,9 @@ def test_a_suggestion_costs_at_least_its_designs() -> None:
     assert found.design >= BURNT > found.closed_loop
     usual = [usual_effort(1, budget).points for budget in (150, 22)]
     assert found.suggestion >= usual[0] * BURNT
+    assert found.choice is not None
+    assert found.verdict is not None
+    assert 64 * BURNT <= found.choice < found.verdict  # the pool of designs that are made one at a time
     assert usual[1] * BURNT <= found.fast < found.suggestion
 
 
@@ -74,7 +77,8 @@ def test_a_check_states_the_costs_without_an_execution() -> None:
     assert found["cost"].state == "ok"
     seconds = r"[\d.e-]+ s"
     assert re.search(
-        rf"a design takes {seconds} of CPU, a closed loop on the model {seconds}; a suggestion of the search auto "
+        rf"a design takes {seconds} of CPU, a closed loop on the model {seconds}; the choice of a task takes about "
+        rf"{seconds}, and the verdict {seconds}; with --explore, a suggestion "
         rf"takes about {seconds} if it thinks thoroughly \(150 designs\) and {seconds} if it thinks fast",
         found["cost"].text,
     )

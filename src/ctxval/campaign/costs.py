@@ -13,6 +13,8 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
+from ctxval.certificates.dynamics import draws_for
+from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.plan import Plan
 from ctxval.core.rollout import rollout
 from ctxval.core.trajectory import Trajectory
@@ -29,21 +31,28 @@ _QUICK, _ENOUGH = 0.02, 0.1
 """Seconds of a single prediction up to which the large batch is timed if designs take batches, and up to which the
 medium one is timed if they do not."""
 
+_SCREENED = 5.0
+"""Seconds of the designs of a screening up to which it is timed."""
+
 
 @dataclass(frozen=True)
 class ThinkingCosts:
-    """What the search ``auto`` costs before the first execution of S, in seconds of CPU time.
+    """What the choice of a task costs after a few executions of S, in seconds of CPU time.
 
     Attributes:
         design: seconds of the design of one controller.
         closed_loop: seconds of one closed loop on the model.
-        suggestion: estimated seconds of one suggestion; None if it cannot be estimated.
+        choice: estimated seconds of the choice of a task that decides; None if it cannot be estimated.
+        verdict: estimated seconds of the bound that decides; None likewise.
+        suggestion: estimated seconds of one suggestion of the search ``auto``; None likewise.
         designs: number of designs of this suggestion; None likewise.
         fast: estimated seconds of one suggestion with the thinking ``"fast"``; None likewise.
     """
 
     design: float
     closed_loop: float
+    choice: float | None = None
+    verdict: float | None = None
     suggestion: float | None = None
     designs: int | None = None
     fast: float | None = None
@@ -61,17 +70,28 @@ class ThinkingCosts:
         controller = parts.synthesizer.design(task, parts.model)
         loop = _cpu_seconds(lambda: rollout(parts.model.step, controller, task))
         made_up = [(validation.space.to_unit(point), _unlike(validation.plan(point))) for point in points]
-        begun = _cpu_now()
-        prediction = DynamicsStudy(validation).predict(made_up)
+        begun, study = _cpu_now(), DynamicsStudy(validation)
+        learned = study.learn(made_up)
+        prediction = study.prediction_of(learned, made_up)
         if prediction is None:
             return cls(design, loop)
         learning = _cpu_now() - begun
         costs = costs_of(prediction, validation, ())
+        choice = verdict = None
+        if learned is not None:
+            designing = study.search.settings.pool * (costs.rough or costs.prediction)
+            loops, each = study.search.screening_loops, costs.prediction
+            if designing < _SCREENED:
+                begun = _cpu_now()
+                learned.screened  # noqa: B018 (what is computed first takes long)
+                each = (_cpu_now() - begun) / loops
+            choice = learning + max(designing, loops * each)
+            verdict = choice + study.search.expected_loops(draws_for(CONFIDENCE)) * each
         search = Auto("thorough")
         search.reset(validation.space.dimension, 0)
         designs = search.designs(prediction)
         thorough, fast = (search.thinking_seconds(costs, number) for number in (designs, round(FAST * designs)))
-        return cls(design, loop, learning + thorough, designs, learning + fast)
+        return cls(design, loop, choice, verdict, learning + thorough, designs, learning + fast)
 
 
 def _unlike(plan: Plan) -> Trajectory:

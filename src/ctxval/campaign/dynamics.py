@@ -14,7 +14,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.history import executed_trials, for_known_values, largest_distance
-from ctxval.certificates.dynamics import MOST_DRAWS, bound_of
+from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, PREDICTIONS, doubt_of, jumps
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
@@ -137,7 +137,7 @@ class CampaignDynamics:
         known = self.kept_evidence(trials, confidence)
         if known is not None:
             return known
-        draws = min(MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
+        draws = draws_for(confidence)
         with stage("searching the learned dynamics", self._study.search.expected_loops(draws), "closed loops"):
             learned = self.learned(trials)
             return None if learned is None else self._guarded(lambda: self._whole(learned, trials, draws, confidence))

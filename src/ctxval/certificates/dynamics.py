@@ -112,6 +112,11 @@ class Dynamics(CertificateKind):
         )
 
 
+def draws_for(confidence: float) -> int:
+    """Return the number of draws of the dynamics that a bound with this confidence needs."""
+    return min(MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
+
+
 def require_executions(sample: Sample) -> None:
     """Check that the trials allow a bound from learned dynamics."""
     failed = [number for number, distance in zip(sample.numbers, sample.distances, strict=True) if np.isnan(distance)]

@@ -20,6 +20,9 @@ from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Trial, designs_sentence
 from ctxval.errors import CertificateError
 
+_ASSUMPTIONS = 350
+"""Characters of the assumptions in a representation; the text of a verdict has them whole."""
+
 Answer = Literal["validated", "falsified", "undecided"]
 """The answer of a verdict to the question whether d* <= tau."""
 
@@ -53,12 +56,14 @@ class Verdict:
         return usable_bound(self.certificate)
 
     def __str__(self) -> str:
-        return f"{self.answer}: {self.reason}"
+        return f"{self.answer}: {self.reason}" + (f" {self.rests_on}" if self.rests_on else "")
 
     def __repr__(self) -> str:
+        head, reason = call(self, self.answer, threshold=self.threshold), f"reason: {line(self.reason)}"
+        if self.rests_on:
+            return "\n  ".join([head, reason, line(self.rests_on, _ASSUMPTIONS)])
         found = {"witness": self.witness, "certificate": self.certificate, "expected": self.expected}
-        rows = [f"{name}: {shown(part)}" for name, part in found.items() if part is not None]
-        return lines(call(self, self.answer, threshold=self.threshold), f"reason: {line(self.reason)}", *rows)
+        return lines(head, reason, *(f"{name}: {shown(part)}" for name, part in found.items() if part is not None))
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer and its reasons, ready for JSON; the certificate has its own."""

@@ -167,15 +167,14 @@ def _cost(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked]:
     with stage("measuring what a suggestion costs"):
         thinking = ThinkingCosts.measured(validation, [plan.parameters.points for plan in plans[:_EXECUTED]])
     text = f"a design takes {thinking.design:.2g} s of CPU, a closed loop on the model {thinking.closed_loop:.2g} s"
-    if thinking.suggestion is None:
-        yield Checked("cost", "ok", text)
-        return
-    yield Checked(
-        "cost",
-        "ok" if thinking.suggestion < _LONG else "noted",
-        f"{text}; a suggestion of the search auto takes about {thinking.suggestion:.2g} s if it thinks thoroughly "
-        f"({thinking.designs} designs) and {thinking.fast:.2g} s if it thinks fast",
-    )
+    if thinking.choice is not None:
+        text += f"; the choice of a task takes about {thinking.choice:.2g} s, and the verdict {thinking.verdict:.2g} s"
+    if thinking.suggestion is not None:
+        text += (
+            f"; with --explore, a suggestion takes about {thinking.suggestion:.2g} s if it thinks thoroughly "
+            f"({thinking.designs} designs) and {thinking.fast:.2g} s if it thinks fast"
+        )
+    yield Checked("cost", "noted" if max(thinking.choice or 0.0, thinking.suggestion or 0.0) >= _LONG else "ok", text)
 
 
 def _short(value: Any) -> str:
