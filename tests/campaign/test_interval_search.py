@@ -12,7 +12,7 @@ import pytest
 
 from conftest import interrupt_at_once, make_validation, make_validation_without_inputs
 from ctxval import Campaign, cases, searches
-from ctxval.campaign.dynamics import AUDIT, PREDICTION
+from ctxval.campaign.dynamics import AUDIT, NEAR, PREDICTION
 from ctxval.campaign.interval_search import next_task
 from ctxval.certificates import (
     AnytimeAudit,
@@ -204,6 +204,17 @@ def test_next_to_an_executed_task_one_more_may_lead_elsewhere() -> None:
     assert asked(contested, beside[None], 2.0) == farthest.tolist()
     assert asked(contested, np.stack([beside, also_beside]), 2.0) == contested.points[38].tolist()
     assert asked(contested, farthest[None], 2.0) == contested.points[38].tolist()
+
+
+def test_no_task_is_executed_a_second_time() -> None:
+    contested = evidence()
+    known = np.concatenate([contested.points, contested.elites, contested.coverage.task[None]])
+    for _ in range(5):
+        fresh = np.array(asked(contested, known, 2.0))
+        assert np.abs(known - fresh).max(axis=1).min() > NEAR
+        known = np.concatenate([known, fresh[None]])
+    everywhere = np.stack(np.meshgrid(*[np.linspace(0, 1, 60)] * 2), axis=-1).reshape(-1, 2)
+    assert next_task(contested, everywhere, 0.2, 2.0, 0.95) is None
 
 
 def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: float = 0.2) -> list[float]:

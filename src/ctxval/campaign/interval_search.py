@@ -46,6 +46,10 @@ _EXPLORE = 3
 """Every so many executions, the task that leads farthest from the records is executed in any case."""
 
 
+_SPREAD = 256
+"""Number of random tasks of which the one farthest from all known ones is taken."""
+
+
 @dataclass(frozen=True, eq=False)
 class IntervalSearch:
     """Chooses the next task until the interval of d* decides.
@@ -213,12 +217,12 @@ def next_task(
     confidence: float,
     steady: Callable[[Array], bool] = lambda point: True,
 ) -> Array | None:
-    """Return the task to execute next, a point ``(d,)``; None if the search is to choose it.
+    """Return the task to execute next, a point ``(d,)``; None if all tasks lie next to executed ones.
 
     These come first: a task whose predicted distance exceeds the limit; the task of the draw that sets the bound,
     while the bound exceeds the limit; the task that leads farthest from the records, while they leave gaps; and
     the task with the largest predicted distance, while no similar distance was executed or a deeper search found it.
-    Further tasks test the predictions.
+    Further tasks test the predictions, and if all of these are known, the task that is farthest from all others does.
 
     Args:
         evidence: what the learned dynamics say.
@@ -254,7 +258,15 @@ def next_task(
         most = 2 if np.array_equal(point, evidence.coverage.task) else 1
         return len(near) < most and not (near == point).all(axis=1).any()
 
+    candidates.append(_farthest_first(known))
     return next((point for point in np.concatenate(candidates) if is_new(point) and steady(point)), None)
+
+
+def _farthest_first(known: Array) -> Array:
+    """Return tasks spread over the cube, points ``(m, d)``, the one farthest from the known tasks first."""
+    spread = np.random.default_rng(len(known)).random((_SPREAD, known.shape[1]))
+    away = np.abs(spread[:, None] - known).max(axis=2).min(axis=1, initial=1.0)
+    return spread[np.argsort(-away, kind="stable")]
 
 
 def _points(trials: Sequence[Trial], dimension: int) -> Array:
