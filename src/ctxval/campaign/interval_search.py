@@ -44,8 +44,6 @@ _PATIENCE = 16
 """Number of executions after which ``auto`` uses the posterior bound if the dynamics have not decided."""
 _EXPLORE = 3
 """Every so many executions, the task that leads farthest from the records is executed in any case."""
-
-
 _SPREAD = 256
 """Number of random tasks of which the one farthest from all known ones is taken."""
 
