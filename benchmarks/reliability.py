@@ -273,8 +273,8 @@ columns and units. Some of the inputs run in a newly started interpreter under `
 
 HOSTILE_TAIL = """
 - *traceback*: an exception reached the top level, or its name was printed in place of a sentence. *hang*: more than
-  12 s of processor time. *memory*: more than 700 MB in addition to the interpreter with the package. *status*: an exit
-  status that is not in the [list](reference/exit-statuses.md), or a signal.
+  12 s of processor time or 60 s of the clock. *memory*: more than 700 MB in addition to the interpreter with the
+  package. *status*: an exit status that is not in the [list](reference/exit-statuses.md), or a signal.
 - *code*: a part of the input was run although the input is data. *elsewhere*: a file outside the folder was written.
 - *read*: a file was opened that is neither an input, nor an output, nor part of the interpreter. *secret*: a secret was
   printed, answered or written. *files*: a file was changed, removed or created that is neither the store nor a declared

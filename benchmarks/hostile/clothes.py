@@ -159,16 +159,13 @@ def _marked(rng: Rng, table: Table) -> None:
 
 
 def _episodes(rng: Rng, table: Table) -> None:
-    """Append another recording, which a column of numbers tells from this one."""
+    """Append the recording again, at later times; a column of numbers tells the two apart."""
     count = len(table.columns[0][1])
-    other = dict(table_of(3).columns)
     joined = []
     for name, values in table.columns:
-        new = other.get(name.partition(" ")[0], values)
-        new = new if len(new) == count else values
-        if name.startswith("t"):
-            new = np.asarray(values)[-1] + 0.05 + np.asarray(new)
-        joined.append((name, np.concatenate([values, new])))
+        old = np.asarray(values)
+        later = old[-1] + old[1] - 2 * old[0] if name.lower().startswith("t") else 0
+        joined.append((name, np.concatenate([old, old + later])))
     table.columns = [*joined, (str(pick(rng, ("episode", "episode_index", "run"))), np.repeat([0, 1], count))]
     table.tolerance = 1.0
 
@@ -363,7 +360,10 @@ def _compared(
         if status != 0:
             return []
         found = _answer(kind, out)
-        same = len(found) == len(expected) and np.allclose(found, expected, rtol=tolerance, atol=margin)
+        known = expected
+        if kind == "fit" and tolerance >= 1 and found:
+            known = expected[: len(found)]  # held-out parts of recordings may be too short for long predictions
+        same = len(found) == len(known) and np.allclose(found, known, rtol=tolerance, atol=margin)
         shown = f"{np.round(found, 5)} in place of {np.round(expected, 5)} for {worn}"
         return [] if same else [f"other answer: {kind}: {shown}"]
 

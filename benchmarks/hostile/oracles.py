@@ -169,6 +169,10 @@ def strays(
     """
     words = [word.partition("=")[2] if word.startswith("--") and "=" in word else word for word in arguments]
     named = [_relative(word, place) for word in words if word and len(word) < 4096]
+    # A store that is named by a link to a file that is not there is made where the link points.
+    links = [(name, str(before[name][1])) for name in named if before.get(name, ("",))[0] == "link"]
+    ends = [os.path.normpath(os.path.join(os.path.dirname(name), end)) for name, end in links]
+    named += [end for end in ends if end not in before]
     # What lies beside a database belongs to SQLite, also if it is none.
     stores = {name + end for name in named for end in _BESIDE if end or _may_be_store(head.get(name))}
     targets = [
@@ -265,8 +269,14 @@ def read_elsewhere(path: str, folder: Path, declared: Sequence[str]) -> bool:
     if f"{path}/".startswith((f"{folder}/", *PYTHON)) or _SYSTEM.match(path):
         return False
     path = re.sub(r"(-journal|-wal|-shm|\.lock)$", "", path)
-    # A folder that is named contains its inputs, and one that leads to a file is looked at on the way.
-    return not any(path == name or path.startswith(f"{name}/") or name.startswith(f"{path}/") for name in declared)
+    # A folder that is named contains its inputs, one that leads to a file is looked at on the way, and the files of a
+    # folder are written beside it until they are complete.
+    return not any(
+        path == name
+        or path.startswith((f"{name}/", os.path.join(os.path.dirname(name), f".{os.path.basename(name)}-")))
+        or name.startswith(f"{path}/")
+        for name in declared
+    )
 
 
 _LIBC = ctypes.CDLL(None, use_errno=True)

@@ -100,7 +100,10 @@ def test_a_process_that_is_taken_over_learns_and_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ROBOT_PASSWORD", CANARY)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])]))
+    packages = [str(Path(__file__).parent), str(Path(__file__).parents[1]), str(tmp_path)]  # the last one has the home
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(packages))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home").mkdir()
     (tmp_path / "key").write_text(CANARY)
     (tmp_path / "run.csv").write_text("t,position")
     probe = Probe(tmp_path / "run.csv", {"position": "m"}, {}, ONE.times)
@@ -110,7 +113,7 @@ def test_a_process_that_is_taken_over_learns_and_changes_nothing(
     assert pickle.loads(pickle.dumps(probe)).path == probe.path
     with pytest.raises(InputError, match=r"^learned: \[\]$"):
         probe.read_confined()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["key", "run.csv"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["home", "key", "run.csv"]
 
 
 class Greedy(Probe):

@@ -97,6 +97,16 @@ def test_times_that_go_back_begin_another_recording() -> None:
     assert "go back from 0.2 s to 0 s at row 3" in found.breaks[0].reason
 
 
+def test_times_that_do_not_tell_rows_apart_are_refused() -> None:
+    single = (1.7e9 + np.arange(0, 3, 0.05)).astype(np.float32)
+    for dt, times in ((0.05, single), (0.1, np.round(np.arange(0, 3, 0.05), 1))):
+        values = np.arange(60.0)
+        with pytest.raises(InputError, match=r"of 60 rows have the time of the row before.*more digits"):
+            recorded({"t": times, "x": values, "u": values}, dt=dt)
+    twice = np.insert(np.arange(0, 3, 0.05), 3, 0.1)
+    assert len(recorded({"t": twice, "x": np.arange(61.0), "u": np.arange(61.0)}).runs) == 2
+
+
 def test_a_held_command_is_no_gap() -> None:
     table = {"states": {"x": "x"}, "inputs": {"u": {"path": "u", "held": True}}}
     u = [5, np.nan, np.nan, np.nan, 6, np.nan]

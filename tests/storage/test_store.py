@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sqlite3
+import tracemalloc
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -146,6 +147,20 @@ def test_settings_come_back_and_the_last_ones_count(tmp_path: Path) -> None:
     store.keep_settings(kept)
     store.close()
     assert Store(tmp_path / "a.sqlite").settings() == kept
+
+
+def test_settings_that_are_too_long_are_neither_stored_nor_read(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    with pytest.raises(InputError, match="name must have at most 16777216 characters as JSON"):
+        store.keep_settings({"name": "0" * 2**24})
+    assert store.settings() == {}
+    with closing(sqlite3.connect(tmp_path / "a.sqlite")) as other, other:
+        other.execute("INSERT INTO settings SELECT 'name', '\"' || hex(zeroblob(20000000)) || '\"'")
+    tracemalloc.start()
+    with pytest.raises(ForeignStoreError, match="the settings in it cannot be read"):
+        store.settings()
+    assert tracemalloc.get_traced_memory()[1] < 2**24
+    tracemalloc.stop()
 
 
 def test_settings_do_not_change_which_experiment_it_is() -> None:

@@ -14,8 +14,10 @@ from pathlib import Path
 
 def main() -> None:
     """Read the recording with as few rights as possible."""
-    os.environ.clear()  # the secrets of the user are often there
-    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
+    # The secrets of the user are often in the environment; where the home lies decides what must not be readable.
+    home = {"HOME": os.environ["HOME"]} if "HOME" in os.environ else {}
+    os.environ.clear()
+    os.environ |= home | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
     sys.path.append(str(Path(__file__).resolve().parents[2]))
     from ctxval._util.confinement import limit, read_only
     from ctxval.campaign.recording_file import REFUSED

@@ -19,6 +19,8 @@ _SLACK = 1e-3
 """A sample within this share of a period of a wanted time belongs to it, because times are rounded."""
 _MOST_STEPS = 20_000_000
 """Largest number of steps of one recording."""
+_MOST_STILL = 0.1
+"""Largest share of rows, besides one, with the time of the row before."""
 
 Interval = tuple[float, float]
 
@@ -106,12 +108,13 @@ def sampled(
 
 def _forward_pieces(source: str, channels: Sequence[Channel], breaks: list[Break]) -> list[list[Channel]]:
     """Return the channels in pieces in which times increase; channels with times of their own must increase."""
-    ends = np.flatnonzero(np.diff(channels[0].times) <= 0)
     together = all(one.times is channels[0].times or np.array_equal(one.times, channels[0].times) for one in channels)
     if not together:
         for one in channels:
             _require_forward(source, one)
         return [list(channels)]
+    _require_resolution(source, channels[0])
+    ends = np.flatnonzero(np.diff(channels[0].times) <= 0)
     bounds = [0, *(ends + 1).tolist(), len(channels[0].times)]
     for end in ends.tolist():
         word, first = channels[0].place
@@ -127,6 +130,17 @@ def _require_forward(source: str, channel: Channel) -> None:
         raise InputError(
             f"{source}, {word} {first + k + 1} of {channel.path}: its time must be after that of the one before, "
             f"{channel.times[k]:.9g} s, got {channel.times[k + 1]:.9g} s."
+        )
+
+
+def _require_resolution(source: str, channel: Channel) -> None:
+    """Refuse times that are rounded so far that they do not tell rows apart; single rows may be written twice."""
+    still = np.flatnonzero(np.diff(channel.times) == 0)
+    if len(still) > 1 + _MOST_STILL * len(channel.times):
+        word, first = channel.place
+        raise InputError(
+            f"{source}: {len(still)} of {len(channel.times)} {word}s have the time of the {word} before, the first "
+            f"{word} {first + int(still[0]) + 1}, {channel.times[still[0]]:.9g} s: give times with more digits."
         )
 
 

@@ -14,6 +14,7 @@ from urllib.parse import quote
 
 from ctxval._util.describe import first_difference
 from ctxval.storage import schema
+from ctxval.storage.rows import MOST_CHARACTERS
 
 STORE_SUFFIXES = (".sqlite", ".sqlite3", ".db")
 """Suffixes of files that are taken for stores."""
@@ -24,9 +25,6 @@ _HEADER = 72
 """Bytes at the start of a SQLite file; the last four of them are its application_id."""
 
 _MARK = b"ctxv"
-
-_LONGEST = 2**24
-"""Largest number of characters of a description that is read."""
 
 _UNREADABLE = (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
@@ -62,7 +60,8 @@ def _validation_of(path: Path) -> dict[str, Any]:
         if not {"key", "value", "executed"} <= _columns(connection):
             raise ValueError(f"{path} is not a store")
         rows = connection.execute(
-            "SELECT key, value FROM experiment WHERE key IN ('validation', 'draws') AND length(value) <= ?", (_LONGEST,)
+            "SELECT key, value FROM experiment WHERE key IN ('validation', 'draws') AND length(value) <= ?",
+            (MOST_CHARACTERS,),
         ).fetchall()
         executed = connection.execute("SELECT EXISTS (SELECT 1 FROM trials WHERE executed)").fetchone()[0]
     found = {str(key): json.loads(value) for key, value in rows}

@@ -115,6 +115,18 @@ def _refuse_constant(name: str) -> NoReturn:
     raise InputError(f"{name} is not a number of JSON.")
 
 
+MOST_CHARACTERS = 2**24
+"""Largest number of characters of a key, and of the JSON text of a value."""
+
+
+def pair_of(key: str, value: Any) -> tuple[str, str]:
+    """Return a key and its value as the row of a table."""
+    text = json.dumps(value)
+    if len(text) > MOST_CHARACTERS:
+        raise InputError(f"{key} must have at most {MOST_CHARACTERS} characters as JSON to be stored, got {len(text)}.")
+    return key, text
+
+
 def read_pairs(rows: Iterable[tuple[Any, Any]]) -> dict[str, Any]:
     """Return the rows of a table of keys and JSON values as a dictionary."""
     found: dict[str, Any] = {}

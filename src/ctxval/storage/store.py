@@ -120,8 +120,8 @@ class Store:
 
     def _write_description(self, description: dict[str, Any]) -> None:
         self._database.execute("DELETE FROM experiment WHERE key != ?", (_DRAWS,))
-        for key, value in description.items():
-            self._database.execute("INSERT INTO experiment VALUES (?, ?)", (key, json.dumps(value)))
+        for pair in description.items():
+            self._database.execute("INSERT INTO experiment VALUES (?, ?)", rows.pair_of(*pair))
 
     def description(self) -> dict[str, Any]:
         """Return the stored description of the experiment; empty in a new store."""
@@ -143,15 +143,16 @@ class Store:
             return
         with self._database.transaction():
             self._database.execute("DELETE FROM settings")
-            for key, value in settings.items():
-                self._database.execute("INSERT INTO settings VALUES (?, ?)", (key, json.dumps(value)))
+            for pair in settings.items():
+                self._database.execute("INSERT INTO settings VALUES (?, ?)", rows.pair_of(*pair))
 
     def settings(self) -> dict[str, Any]:
         """Return the settings that make the experiment again; empty if no command made the store."""
         return self._pairs("settings")
 
     def _pairs(self, table: str) -> dict[str, Any]:
-        with self._database.rows(f"SELECT key, value FROM {table} ORDER BY rowid") as found:
+        bounded = (f"CASE WHEN length({cell}) <= {rows.MOST_CHARACTERS} THEN {cell} END" for cell in ("key", "value"))
+        with self._database.rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as found:
             try:
                 return rows.read_pairs(found)
             except InputError as error:
