@@ -97,8 +97,14 @@ def digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def command_of(context: ReportContext) -> str:
-    """Return the command that runs the campaign; empty if no command made the store."""
+def command_of(context: ReportContext, budget: int | None = None, *others: str) -> str:
+    """Return the command that runs the campaign; empty if no command made the store.
+
+    Args:
+        context: what the report is made from.
+        budget: another budget than that of the campaign.
+        others: further words.
+    """
     settings = context.settings
     if not settings:
         return ""
@@ -108,7 +114,7 @@ def command_of(context: ReportContext) -> str:
     given = {
         "--search": search.get("name"),
         "--seed": settings.get("seed"),
-        "--budget": settings.get("budget") or context.budget,
+        "--budget": budget or settings.get("budget") or context.budget,
         "--threshold": settings.get("threshold"),
         "--confidence": _unless(CONFIDENCE, settings.get("confidence")),
         "--resolution": _unless(RESOLUTION, certificate.get("resolution")),
@@ -125,7 +131,7 @@ def command_of(context: ReportContext) -> str:
     words += [flag for flag, wanted in flags.items() if wanted is True]
     for name, value in options.items():
         words += ["--option", f"{name}={value}"]
-    return shlex.join(words)
+    return shlex.join([*words, *others])
 
 
 def _unless(default: float, value: Any) -> Any:
@@ -152,7 +158,7 @@ def python_snippet(context: ReportContext, trial: Trial) -> str:
     if context.settings:
         made = (
             "from ctxval import Store\nfrom ctxval.config.stored_settings import trusted_settings\n\n"
-            f"store = Store.existing({str(_path(context))!r})\n"
+            f"store = Store.existing({str(path_of(context))!r})\n"
             "validation = trusted_settings(store).load().validation"
         )
     return (
@@ -163,8 +169,9 @@ def python_snippet(context: ReportContext, trial: Trial) -> str:
 
 def command_snippet(context: ReportContext, trial: Trial) -> str:
     """Return the command that opens the task of a trial again, and writes its controller to files."""
-    return shlex.join(["ctxval", "ask", str(_path(context)), "--again", str(trial.number)])
+    return shlex.join(["ctxval", "ask", str(path_of(context)), "--again", str(trial.number)])
 
 
-def _path(context: ReportContext) -> Path | str:
+def path_of(context: ReportContext) -> Path | str:
+    """Return the path of the store, for a command."""
     return context.store.name if context.store.path is not None else "campaign.sqlite"

@@ -42,7 +42,7 @@ class TrialsSection:
         lines = recorded_lines(context)
         return joined(
             [
-                paragraph(_left_out(context, lines)),
+                _left_out(context, lines),
                 _table(context, lines),
                 element("div", id="trial", aria_live="polite", class_="needs-script"),
                 data_element(DATA, lines.data),
@@ -61,11 +61,12 @@ def data_element(identifier: str, data: Any) -> Markup:
     return element("script", Markup(plain), type="application/json", id=identifier)
 
 
-def _left_out(context: ReportContext, lines: RecordedLines) -> str:
-    said = [f"The page has the trajectories of {len(lines.kept)} of {len(context.trials)} trials."]
+def _left_out(context: ReportContext, lines: RecordedLines) -> Markup:
+    said = []
     if lines.left_out:
         said.append(
-            f"Those of {len(lines.left_out)} trials with smaller distances are left out, so that the page stays small."
+            f"The page has the trajectories of {len(lines.kept)} of {len(context.trials)} trials. Those of "
+            f"{len(lines.left_out)} trials with smaller distances are left out, so that the page stays small."
         )
     if lines.thinned:
         said.append(f"Each line has about {lines.points} of the recorded points; `ctxval export` writes all of them.")
@@ -73,7 +74,7 @@ def _left_out(context: ReportContext, lines: RecordedLines) -> str:
         said.append("The corrected model is not drawn, because the experiment is not loaded.")
     elif context.replays:
         said.append("The corrected model in each trial is learned from the other trials.")
-    return " ".join(said)
+    return paragraph(" ".join(said)) if said else Markup("")
 
 
 def _table(context: ReportContext, lines: RecordedLines) -> Markup:
@@ -116,13 +117,14 @@ def _worst(context: ReportContext) -> Markup:
         return paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")
     parts = [heading(f"The {counted(len(worst), 'worst task')}")]
     for trial in worst:
-        head = f"Trial {trial.number}: {quantity(trial.distance, context.labels.units)} at {_where(context, trial)}"
+        head = f"Trial {trial.number}: {quantity(trial.distance, context.labels.units)} at {task_of(context, trial)}"
         charts = small_charts(_signals(context, trial.number))
         parts.append(details(head, charts, opened=trial is worst[0]))
     return joined(parts)
 
 
-def _where(context: ReportContext, trial: Trial) -> str:
+def task_of(context: ReportContext, trial: Trial) -> str:
+    """Return the task of a trial: its first parameters with their labels."""
     values = context.coordinates([trial])[0].tolist()
     listed = [f"{label} = {number(value)}" for label, value in zip(context.space.labels, values, strict=True)]
     return ", ".join(listed[:4]) + (f" and {len(listed) - 4} more" if len(listed) > 4 else "")
