@@ -182,7 +182,7 @@ def _assumptions(context: ReportContext) -> str:
 
 
 def _verification(context: ReportContext) -> str:
-    said = "; ".join(f"{one.name}: {WORDS[one.light]}" for one in diagnostics(context))
+    said = "; ".join(f"{one.name}: {WORDS[one.light]}" for one in diagnostics(context)) or "nothing is unusual"
     return (
         "Software and solution verification of the model itself are not part of this campaign. Diagnostics of the "
         f"campaign: {said}."

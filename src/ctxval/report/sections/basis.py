@@ -28,7 +28,7 @@ class BasisSection:
             [
                 *([] if context.certificate is None else _assumptions(context.certificate)),
                 heading("Diagnostics"),
-                lights(found) if found else paragraph("Nothing speaks against the verdict."),
+                lights(found) if found else paragraph("Nothing is unusual."),
                 heading("What was not tested"),
                 bullets(not_tested(context)),
             ]

@@ -24,8 +24,9 @@ from ctxval.version import VERSION
 _WORST = 5
 _PACKAGES = ("numpy", "scipy")
 _SAME = (
-    "The same command makes the same choices with the same versions of the libraries on the same kind of processor. "
-    "The option thinking of the search auto must then be a number, fast or thorough: balanced measures times."
+    "The command makes the same choices again, into a new store, with the same versions of the libraries on the same "
+    "kind of processor. The option thinking of the search auto must then be a number, fast or thorough: balanced "
+    "measures times."
 )
 _FILE = (
     "The experiment is described in a file. The store keeps its content, but not its name, so its name is assumed here."
@@ -39,7 +40,7 @@ class RepeatSection:
 
     def render(self, context: ReportContext) -> Markup:
         """Return the command, the seed, the versions, the digests and a snippet for each of the worst tasks."""
-        command = command_of(context)
+        command = repeating_command(context)
         parts = [
             paragraph(_SAME) if command else paragraph("No command made this store, so there is none that repeats it."),
             code(command, "Command that repeats the campaign") if command else Markup(""),
@@ -95,6 +96,12 @@ def _plain(trial: Trial) -> list[Any]:
 def digest(value: Any) -> str:
     """Return the SHA-256 of a value for JSON."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def repeating_command(context: ReportContext) -> str:
+    """Return the command that runs the campaign again, into a new store; empty if no command made the store."""
+    path = Path(path_of(context))
+    return command_of(context, None, "--store", str(path.with_stem(f"{path.stem}-again")))
 
 
 def command_of(context: ReportContext, budget: int | None = None, *others: str) -> str:

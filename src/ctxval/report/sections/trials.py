@@ -10,10 +10,11 @@ from markupsafe import Markup
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, counted
+from ctxval._util.texts import parted
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, small_charts
 from ctxval.report.context import Recording, ReportContext
-from ctxval.report.markup import cell, details, element, heading, joined, number, paragraph, quantity
+from ctxval.report.markup import cell, details, element, heading, joined, paragraph, quantity
 from ctxval.report.recorded_lines import RecordedLines, recorded_lines
 
 DATA = "trial-data"
@@ -124,9 +125,9 @@ def _worst(context: ReportContext) -> Markup:
 
 
 def task_of(context: ReportContext, trial: Trial) -> str:
-    """Return the task of a trial: its first parameters with their labels."""
-    values = context.coordinates([trial])[0].tolist()
-    listed = [f"{label} = {number(value)}" for label, value in zip(context.space.labels, values, strict=True)]
+    """Return the task of a trial: its first parameters with their units."""
+    values, labels = context.coordinates([trial])[0].tolist(), map(parted, context.space.labels)
+    listed = [f"{name} = {quantity(value, unit)}" for (name, unit), value in zip(labels, values, strict=True)]
     return ", ".join(listed[:4]) + (f" and {len(listed) - 4} more" if len(listed) > 4 else "")
 
 

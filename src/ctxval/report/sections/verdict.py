@@ -124,7 +124,7 @@ def _facts(context: ReportContext) -> Markup:
     rows: list[tuple[str, object]] = []
     if context.worst_first:
         worst = context.worst_first[0]
-        at = f"{quantity(distance_of(worst), units)} in trial {worst.number}, {task_of(context, worst)}"
+        at = f"{quantity(distance_of(worst), units)} at {task_of(context, worst)} (trial {worst.number})"
         rows.append(("Largest executed distance", at))
     if certificate is not None:
         bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
