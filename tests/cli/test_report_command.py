@@ -65,14 +65,13 @@ def store(invoke: Any) -> Path:
     ids=" ".join,
 )
 def test_the_command_of_a_report_repeats_the_campaign(invoke: Any, options: list[str]) -> None:
-    first = ["run", "short_rig:experiment", "--seed", "2", "--no-report", *options]
+    first = ["run", "short_rig:experiment", "--seed", "2", "--no-report", "--json", *options]
     ran = invoke(*first, "--store", "a.sqlite")
     command = shlex.split(repeating_command(context_of_store(Store.existing("a.sqlite"))))
     assert command[0] == "ctxval"
-    repeated = invoke(*command[1:], "--no-report")
-    assert (ran.exit_code, repeated.exit_code) == (0, 0)
-    assert repeated.stdout == ran.stdout.replace("a.sqlite", "a-again.sqlite")
-    one, other = (Store.existing(path) for path in ("a.sqlite", "a-again.sqlite"))
+    repeated = invoke(*command[1:], "--no-report", "--json")
+    assert json.loads(repeated.stdout) == {**json.loads(ran.stdout), "store": "again/a.sqlite"}
+    one, other = (Store.existing(path) for path in ("a.sqlite", "again/a.sqlite"))
     assert [(trial.unit_point.tolist(), trial.origin, trial.distance) for trial in other.trials()] == [
         (trial.unit_point.tolist(), trial.origin, trial.distance) for trial in one.trials()
     ]

@@ -99,9 +99,12 @@ def digest(value: Any) -> str:
 
 
 def repeating_command(context: ReportContext) -> str:
-    """Return the command that runs the campaign again, into a new store; empty if no command made the store."""
+    """Return the command that runs the campaign again, into a new store; empty if no command made the store.
+
+    The new store has a folder of its own, because it is no other campaign among which one is chosen.
+    """
     path = Path(path_of(context))
-    return command_of(context, None, "--store", str(path.with_stem(f"{path.stem}-again")))
+    return command_of(context, None, "--store", str(path.parent / "again" / path.name))
 
 
 def command_of(context: ReportContext, budget: int | None = None, *others: str) -> str:
