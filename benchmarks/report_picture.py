@@ -1,4 +1,4 @@
-"""``docs/pictures/report.png``: what the README's command writes, in the Chromium of this computer. Needs playwright."""
+"""``docs/pictures/report.png``: the report of the README's command, in Chromium. Needs playwright."""
 
 from __future__ import annotations
 

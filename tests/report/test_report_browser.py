@@ -55,7 +55,7 @@ def by_hand(tmp_path: Path) -> ReportContext:
 
 REPORTS: dict[str, Callable[[Path], ReportContext]] = {
     "pendulum": lambda folder: case("pendulum", 15),
-    "dubins": lambda folder: case("dubins", 4),
+    "many parameters": lambda folder: context_of_campaign(plane(8), threshold=0.1),
     "arm": lambda folder: arm(),
     "by hand": by_hand,
     "hostile": lambda folder: context_of_store(hostile_store(folder / "hostile.sqlite"), 1.0),

@@ -19,6 +19,7 @@ from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.trial import Trial
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.markup import code, heading, joined, number, paragraph, table
+from ctxval.searches import DEFAULT as DEFAULT_SEARCH
 from ctxval.version import VERSION
 
 _WORST = 5
@@ -122,8 +123,8 @@ def command_of(context: ReportContext, budget: int | None = None, *others: str) 
     words = ["ctxval", "run", str(named) if named else f"{settings.get('name') or 'experiment'}.toml"]
     search, certificate, options = (_mapping(settings.get(name)) for name in ("search", "certificate", "options"))
     given = {
-        "--search": search.get("name"),
-        "--seed": settings.get("seed"),
+        "--search": search.get("name") if not named else _unless(DEFAULT_SEARCH, search.get("name")),
+        "--seed": settings.get("seed") if not named else _unless(0, settings.get("seed")),
         "--budget": budget or settings.get("budget") or context.budget,
         "--threshold": settings.get("threshold"),
         "--confidence": _unless(CONFIDENCE, settings.get("confidence")),
@@ -144,7 +145,7 @@ def command_of(context: ReportContext, budget: int | None = None, *others: str) 
     return shlex.join([*words, *others])
 
 
-def _unless(default: float, value: Any) -> Any:
+def _unless(default: object, value: Any) -> Any:
     return None if value == default else value
 
 

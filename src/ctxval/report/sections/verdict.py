@@ -125,7 +125,7 @@ def _facts(context: ReportContext) -> Markup:
     if context.worst_first:
         worst = context.worst_first[0]
         at = f"{quantity(distance_of(worst), units)} at {task_of(context, worst)} (trial {worst.number})"
-        rows.append(("Largest executed distance", at))
+        rows.append(("Largest executed", at))
     if certificate is not None:
         bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
         how = "withdrawn" if certificate.doubt is not None else f"{percent(certificate.confidence)} confidence"
