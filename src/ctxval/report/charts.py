@@ -83,7 +83,7 @@ class Axis:
     @property
     def ends(self) -> tuple[float, float]:
         """Its ends, which are different."""
-        if self.high - self.low > 1e-12 * max(abs(self.low), abs(self.high)):
+        if self.high - self.low > max(1e-12 * max(abs(self.low), abs(self.high)), 1e-300):
             return self.low, self.high
         width = 0.5 * abs(self.low) or 0.5
         return self.low - width, self.low + width

@@ -23,10 +23,11 @@ class BasisSection:
 
     def render(self, context: ReportContext) -> Markup:
         """Return the assumptions, the diagnostics and what was not tested."""
-        found = diagnostics(context)
+        found, rests_on = diagnostics(context), None if context.verdict is None else context.verdict.rests_on
         return joined(
             [
                 *([] if context.certificate is None else _assumptions(context.certificate)),
+                *([] if rests_on is None else [paragraph(text(rests_on, UNCUT))]),
                 heading("Diagnostics"),
                 lights(found) if found else paragraph("Nothing is unusual."),
                 heading("What was not tested"),

@@ -7,6 +7,7 @@ import shlex
 from markupsafe import Markup
 
 from ctxval._util.representation import call, counted
+from ctxval.certificates import Certificate
 from ctxval.certificates.bounds import at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics
@@ -41,7 +42,9 @@ class VerdictSection:
         word = element("p", shape, " ", answer.capitalize(), class_="word")
         chart = (distance_over_task(context) if context.space.dimension == 1 else None) or distances_in_order(context)
         drawn = paragraph("No distance is known yet.") if chart is None else chart
-        beside = element("div", heading("What next"), *_next(context), _facts(context), *_remarks(context))
+        said, command = _next(context)
+        block = code(command, "Next command") if command else None
+        beside = element("div", heading("What next"), paragraph(said), block, _facts(context), *_remarks(context))
         return joined(
             [
                 element("div", word, paragraph(_sentence(context), class_="sentence"), class_=f"answer {answer}"),
@@ -57,66 +60,55 @@ def _sentence(context: ReportContext) -> str:
     verdict, certificate, units = context.verdict, context.certificate, context.labels.units
     if verdict is None:
         return "No threshold was given."
-    if verdict.answer != "validated" or certificate is None or certificate.volume:
+    if verdict.answer != "validated" or certificate is None or certificate.kind != "dynamics":
         return f"{verdict.reason[:1].upper()}{verdict.reason[1:]}"
-    provided = "the assumptions below hold"
-    if certificate.kind == "dynamics":
-        provided = "what M misses depends on the recorded state and input alone, alike in every task"
-    bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
     designs = "" if context.designs is None else f" Note: {context.designs}."
     return (
         f"Every task keeps the threshold of {quantity(verdict.threshold, units)}: the largest distance is at most "
-        f"{bound} with {percent(certificate.confidence)} confidence, if {provided}.{designs}"
+        f"{_bound(context, certificate)} with {percent(certificate.confidence)} confidence, if what M misses depends "
+        f"on the recorded state and input alone, alike in every task.{designs}"
         f"{context.provenance.caution(verdict.threshold)}"
     )
 
 
-def _next(context: ReportContext) -> list[Markup]:
-    """Return what to do next: a sentence, and a command if one does it."""
+def _next(context: ReportContext) -> tuple[str, str]:
+    """Return what to do next, and the command that does it; empty if there is none."""
     verdict, path = context.verdict, str(path_of(context))
-    known = bool(context.settings)
     if not context.executions:
-        return [paragraph("Execute tasks."), *_command(command_of(context))]
+        return "Execute tasks.", command_of(context)
     if verdict is None:
         said = "State the threshold that the distance must keep. The recorded trials are then judged."
-        return [paragraph(said), *_command(shlex.join(["ctxval", "report", path, "--threshold", "VALUE"]))]
+        return said, shlex.join(["ctxval", "report", path, "--threshold", "VALUE"])
     if verdict.answer == "validated":
         said = (
             "Use the model for these tasks. Validate it again if the system, the model, the design of the controllers "
             "or the tasks change."
         )
-        certificate = verdict.certificate
-        if not known or context.settings.get("audited") or certificate is None or certificate.kind != "dynamics":
-            return [paragraph(said)]
         budget = max(context.budget or 0, context.executions + _MORE)
-        return [
-            paragraph(f"{said} If an error would be costly, test the assumptions with eight fresh random tasks:"),
-            *_command(command_of(context, budget, "--audited", "--store", path)),
-        ]
+        command = command_of(context, budget, "--audited", "--store", path)
+        if not command or context.settings.get("audited") or getattr(verdict.certificate, "kind", "") != "dynamics":
+            return said, ""
+        return f"{said} If an error would be costly, test the assumptions with eight fresh random tasks:", command
     if verdict.answer == "falsified":
         largest = quantity(distance_of(context.worst_first[0]), context.labels.units)
         said = f"Do not rely on the model at this threshold. Improve it, narrow the tasks, or accept {largest} or more."
-        if not known:
-            return [paragraph(said)]
-        return [
-            paragraph(f"{said} This learns a better model from the recorded executions, and validates it:"),
-            *_command(shlex.join(["ctxval", "refine", path])),
-        ]
+        if not context.settings:
+            return said, ""
+        better = "This learns a better model from the recorded executions, and validates it:"
+        return f"{said} {better}", shlex.join(["ctxval", "refine", path])
+    by_hand = any(trial.told for trial in context.trials)
     if context.failed:
         number = context.failed[0].number
-        said = f"Trial {number} has no distance. Find out why, and execute its task again:"
-        return [paragraph(said), *_command(shlex.join(["ctxval", "ask", path, "--again", str(number)]))]
+        again = shlex.join(["ctxval", "ask", path, "--again", str(number)]) if by_hand else ""
+        return f"Find out why trial {number} has no distance, and execute its task again.", again
     expected = None if verdict.expected is None else verdict.expected.executions
-    many = f"about {expected} more are expected to decide" if expected else "how many more decide is not known"
-    said = paragraph(f"Execute more tasks; {many}:")
-    if any(trial.told for trial in context.trials):
-        return [said, *_command(shlex.join(["ctxval", "ask", path]))]
-    budget = context.executions + (expected or _MORE)
-    return [said, *_command(command_of(context, budget, "--store", path) if known else f"campaign.run({budget}, ...)")]
+    said = f"about {expected} are expected to decide" if expected else "how many will decide cannot be forecast"
+    command = command_of(context, context.executions + (expected or _MORE), "--store", path)
+    return f"Execute more tasks: {said}.", shlex.join(["ctxval", "ask", path]) if by_hand else command
 
 
-def _command(words: str) -> list[Markup]:
-    return [code(words, "Next command")] if words else []
+def _bound(context: ReportContext, certificate: Certificate) -> str:
+    return f"{with_error(certificate.upper_bound, certificate.error)} {context.labels.units}".rstrip()
 
 
 def _facts(context: ReportContext) -> Markup:
@@ -127,9 +119,8 @@ def _facts(context: ReportContext) -> Markup:
         at = f"{quantity(distance_of(worst), units)} at {task_of(context, worst)} (trial {worst.number})"
         rows.append(("Largest executed", at))
     if certificate is not None:
-        bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
         how = "withdrawn" if certificate.doubt is not None else f"{percent(certificate.confidence)} confidence"
-        rows.append(("Bound on all tasks", f"{bound} ({certificate.kind}, {how})"))
+        rows.append(("Bound on all tasks", f"{_bound(context, certificate)} ({certificate.kind}, {how})"))
         if certificate.volume:
             rows.append(("Tasks left out", f"{at_most(100 * certificate.volume, 3)} %"))
     if verdict is not None:
