@@ -68,6 +68,8 @@ def test_names_units_threshold_and_verdict_are_on_the_page(html: str) -> None:
     for words in ("angle [rad]", "rate [rad/s]", "torque [N m]", "goal [rad]", "distance [rad]", "threshold 0.2"):
         assert words in html
     assert "</span> Falsified</p>" in html
+    assert "Do not rely on the model at this threshold." in html
+    assert "predicted by the learned dynamics" in html
 
 
 @pytest.mark.parametrize(

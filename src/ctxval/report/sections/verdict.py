@@ -103,7 +103,9 @@ def _next(context: ReportContext) -> tuple[str, str]:
         return f"Find out why trial {number} has no distance, and execute its task again.", again
     expected = None if verdict.expected is None else verdict.expected.executions
     said = f"about {expected} are expected to decide" if expected else "how many will decide cannot be forecast"
-    command = command_of(context, context.executions + (expected or _MORE), "--store", path)
+    # A search that explores may never execute what the certificate lacks.
+    decide = ["--decide"] if getattr(verdict.certificate, "kind", "") in ("dynamics", "posterior") else []
+    command = command_of(context, context.executions + (expected or _MORE), *decide, "--store", path)
     return f"Execute more tasks: {said}.", shlex.join(["ctxval", "ask", path]) if by_hand else command
 
 
