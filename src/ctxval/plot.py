@@ -125,6 +125,7 @@ def convergence(
         axes.plot(without, [0.03] * len(without), "x", color=_ORANGE, transform=bottom, label="no distance is known")
     _draw_limits(axes, threshold, bound)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlim(-0.3, max(last, 1) + 0.3)
     axes.set_xlabel("trial")
     axes.set_ylabel(_distance_label(campaign, units))
     axes.legend(loc="best", fontsize=8, framealpha=0.9)

@@ -18,6 +18,11 @@ from ctxval.report import ReportContext, context_of_campaign, context_of_store, 
 LARGEST = 1_500_000
 """Bytes of a report."""
 
+FIRST = ".answer .word, .answer .sentence, .picture svg.chart, .first h3 + p"
+"""The verdict, its sentence, its picture and what to do next."""
+
+LOWEST = f"Math.max(...[...document.querySelectorAll('{FIRST}')].map((one) => one.getBoundingClientRect().bottom))"
+
 POINT_AT_THE_END = """(chart) => {
   const box = chart.getBoundingClientRect();
   chart.dispatchEvent(new PointerEvent("pointermove", { clientX: box.right - 1, clientY: box.top + 1 }));
@@ -50,7 +55,7 @@ def by_hand(tmp_path: Path) -> ReportContext:
 
 REPORTS: dict[str, Callable[[Path], ReportContext]] = {
     "pendulum": lambda folder: case("pendulum", 15),
-    "dubins": lambda folder: case("dubins", 4),
+    "many parameters": lambda folder: context_of_campaign(plane(8), threshold=0.1),
     "arm": lambda folder: arm(),
     "by hand": by_hand,
     "hostile": lambda folder: context_of_store(hostile_store(folder / "hostile.sqlite"), 1.0),
@@ -71,6 +76,10 @@ class Opened:
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.goto(path.as_uri())
 
+    def unfold(self, which: str = "section > details") -> None:
+        """Unfold what is folded: by default the sections, but not what is folded in them."""
+        self.page.evaluate(f"document.querySelectorAll('{which}').forEach((one) => {{ one.open = true; }})")
+
     def require_quiet(self, path: Path) -> None:
         """Check that there was no message, and no request but for the page and its own images."""
         assert self.said == []
@@ -79,7 +88,7 @@ class Opened:
     def violations(self, unfold: bool) -> list[str]:
         """Return what axe-core finds, also in what is folded if ``unfold`` is True."""
         if unfold:
-            self.page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+            self.unfold("details")
         return accessibility_findings(self.page)
 
 
@@ -87,12 +96,16 @@ class Opened:
 def test_a_report_is_quiet_small_and_accessible(name: str, browser: Any, tmp_path: Path) -> None:
     path = write_page(REPORTS[name](tmp_path), tmp_path / "report.html")
     assert path.stat().st_size < LARGEST
-    for options in ({}, {"color_scheme": "dark"}, {"viewport": {"width": 400, "height": 800}}):
+    phone = {"viewport": {"width": 400, "height": 800}}
+    for options in ({"viewport": {"width": 1280, "height": 800}}, {"color_scheme": "dark"}, phone):
         opened = Opened(browser, path, **options)
+        assert opened.page.locator(FIRST).count() == 4
+        assert opened.page.evaluate(LOWEST) <= (1600 if options is phone else 800)
+        opened.unfold()
         if opened.page.locator("button[data-trial]").count():
             opened.page.locator("button[data-trial]").first.click()
             assert opened.page.locator("#trial svg.chart").count() > 0
-        if "viewport" not in options and (name == "pendulum" or not options):
+        if options is not phone and (name == "pendulum" or "viewport" in options):
             assert opened.violations(unfold=name in ("pendulum", "hostile")) == []
         opened.require_quiet(path)
         assert opened.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
@@ -105,6 +118,7 @@ def swing(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tu
     context = context_of_campaign(pendulum(), threshold=0.2, certificate=CertificateOptions.posterior())
     path = write_page(context, tmp_path_factory.mktemp("swing") / "report.html")
     opened = Opened(browser, path)
+    opened.unfold()
     yield opened, context
     opened.context.close()
 
@@ -165,7 +179,7 @@ def test_print_unfolds_and_hides_what_cannot_be_clicked(swing: tuple[Opened, Rep
     opened.page.evaluate("dispatchEvent(new Event('afterprint'))")
     assert opened.page.locator("details:not([open])").count() > 0
     opened.page.emulate_media(media="print")
-    assert not opened.page.locator("nav").is_visible()
+    assert not opened.page.locator(".trial-panel").is_visible()
     opened.page.emulate_media(media="screen")
     assert len(opened.page.pdf(path=tmp_path / "report.pdf")) > 10_000
 
@@ -174,6 +188,7 @@ def test_a_hostile_store_does_not_script_the_page(browser: Any, tmp_path: Path) 
     context = context_of_store(hostile_store(tmp_path / "hostile.sqlite"), 1.0)
     path = write_page(context, tmp_path / "report.html")
     opened = Opened(browser, path)
+    opened.unfold()
     opened.page.locator("button[data-trial]").last.click()
     assert opened.page.title().startswith("Validation of </script>")
     assert opened.page.locator("img").count() == 0

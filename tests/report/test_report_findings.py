@@ -47,14 +47,13 @@ def test_the_lights_of_a_campaign_with_a_failure(flat: ReportContext) -> None:
     found = named(diagnostics(flat))
     assert found["Executions"].light == "bad"
     assert found["Executions"].numbers["failed"] == [1]
-    assert found["Certificate"].light == "unknown"
-    assert "exceeds the threshold" in found["Certificate"].text
+    assert set(found) <= {"Executions", "Predictions made beforehand"}  # a counterexample rests on nothing else
     assert any("trial 1" in sentence for sentence in not_tested(flat))
 
 
 def test_a_campaign_without_a_threshold_has_no_verdict() -> None:
     context = context_of_campaign(pendulum(executions=3))
-    assert named(diagnostics(context))["Certificate"].light == "unknown"
+    assert "Certificate" not in named(diagnostics(context))
     assert weak_region(context) is None
 
 
@@ -215,12 +214,12 @@ def test_designs_that_stop_early_are_counted(weak_motor: ReportContext) -> None:
     )
 
 
-def test_motion_bias_and_states_have_numbers(swing: ReportContext) -> None:
-    for question in (unusual_motion, bias, weak_states):
-        found = question(swing)
-        assert found is not None
-        assert found.numbers
-        assert found.text.endswith(".")
+def test_the_bias_has_numbers_and_nothing_is_said_of_what_is_usual(swing: ReportContext) -> None:
+    assert unusual_motion(swing) is None
+    assert weak_states(swing) is None
+    found = bias(swing)
+    assert found is not None
+    assert found.numbers
 
 
 def test_every_finding_is_one_text_with_a_light_and_json(swing: ReportContext, flat: ReportContext) -> None:

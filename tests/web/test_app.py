@@ -411,11 +411,13 @@ def test_the_choices_are_those_of_the_command_line(tmp_path: Path, how: str, opt
 def test_no_task_is_opened_for_a_verdict_that_is_reached(tmp_path: Path) -> None:
     new_store(tmp_path)
     ctxval("tell", "a.sqlite", "0", "--distance", "2.5", folder=tmp_path)
-    with serving(tmp_path) as server:
+    with serving(tmp_path, "--budget", "9") as server:
         page = server.request("GET", "/")
         assert post(server, "/choose", page, {"how": "decides", "seen": "1"}).status == 303
-        found = wait_for(server, "No task was chosen", page)
-        assert "the verdict against 2 is reached, so no further execution is needed" in found
+        found = wait_for(server, 'class="done">The verdict is reached', page)
+        assert "No further execution is needed for it." in found
+        assert "No task was chosen" not in found
+        assert "<strong>1</strong> of 9 executions" in found
     assert len(trials(tmp_path)) == 1
 
 

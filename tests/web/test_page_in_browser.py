@@ -115,6 +115,8 @@ def test_a_whole_campaign_by_hand(browser: Any, folder: Path, address: str) -> N
         one.page.locator("#verdict .work").wait_for(state="detached", timeout=WAIT)
     assert one.page.locator(".answer").inner_text() == "validated against 2 m"
     assert "with confidence 0.95" in one.page.locator("#verdict").inner_text()
+    assert one.page.locator("#choosing .done").inner_text().startswith("The verdict is reached: validated.")
+    assert one.page.locator("#choosing .problem").count() == 0
     assert one.page.locator("#verdict img").evaluate_all("all => all.map((one) => one.naturalWidth > 0)") == [True] * 2
     assert one.page.locator("#trials tbody tr").count() == 7
     assert accessibility_findings(one.page) == []
@@ -279,7 +281,7 @@ def test_the_keyboard_reaches_everything_in_order(browser: Any, folder: Path, ad
 
 def test_the_page_fits_a_small_screen_and_is_accessible(browser: Any, folder: Path, address: str) -> None:
     ctxval("tell", "a.sqlite", "0", "--distance", "3", folder=folder)
-    ctxval("ask", "a.sqlite", folder=folder)
+    ctxval("ask", "a.sqlite", "--explore", folder=folder)
     for scheme in ("light", "dark"):
         one = Operator(browser, folder, address, viewport={"width": 400, "height": 800}, color_scheme=scheme)
         one.opened()

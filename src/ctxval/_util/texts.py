@@ -89,9 +89,9 @@ def unguarded(cell: str) -> str:
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell.lstrip("'")) else cell
 
 
-def markdown_text(text: str) -> str:
+def markdown_text(text: str, longest: int = LONGEST) -> str:
     """Return a text in one line, in which characters that Markdown or HTML acts upon are escaped."""
-    return re.sub(r"([\\`*_{}\[\]<>#|!~])", r"\\\1", " ".join(shortened(visible(text)).split()))
+    return re.sub(r"([\\`*_{}\[\]<>#|!~])", r"\\\1", " ".join(shortened(visible(text), longest).split()))
 
 
 def aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> str:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ctxval._util.checked import PositiveInt, require
 from ctxval.cli.base import command, out
 from ctxval.cli.commands import app
 from ctxval.cli.options import StoreArgument, Threshold
@@ -35,6 +36,13 @@ Token = Annotated[
         "environment variable instead.",
     ),
 ]
+Budget = Annotated[
+    int | None,
+    typer.Option(
+        help="Maximum number of executions that are chosen for the verdict, including earlier ones in the store "
+        "(default: the budget of the campaign)."
+    ),
+]
 AllowHost = Annotated[
     list[str] | None,
     typer.Option(
@@ -54,6 +62,7 @@ def serve(
     token: Token = None,
     allow_host: AllowHost = None,
     threshold: Threshold = None,
+    budget: Budget = None,
     experiment: Named = None,
     trust: Trust = False,
     accept_change: AcceptChange = None,
@@ -65,10 +74,10 @@ def serve(
     """
     web = _web()
     address = web.Address(host, port, token, tuple(allow_host or ()))
-    again = _Reopening(settings_of(Store.existing(store), experiment, trust), store, threshold)
+    again = _Reopening(settings_of(Store.existing(store), experiment, trust), store, threshold, budget)
 
     def first() -> ServedCampaign:
-        return _served(open_store(Store.existing(store), store, experiment, trust, accept_change), threshold)
+        return _served(open_store(Store.existing(store), store, experiment, trust, accept_change), threshold, budget)
 
     web.serve(first, again, address, _say_started)
 
@@ -83,16 +92,19 @@ class _Reopening:
     settings: Settings
     path: Path
     threshold: float | None
+    budget: int | None
 
     def __call__(self) -> ServedCampaign:
         made = self.settings.load()
         campaign = self.settings.campaign(made, Store.existing(self.path))
-        return _served(Opened(self.settings, made, campaign, self.path), self.threshold)
+        return _served(Opened(self.settings, made, campaign, self.path), self.threshold, self.budget)
 
 
-def _served(opened: Opened, threshold: float | None) -> ServedCampaign:
+def _served(opened: Opened, threshold: float | None, budget: int | None) -> ServedCampaign:
     limit = limit_of(opened.experiment, opened.settings, threshold)
-    return ServedCampaign(opened.experiment, opened.campaign, limit, opened.settings.certificate_options)
+    totals = (budget, opened.settings.budget, opened.experiment.budget)
+    total = require("budget", PositiveInt, next(one for one in totals if one is not None))
+    return ServedCampaign(opened.experiment, opened.campaign, limit, opened.settings.certificate_options, total)
 
 
 def _web() -> Any:

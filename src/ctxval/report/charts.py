@@ -56,11 +56,13 @@ class Axis:
     Attributes:
         label: its name with the unit.
         low, high: its ends; if they are equal or not finite, it is widened to a range around them.
+        whole: whether its ticks are whole numbers.
     """
 
     label: str
     low: float
     high: float
+    whole: bool = False
 
     @classmethod
     def over(cls, label: str, *values: ArrayLike, zero: bool = False, room: float = 0.06) -> Axis:
@@ -81,7 +83,7 @@ class Axis:
     @property
     def ends(self) -> tuple[float, float]:
         """Its ends, which are different."""
-        if self.high - self.low > 1e-12 * max(abs(self.low), abs(self.high)):
+        if self.high - self.low > max(1e-12 * max(abs(self.low), abs(self.high)), 1e-300):
             return self.low, self.high
         width = 0.5 * abs(self.low) or 0.5
         return self.low - width, self.low + width
@@ -92,6 +94,7 @@ class Axis:
         raw = (high - low) / count
         power = 10.0 ** np.floor(np.log10(raw))
         step = power * next(one for one in (1.0, 2.0, 2.5, 5.0, 10.0) if one * power >= raw * (1 - 1e-9))
+        step = max(step, 1.0) if self.whole else step
         first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
         return [float(k * step) for k in np.arange(first, last + 1)][: 4 * count]
 

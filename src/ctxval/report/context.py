@@ -206,14 +206,38 @@ class ReportContext:
         """The distance over the tasks as the trials show it; None if it cannot be fitted."""
         return DistanceModel.of(self.completed)
 
+    @property
+    def batched(self) -> bool:
+        """Whether the experiment is loaded, and its synthesizer designs many controllers at once."""
+        return self.validation is not None and bool(getattr(self.validation.synthesizer, "batched", False))
+
+    def predicted(self, points: Array) -> Array | None:
+        """Return the distances ``(m,)`` that the learned dynamics predict at points of the unit cube ``(m, d)``.
+
+        They are None if nothing can be predicted, or if :attr:`distance_model` predicts the executed distances better,
+        each from the other trials.
+        """
+        learned, model = self.provenance.learned, self.distance_model
+        if learned is None:
+            return None
+        executed = {trial.number: distance_of(trial) for trial in self.completed}
+        errors = np.array([one.distance - executed[number] for number, one in self.replays.items()])
+        if model is not None and not (errors**2).mean() <= ((model.left_out.median - model.values) ** 2).mean():
+            return None
+        try:
+            with stage("predicting distances", len(points), "tasks"):
+                found = learned.expected(points, len(self.trials))
+        except Exception:  # the user's parts, at states that no execution has reached, must not end a report
+            return None
+        return found if np.isfinite(found).any() else None
+
     @functools.cached_property
     def replays(self) -> dict[int, Replay]:
         """The replays of the trials with recordings on the corrected model, by number; empty without the experiment."""
         if self.validation is None or not self.recordings:
             return {}
-        quick = bool(getattr(self.validation.synthesizer, "batched", False))
         by_number = {trial.number: trial for trial in self.completed}
-        numbers = list(self.recordings)[: MOST_REPLAYS if quick else _SLOW_REPLAYS]
+        numbers = list(self.recordings)[: MOST_REPLAYS if self.batched else _SLOW_REPLAYS]
         executed = [(by_number[number].unit_point, one.system) for number, one in self.recordings.items()]
         with stage("replaying executed tasks", len(numbers), "tasks"):
             found = replay_executed(self.validation, executed, [by_number[number].unit_point for number in numbers])

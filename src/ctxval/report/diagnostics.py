@@ -36,7 +36,7 @@ def diagnostics(context: ReportContext) -> list[Finding]:
     return findings_of(_QUESTIONS, context)
 
 
-def _executions(context: ReportContext) -> Finding:
+def _executions(context: ReportContext) -> Finding | None:
     states = ("failed", "unmeasured", "open")
     listed = {state: [trial.number for trial in context.trials if trial.state == state] for state in states}
     numbers = {"executions": context.executions, **listed}
@@ -49,25 +49,31 @@ def _executions(context: ReportContext) -> Finding:
         return Finding("Executions", "attention", f"Trials are open and wait for their results: {waiting}.", numbers)
     if not context.executions:
         return Finding("Executions", "unknown", "Nothing was executed.", numbers)
-    return Finding("Executions", "good", f"All {context.executions} executions gave a distance.", numbers)
+    return None
 
 
-def _certificate(context: ReportContext) -> Finding:
+def _certificate(context: ReportContext) -> Finding | None:
+    verdict, found = context.verdict, context.certificate
+    if verdict is None or verdict.answer == "falsified":
+        return None
+    if found is None:
+        return Finding("Certificate", "bad", f"Refused: {verdict.reason}")
+    if found.doubt is None:
+        return None
+    numbers = {"kind": found.kind, "upper_bound": _finite(found.upper_bound), "confidence": found.confidence}
+    return Finding("Certificate", "bad", f"Withdrawn: {found.doubt}.", numbers)
+
+
+def _rests_on_distances(context: ReportContext) -> bool:
+    """Return whether the answer depends on where the tasks lie: not a counterexample, not a bound from dynamics."""
     verdict, found = context.verdict, context.certificate
     if verdict is None:
-        return Finding("Certificate", "unknown", "There is no threshold, so there is no verdict.")
-    if found is None:
-        needed = verdict.answer == "falsified"
-        text = "Not needed: an executed distance exceeds the threshold." if needed else f"Refused: {verdict.reason}"
-        return Finding("Certificate", "unknown" if needed else "bad", text)
-    numbers = {"kind": found.kind, "upper_bound": _finite(found.upper_bound), "confidence": found.confidence}
-    if found.doubt is not None:
-        return Finding("Certificate", "bad", f"Withdrawn: {found.doubt}.", numbers)
-    return Finding("Certificate", "good", f"{found.kind}: {found.statement}", numbers)
+        return True
+    return verdict.answer != "falsified" and found is not None and (found.kind != "dynamics" or found.doubt is not None)
 
 
 def _covering(context: ReportContext) -> Finding | None:
-    if not len(context.points):
+    if not len(context.points) or not _rests_on_distances(context):
         return None
     farthest = farthest_task(context.points)
     share = share_far_from_trials(context.points)
@@ -95,7 +101,7 @@ def share_far_from_trials(points: Array, resolution: float = RESOLUTION) -> floa
 
 def _converged(context: ReportContext) -> Finding | None:
     distances = context.distances
-    if len(distances) < 2:
+    if len(distances) < 2 or not _rests_on_distances(context):
         return None
     so_far = np.maximum.accumulate(distances)
     last = int(np.argmax(so_far >= (1 - _IMPROVED) * so_far[-1]))
@@ -110,7 +116,7 @@ def _converged(context: ReportContext) -> Finding | None:
 
 def _smooth(context: ReportContext) -> Finding | None:
     model = context.distance_model
-    if model is None:
+    if model is None or not _rests_on_distances(context):
         return None
     size = model.calibration
     light: Light = "good" if _CALIBRATED[0] <= size <= _CALIBRATED[1] else "attention" if size <= _ROUGH else "bad"

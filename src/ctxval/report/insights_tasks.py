@@ -34,12 +34,8 @@ def weak_region(context: ReportContext) -> Finding | None:
     share = 0.0 if model is None else float((model.over_tasks.median > tau).mean())
     numbers = {"executed_above": int(above.sum()), "executed": len(above), "predicted_share_above": share}
     if not above.any():
-        ratio = percent(float(context.distances.max()) / tau, 3)
-        text = (
-            f"No executed task exceeds {quantity(tau, units)}: the largest distance is {largest}, {ratio} of the "
-            f"threshold. The trials predict that {percent(share)} of the tasks exceed it."
-        )
-        return Finding("Where M is weak", "good" if not share else "attention", text, numbers)
+        text = f"No executed task exceeds {quantity(tau, units)}, but the trials predict that {percent(share)} do."
+        return Finding("Where M is weak", "attention", text, numbers) if share else None
     weak = context.points[above] if model is None or share < _RARE else model.tasks[model.over_tasks.median > tau]
     text = (
         f"{int(above.sum())} of {len(above)} executed tasks exceed {quantity(tau, units)}, the largest with {largest}: "
@@ -79,8 +75,7 @@ def weak_states(context: ReportContext) -> Finding | None:
     which = "above the threshold" if _is_above(context) else "with the largest distances"
     numbers = {"signal": label, "beyond": float(beyond[j])}
     if beyond[j] < 0.05:
-        text = f"{counted(int(weak.sum()), 'trial')} {which}: the states and inputs are the same as in the others."
-        return Finding("States visited there", "good", text, numbers)
+        return None
     text = (
         f"{counted(int(weak.sum()), 'trial')} {which}: {label} goes from {number(low[weak, j].min())} to "
         f"{number(high[weak, j].max())}; all others stay within {number(inside_low[j])} and {number(inside_high[j])}."

@@ -17,6 +17,9 @@ from ctxval._util.texts import plain, shortened, visible
 LONGEST = 2_000
 """Characters of one text."""
 
+UNCUT = 100_000
+"""Characters of one text that must never be shortened, such as an assumption."""
+
 _CELL = 300
 """Characters of a cell of a table."""
 

@@ -66,11 +66,12 @@ def page(context: ReportContext, sections: Sequence[Section] = ()) -> str:
     with np.errstate(all="ignore"):  # a store may have any numbers
         rendered = [rendered_section(section, context) for section in sections_of(SECTIONS, sections)]
     name = visible(context.name) or "campaign"
-    return framed(f"Validation of {name}", f"Store {context.store.name}; report made {now()}.", rendered)
+    made = f"Store {context.store.name}; report made {now()}."
+    return framed(f"Validation of {name}", made, rendered, folded=True)
 
 
-def framed(title: str, subtitle: str, sections: Sequence[Rendered]) -> str:
-    """Return sections in the frame of every page: headings, navigation, style, script and content security policy."""
+def framed(title: str, subtitle: str, sections: Sequence[Rendered], *, folded: bool = False) -> str:
+    """Return sections in the frame of every page; ``folded`` folds all but the first one."""
     style, script = _asset("report.css"), _asset("report.js")
     return _template().render(
         title=text(title, 200),
@@ -79,6 +80,7 @@ def framed(title: str, subtitle: str, sections: Sequence[Rendered]) -> str:
         style=Markup(style),
         script=Markup(script),
         sections=sections,
+        folded=folded,
         version=VERSION,
     )
 

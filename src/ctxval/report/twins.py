@@ -15,13 +15,11 @@ from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.insights import insights
-from ctxval.report.markup import number, quantity
+from ctxval.report.markup import UNCUT, number, quantity
 from ctxval.report.sections.appendix import appendix, appendix_json
-from ctxval.report.sections.repeat import command_of, command_snippet, identity, python_snippet
+from ctxval.report.sections.repeat import command_snippet, identity, python_snippet, repeating_command
 
 _WORST = 5
-
-"""The first bytes of a store."""
 
 
 def to_json(context: ReportContext) -> dict[str, Any]:
@@ -49,7 +47,7 @@ def to_json(context: ReportContext) -> dict[str, Any]:
                 }
                 for trial in context.worst_tasks(_WORST)
             ],
-            "command": command_of(context) or None,
+            "command": repeating_command(context) or None,
             "identity": identity(context),
             "appendix": appendix_json(context),
         }
@@ -123,11 +121,11 @@ def markdown(context: ReportContext) -> str:
         "",
         "## Diagnostics",
         "",
-        *map(_item, diagnostics(context)),
+        *_items(diagnostics(context)),
         "",
         "## Insights",
         "",
-        *map(_item, insights(context)),
+        *_items(insights(context)),
         "",
         "## What was not tested",
         "",
@@ -142,7 +140,7 @@ def markdown(context: ReportContext) -> str:
         "## For the file",
         "",
         *(
-            f"- **{markdown_text(one.term)}** ({one.standard}): {markdown_text(one.content)}"
+            f"- **{markdown_text(one.term)}** ({one.standard}): {markdown_text(one.content, UNCUT)}"
             for one in appendix(context)
         ),
         "",
@@ -152,8 +150,10 @@ def markdown(context: ReportContext) -> str:
     return "\n".join(lines)
 
 
-def _item(finding: Finding) -> str:
-    return f"- {WORDS[finding.light]}: **{markdown_text(finding.name)}.** {markdown_text(finding.text)}"
+def _items(findings: list[Finding]) -> list[str]:
+    return [f"- {WORDS[one.light]}: **{markdown_text(one.name)}.** {markdown_text(one.text)}" for one in findings] or [
+        "Nothing is unusual."
+    ]
 
 
 def _worst_rows(context: ReportContext, units: str) -> list[str]:

@@ -148,7 +148,7 @@ class Desk:
             campaign.validation.space,
             experiment.units,
             self._served.threshold,
-            experiment.budget,
+            self._served.budget,
             self._decides(),
         )
 

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 _WAIT = 60.0
 """Seconds to wait for another process that chooses a task or runs the store."""
 
-_FURTHER = 100
-"""Largest number of further executions for a verdict: no task is chosen for a bound that needs more."""
-
 Files = dict[str, bytes]
 """The files of a trial by name."""
 
@@ -96,14 +93,14 @@ def warm_up(served: ServedCampaign, tell: TellStage) -> None:
     """Do nothing: the experiment is loaded now, and the first choice need not wait for it."""
 
 
-def choose(served: ServedCampaign, tell: TellStage, request: TaskRequest) -> tuple[int, Files]:
-    """Open the next trial; return its number and its files."""
+def choose(served: ServedCampaign, tell: TellStage, request: TaskRequest) -> tuple[int, Files] | None:
+    """Open the next trial; return its number and its files. None: the verdict is reached or the budget is spent."""
     tell(Stage("choosing a task"))
     opened = _ask(served, request)
-    return opened.number, _files(served, opened)
+    return None if opened is None else (opened.number, _files(served, opened))
 
 
-def _ask(served: ServedCampaign, request: TaskRequest) -> OpenTrial:
+def _ask(served: ServedCampaign, request: TaskRequest) -> OpenTrial | None:
     campaign = served.campaign
     with campaign.store.sole_writer(_WAIT):
         campaign.refresh()
@@ -113,26 +110,15 @@ def _ask(served: ServedCampaign, request: TaskRequest) -> OpenTrial:
                 "one more task, ask again."
             )
         if request.decides:
-            return _ask_for_verdict(served)
+            if served.threshold is None:
+                raise InputError(
+                    "there is no threshold, so no task decides a verdict: start the server with --threshold."
+                )
+            return campaign.ask_for_verdict(served.threshold, served.budget, certificate=served.certificate)
         parameters = request.parameters
         if request.again is not None:
             parameters = parameters_of_trial(campaign, request.again)
         return campaign.ask(parameters, draw=request.draw, because=request.because)
-
-
-def _ask_for_verdict(served: ServedCampaign) -> OpenTrial:
-    campaign, threshold = served.campaign, served.threshold
-    if threshold is None:
-        raise InputError("there is no threshold, so no task decides a verdict: start the server with --threshold.")
-    # At a rig people decide when to stop, so the budget is never what ends the campaign.
-    budget = len(campaign.trials) + _FURTHER
-    opened = campaign.ask_for_verdict(threshold, budget, certificate=served.certificate)
-    if opened is None:
-        raise InputError(
-            f"the verdict against {threshold:g} is reached, so no further execution is needed for it. For more "
-            "executions, choose a task in another way."
-        )
-    return opened
 
 
 def files_of(served: ServedCampaign, tell: TellStage, number: int) -> Files:

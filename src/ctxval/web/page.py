@@ -10,6 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
+from ctxval._util.representation import counted
 from ctxval.campaign.telling import result_sentence
 from ctxval.core.trial import Trial
 from ctxval.web.desk import Snapshot
@@ -107,6 +108,7 @@ class Page:
             work=background,
             snapshot=snapshot,
             opened=opened,
+            enough=self._enough(),
             rows=[self._row(trial) for trial in reversed(shown)],
             left_out=len(snapshot.trials) - len(shown),
             again=[(trial.number, in_words(trial, description.space.units)) for trial in shown if trial.executed],
@@ -180,7 +182,22 @@ class Page:
             return "No task was chosen."
         if background.chosen is not None:
             return f"Trial {background.chosen} is open."
-        return ""
+        return self._enough() or ""
+
+    def _enough(self) -> str | None:
+        """Return why no further task is needed for the verdict; None if one may be."""
+        service, snapshot = self._service, self._service.snapshot
+        work, about = service.background, service.description
+        if not about.decides or snapshot.waiting or work.choosing is not None:
+            return None
+        judged = work.judgement if work.judged == snapshot.ended else None
+        if judged is not None and judged.answer != "undecided":
+            return f"The verdict is reached: {judged.answer}. No further execution is needed for it."
+        if not work.enough:
+            return None
+        if snapshot.executions >= about.budget:
+            return f"The budget of {counted(about.budget, 'execution')} is spent."
+        return "The verdict is reached. No further execution is needed for it."
 
     def ended(self, number: int) -> str | None:
         """Return the result of a trial in one sentence without its full stop; None if it has none."""

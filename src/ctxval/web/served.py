@@ -19,12 +19,14 @@ class ServedCampaign:
         campaign: the campaign; only the thread that opened it may use it.
         threshold: tau; None if there is no verdict.
         certificate: the kind and the options of the certificate.
+        budget: the largest number of executions that are chosen for the verdict.
     """
 
     experiment: Experiment
     campaign: Campaign
     threshold: float | None
     certificate: CertificateOptions
+    budget: int
 
 
 OpenCampaign = Callable[[], ServedCampaign]

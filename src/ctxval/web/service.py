@@ -85,6 +85,7 @@ class Background:
     Attributes:
         choosing, judging: present work; None if there is none.
         choice_error: why the last choice failed; None if it did not.
+        enough: whether the last choice found that the verdict is reached or the budget is spent.
         chosen: the number of the trial that was opened last from this page; None if none was.
         judgement: the last verdict; None if there is none.
         judged: the trials that it is about, as :attr:`Snapshot.ended`.
@@ -97,6 +98,7 @@ class Background:
     choosing: Work | None = None
     judging: Work | None = None
     choice_error: str | None = None
+    enough: bool = False
     chosen: int | None = None
     judgement: Judgement | None = None
     judged: tuple[int, int] | None = None
@@ -165,7 +167,7 @@ class CampaignService:
                 f"another task was opened since this page was loaded, as trial {len(self.snapshot.trials) - 1}. If you "
                 "need one more task, ask again."
             )
-        self._update(choosing=Work.begun("choosing a task"), choice_error=None, chosen=None)
+        self._update(choosing=Work.begun("choosing a task"), choice_error=None, chosen=None, enough=False)
         self._spawn(self._choose(request))
 
     async def tell(self, number: int, told: ToldResult, submission: str) -> Trial:
@@ -251,11 +253,13 @@ class CampaignService:
 
     async def _choose(self, request: TaskRequest) -> None:
         try:
-            number, files = await self._background(self._chooser, jobs.choose, request)
+            found = await self._background(self._chooser, jobs.choose, request)
         except CtxvalError as error:
             self._update(choosing=None, choice_error=str(error))
         else:
-            self._update(choosing=None, chosen=number, files={**self.background.files, number: files})
+            number, files = found or (None, {})
+            kept = self.background.files if number is None else {**self.background.files, number: files}
+            self._update(choosing=None, chosen=number, enough=found is None, files=kept)
         await self._look()
 
     async def _watch(self) -> None:
@@ -281,7 +285,7 @@ class CampaignService:
         if not _same(found, self.snapshot):
             self.snapshot = found
             self._follow()
-            self._update()
+            self._update(enough=False)
 
     def _follow(self) -> None:
         """Prepare the files of open trials, forget those of others, and judge the trials that have ended."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ctxval.report.sections.appendix import AppendixSection
 from ctxval.report.sections.base import Section, sections_of
+from ctxval.report.sections.basis import BasisSection
 from ctxval.report.sections.convergence import ConvergenceSection
 from ctxval.report.sections.insights import InsightsSection
 from ctxval.report.sections.repeat import RepeatSection
@@ -13,6 +14,7 @@ from ctxval.report.sections.verdict import VerdictSection
 
 SECTIONS: tuple[Section, ...] = (
     VerdictSection(),
+    BasisSection(),
     InsightsSection(),
     TasksSection(),
     TrialsSection(),
@@ -25,6 +27,7 @@ SECTIONS: tuple[Section, ...] = (
 __all__ = [
     "SECTIONS",
     "AppendixSection",
+    "BasisSection",
     "ConvergenceSection",
     "InsightsSection",
     "RepeatSection",

@@ -12,7 +12,7 @@ from ctxval.certificates.bounds import at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
 from ctxval.report.findings import WORDS
-from ctxval.report.markup import joined, number, paragraph, quantity, table
+from ctxval.report.markup import UNCUT, joined, number, paragraph, quantity, table, text
 from ctxval.report.sections.repeat import command_of, digest
 from ctxval.version import VERSION
 
@@ -41,7 +41,7 @@ class AppendixSection:
 
     def render(self, context: ReportContext) -> Markup:
         """Return the entries as a table."""
-        rows = [(one.term, one.content, one.standard) for one in appendix(context)]
+        rows = [(one.term, text(one.content, UNCUT), one.standard) for one in appendix(context)]
         return joined(
             [
                 paragraph(
@@ -182,7 +182,7 @@ def _assumptions(context: ReportContext) -> str:
 
 
 def _verification(context: ReportContext) -> str:
-    said = "; ".join(f"{one.name}: {WORDS[one.light]}" for one in diagnostics(context))
+    said = "; ".join(f"{one.name}: {WORDS[one.light]}" for one in diagnostics(context)) or "nothing is unusual"
     return (
         "Software and solution verification of the model itself are not part of this campaign. Diagnostics of the "
         f"campaign: {said}."

@@ -1,4 +1,4 @@
-"""The largest distance and the bound against the executions, and the time of each execution."""
+"""The distances in the order of the executions with the bound, and the time of each execution."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from markupsafe import Markup
 
 from ctxval._util.representation import call
 from ctxval.report.charts import Axis, Chart
-from ctxval.report.context import ReportContext, distance_of
+from ctxval.report.context import ReportContext
+from ctxval.report.diagnostics import stored_predictions
 from ctxval.report.markup import element, joined, number, paragraph
 
 
@@ -18,22 +19,26 @@ class ConvergenceSection:
 
     def render(self, context: ReportContext) -> Markup:
         """Return the chart of the distances and the chart of the times."""
-        if not context.completed:
+        chart = distances_in_order(context)
+        if chart is None:
             return paragraph("No distance is known yet.")
-        return joined([element("div", _distances(context), _times(context), class_="charts"), _spent(context)])
+        return joined([element("div", chart, _times(context), class_="charts"), _spent(context)])
 
     __repr__ = call
 
 
-def _distances(context: ReportContext) -> Chart:
+def distances_in_order(context: ReportContext) -> Chart | None:
+    """Return the distance of each trial and the largest one so far, with the limits; None if no distance is known."""
+    if not context.completed:
+        return None
     numbers = np.array([trial.number for trial in context.completed], dtype=np.float64)
     so_far = np.maximum.accumulate(context.distances)
     last = float(max(trial.number for trial in context.trials))
     limits = [one for one in (context.threshold, context.bound) if one is not None]
-    x = Axis.over("trial", [0.0, max(last, 1.0)], room=0.02)
+    beforehand = [(trial.number, one.median) for trial, one in stored_predictions(context)]
     chart = Chart(
-        "Distance of each trial and the largest one so far, with the threshold and the bound",
-        x,
+        "Distance of each trial, and the largest one so far",
+        _trial_axis(last),
         Axis.over(context.distance_label, context.distances, limits, zero=True),
     )
     risen = np.flatnonzero(np.diff(so_far, prepend=-1.0) > 0)  # the line is the same without all other points
@@ -41,7 +46,10 @@ def _distances(context: ReportContext) -> Chart:
     chart.line(np.append(steps[0], last), np.append(steps[1], so_far[-1]), "best", "largest so far")
     chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
     names = [f"trial {trial.number}: {number(trial.distance)}" for trial in context.completed]
-    chart.marks(numbers, context.distances, "sample", "distance", names)
+    if beforehand:
+        at, expected = zip(*beforehand, strict=True)
+        chart.marks(at, expected, "covering", "predicted before the execution")
+    chart.marks(numbers, context.distances, "sample", "executed", names)
     failed = [float(trial.number) for trial in context.failed]
     if failed:
         where = np.full(len(failed), 0.03 * chart.y.ends[1])
@@ -56,24 +64,24 @@ def _times(context: ReportContext) -> Chart | None:
     numbers, seconds = np.array(timed, dtype=np.float64).T
     chart = Chart(
         "Time of each execution",
-        Axis.over("trial", [0.0, max(float(numbers.max()), 1.0)], room=0.02),
+        _trial_axis(float(numbers.max())),
         Axis.over("time [s]", seconds, zero=True),
     )
     return chart.marks(numbers, seconds, "sample", "time of the execution")
 
 
-def _spent(context: ReportContext) -> Markup:
+def _trial_axis(last: float) -> Axis:
+    return Axis("trial", -0.02 * max(last, 1.0), 1.02 * max(last, 1.0), whole=True)
+
+
+def _spent(context: ReportContext) -> Markup | None:
     timed = [trial.seconds for trial in context.trials if trial.seconds is not None]
     attempts = sum(trial.attempts for trial in context.trials)
-    worst = context.worst_first[0]
-    said = (
-        f"{context.executions} executions in {len(context.trials)} trials, with {attempts} attempts. The largest "
-        f"distance, {number(distance_of(worst))}, was found in trial {worst.number}."
-    )
+    said = []
+    if attempts > len(context.trials):
+        said.append(f"{attempts} attempts were made in {len(context.trials)} trials.")
     if timed:
-        said += (
-            f" The executions took {number(float(np.sum(timed)))} s, {number(float(np.median(timed)))} s in the median."
+        said.append(
+            f"The executions took {number(float(np.sum(timed)))} s, {number(float(np.median(timed)))} s in the median."
         )
-    else:
-        said += " The times of the executions were not recorded."
-    return paragraph(said)
+    return paragraph(" ".join(said)) if said else None

@@ -8,7 +8,7 @@ from ctxval._util.representation import call
 from ctxval.report.context import ReportContext
 from ctxval.report.insights import insights
 from ctxval.report.markup import paragraph
-from ctxval.report.sections.verdict import lights
+from ctxval.report.sections.basis import lights
 
 
 class InsightsSection:
@@ -17,8 +17,8 @@ class InsightsSection:
     title = "Insights"
 
     def render(self, context: ReportContext) -> Markup:
-        """Return the insights; nothing can be said of a campaign without distances."""
+        """Return the insights, which say nothing of what is as it should be."""
         found = insights(context)
-        return lights(found) if found else paragraph("No distance is known yet, so nothing can be said.")
+        return lights(found) if found else paragraph("Nothing is unusual.")
 
     __repr__ = call

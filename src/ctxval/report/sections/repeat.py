@@ -19,13 +19,15 @@ from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.trial import Trial
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.markup import code, heading, joined, number, paragraph, table
+from ctxval.searches import DEFAULT as DEFAULT_SEARCH
 from ctxval.version import VERSION
 
 _WORST = 5
 _PACKAGES = ("numpy", "scipy")
 _SAME = (
-    "The same command makes the same choices with the same versions of the libraries on the same kind of processor. "
-    "The option thinking of the search auto must then be a number, fast or thorough: balanced measures times."
+    "The command makes the same choices again, into a new store, with the same versions of the libraries on the same "
+    "kind of processor. The option thinking of the search auto must then be a number, fast or thorough: balanced "
+    "measures times."
 )
 _FILE = (
     "The experiment is described in a file. The store keeps its content, but not its name, so its name is assumed here."
@@ -39,7 +41,7 @@ class RepeatSection:
 
     def render(self, context: ReportContext) -> Markup:
         """Return the command, the seed, the versions, the digests and a snippet for each of the worst tasks."""
-        command = command_of(context)
+        command = repeating_command(context)
         parts = [
             paragraph(_SAME) if command else paragraph("No command made this store, so there is none that repeats it."),
             code(command, "Command that repeats the campaign") if command else Markup(""),
@@ -97,8 +99,23 @@ def digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def command_of(context: ReportContext) -> str:
-    """Return the command that runs the campaign; empty if no command made the store."""
+def repeating_command(context: ReportContext) -> str:
+    """Return the command that runs the campaign again, into a new store; empty if no command made the store.
+
+    The new store has a folder of its own, because it is no other campaign among which one is chosen.
+    """
+    path = Path(path_of(context))
+    return command_of(context, None, "--store", str(path.parent / "again" / path.name))
+
+
+def command_of(context: ReportContext, budget: int | None = None, *others: str) -> str:
+    """Return the command that runs the campaign; empty if no command made the store.
+
+    Args:
+        context: what the report is made from.
+        budget: another budget than that of the campaign.
+        others: further words.
+    """
     settings = context.settings
     if not settings:
         return ""
@@ -106,9 +123,9 @@ def command_of(context: ReportContext) -> str:
     words = ["ctxval", "run", str(named) if named else f"{settings.get('name') or 'experiment'}.toml"]
     search, certificate, options = (_mapping(settings.get(name)) for name in ("search", "certificate", "options"))
     given = {
-        "--search": search.get("name"),
-        "--seed": settings.get("seed"),
-        "--budget": settings.get("budget") or context.budget,
+        "--search": search.get("name") if not named else _unless(DEFAULT_SEARCH, search.get("name")),
+        "--seed": settings.get("seed") if not named else _unless(0, settings.get("seed")),
+        "--budget": budget or settings.get("budget") or context.budget,
         "--threshold": settings.get("threshold"),
         "--confidence": _unless(CONFIDENCE, settings.get("confidence")),
         "--resolution": _unless(RESOLUTION, certificate.get("resolution")),
@@ -125,10 +142,10 @@ def command_of(context: ReportContext) -> str:
     words += [flag for flag, wanted in flags.items() if wanted is True]
     for name, value in options.items():
         words += ["--option", f"{name}={value}"]
-    return shlex.join(words)
+    return shlex.join([*words, *others])
 
 
-def _unless(default: float, value: Any) -> Any:
+def _unless(default: object, value: Any) -> Any:
     return None if value == default else value
 
 
@@ -152,7 +169,7 @@ def python_snippet(context: ReportContext, trial: Trial) -> str:
     if context.settings:
         made = (
             "from ctxval import Store\nfrom ctxval.config.stored_settings import trusted_settings\n\n"
-            f"store = Store.existing({str(_path(context))!r})\n"
+            f"store = Store.existing({str(path_of(context))!r})\n"
             "validation = trusted_settings(store).load().validation"
         )
     return (
@@ -163,8 +180,9 @@ def python_snippet(context: ReportContext, trial: Trial) -> str:
 
 def command_snippet(context: ReportContext, trial: Trial) -> str:
     """Return the command that opens the task of a trial again, and writes its controller to files."""
-    return shlex.join(["ctxval", "ask", str(_path(context)), "--again", str(trial.number)])
+    return shlex.join(["ctxval", "ask", str(path_of(context)), "--again", str(trial.number)])
 
 
-def _path(context: ReportContext) -> Path | str:
+def path_of(context: ReportContext) -> Path | str:
+    """Return the path of the store, for a command."""
     return context.store.name if context.store.path is not None else "campaign.sqlite"

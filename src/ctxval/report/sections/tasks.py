@@ -18,15 +18,18 @@ from ctxval.report.markup import bar, element, heading, joined, number, paragrap
 from ctxval.report.parallel import parallel_coordinates
 from ctxval.report.region import region_map
 
-_CURVE, _GRID = 121, 48
+_CURVE, _GRID = 121, 32
 """Number of points of a curve, and of each side of a map."""
+
+_SLOW_CURVE = 31
+"""Number of points of a curve, if each needs the design of a controller that cannot be made in a batch."""
 
 _SLICES = 12
 """Largest number of slices: of the parameters to which the distance is most sensitive."""
 
 _ORIGINS: tuple[tuple[Kind, str, tuple[str, ...]], ...] = (
     ("initial", "initial or chosen by a person", ("iid", "initial", "manual")),
-    ("covering", "chosen to cover the tasks", ("covering",)),
+    ("covering", "chosen to decide the verdict", ("covering",)),
     ("sample", "chosen by the search", ("acquisition",)),
 )
 
@@ -41,9 +44,11 @@ class TasksSection:
         model = context.distance_model
         if model is None:
             return paragraph("Fewer than two distances are known, so no picture of the distance can be drawn.")
-        shares = [_sensitivity(context, model)] if context.space.dimension > 1 else []
-        second = element("div", *shares, _predicted(context, model), class_="charts")
-        parts = [_space_charts(context, model), second]
+        if context.space.dimension == 1:  # the distance over the tasks is on the first screen
+            parts = [element("div", _predicted(context, model), class_="charts")]
+        else:
+            second = element("div", _sensitivity(context, model), _predicted(context, model), class_="charts")
+            parts = [_space_charts(context, model), second]
         mapped = region_map(context)
         if mapped is not None:
             parts += [heading("Where the threshold is kept"), mapped]
@@ -54,46 +59,57 @@ class TasksSection:
 
 def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:
     d = context.space.dimension
-    said = paragraph(
-        "The line and the band are a Gaussian process of the executed distances with its 95 % band, which is cut at "
-        "zero. It is a picture of what the trials suggest and not a certificate."
-    )
-    if d == 1:
-        return joined([said, element("div", _slice(context, model, 0, samples=True), class_="charts wide")])
+    said = paragraph("Lines, bands and maps are pictures of what the trials suggest, and no certificate.")
     if d == 2:
-        both = (_slice(context, model, axis) for axis in range(2))
+        both = (_slice(context, axis) for axis in range(2))
         return joined([said, element("div", _map(context, model), *both, class_="charts")])
     axes = [int(j) for j in np.argsort(-model.sensitivity, kind="stable")[:_SLICES]]
-    left_out = d - len(axes)
-    more = paragraph(f"{left_out} parameters with less influence have no slice here.") if left_out else None
-    slices = [_slice(context, model, axis, small=True) for axis in axes]
+    if d > len(axes):
+        said += paragraph(f"{d - len(axes)} parameters with less influence have no slice here.")
+    slices = filter(None, (_slice(context, axis, small=True) for axis in axes))
     return joined(
         [
             said,
             heading("Slices through the worst task"),
-            small_charts(slices),
-            more or Markup(""),
+            small_charts(list(slices)),
             heading("All tasks at once"),
             parallel_coordinates(context),
         ]
     )
 
 
-def _slice(
-    context: ReportContext, model: DistanceModel, axis: int, *, samples: bool = False, small: bool = False
-) -> Chart:
-    """Return the distance along one parameter, through the worst executed task."""
+def distance_over_task(context: ReportContext) -> Chart | None:
+    """Return the distance over the only parameter with the executed tasks; None if too few distances are known."""
+    return _slice(context, 0) if context.worst_first else None
+
+
+def _estimated(context: ReportContext, unit: Array) -> Band | None:
+    """Return the distances at points of the unit cube by the learned dynamics, or by a Gaussian process with a band."""
+    values = context.predicted(unit) if context.batched or context.space.dimension == 1 else None
+    if values is not None:
+        return Band(values, values, values)
+    return None if context.distance_model is None else context.distance_model.predict(unit)
+
+
+def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart | None:
+    """Return the distance along one parameter, through the worst executed task; None if it cannot be estimated."""
     space, worst = context.space, context.worst_first[0]
-    unit = np.tile(worst.unit_point, (_CURVE, 1))
-    unit[:, axis] = np.linspace(0, 1, _CURVE)
-    x, band = space.from_unit(unit)[:, axis], model.predict(unit)
+    count = _CURVE if context.batched or context.validation is None else _SLOW_CURVE
+    unit = np.tile(worst.unit_point, (count, 1))
+    unit[:, axis] = np.linspace(0, 1, count)
+    x, band = space.from_unit(unit)[:, axis], _estimated(context, unit)
+    if band is None:
+        return None
     label = space.labels[axis]
     title = f"Distance over {label}" + ("" if space.dimension == 1 else ", through the worst executed task")
     ends = Axis(label, float(space.low[axis]), float(space.high[axis]))
     chart = Chart(title, ends, _distance_axis(context, band), **(SMALL if small else {}))
-    chart.band(x, band.low, band.high, "95 % band").line(x, band.median, "mean", "Gaussian process")
+    if band.low is band.high:
+        chart.line(x, band.median, "mean", "predicted by the learned dynamics")
+    else:
+        chart.band(x, band.low, band.high, "95 % band").line(x, band.median, "mean", "Gaussian process of the distance")
     chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
-    if samples:
+    if space.dimension == 1:
         _add_samples(chart, context, lambda trials: (context.coordinates(trials)[:, axis], _distances(trials)))
         _add_failed(chart, context, axis)
     at = context.coordinates([worst])[:, axis]
@@ -114,7 +130,8 @@ def _map(context: ReportContext, model: DistanceModel) -> Markup:
     space = context.space
     side = np.linspace(0, 1, _GRID)
     unit = np.stack(np.meshgrid(side, side, indexing="xy"), axis=-1).reshape(-1, 2)
-    values = model.predict(unit).median.reshape(_GRID, _GRID)
+    found = _estimated(context, unit) or model.predict(unit)
+    values = np.nan_to_num(found.median, nan=float(context.distances.max())).reshape(_GRID, _GRID)
     low, high = 0.0, max(float(values.max()), float(context.distances.max()))
     x, y = (Axis(space.labels[i], float(space.low[i]), float(space.high[i])) for i in range(2))
     chart = Chart("Map of the distance over the two parameters, with the executed tasks", x, y, height=360)

@@ -10,10 +10,11 @@ from markupsafe import Markup
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, counted
+from ctxval._util.texts import parted
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, small_charts
 from ctxval.report.context import Recording, ReportContext
-from ctxval.report.markup import cell, details, element, heading, joined, number, paragraph, quantity
+from ctxval.report.markup import cell, details, element, heading, joined, paragraph, quantity
 from ctxval.report.recorded_lines import RecordedLines, recorded_lines
 
 DATA = "trial-data"
@@ -42,7 +43,7 @@ class TrialsSection:
         lines = recorded_lines(context)
         return joined(
             [
-                paragraph(_left_out(context, lines)),
+                _left_out(context, lines),
                 _table(context, lines),
                 element("div", id="trial", aria_live="polite", class_="needs-script"),
                 data_element(DATA, lines.data),
@@ -61,11 +62,12 @@ def data_element(identifier: str, data: Any) -> Markup:
     return element("script", Markup(plain), type="application/json", id=identifier)
 
 
-def _left_out(context: ReportContext, lines: RecordedLines) -> str:
-    said = [f"The page has the trajectories of {len(lines.kept)} of {len(context.trials)} trials."]
+def _left_out(context: ReportContext, lines: RecordedLines) -> Markup:
+    said = []
     if lines.left_out:
         said.append(
-            f"Those of {len(lines.left_out)} trials with smaller distances are left out, so that the page stays small."
+            f"The page has the trajectories of {len(lines.kept)} of {len(context.trials)} trials. Those of "
+            f"{len(lines.left_out)} trials with smaller distances are left out, so that the page stays small."
         )
     if lines.thinned:
         said.append(f"Each line has about {lines.points} of the recorded points; `ctxval export` writes all of them.")
@@ -73,7 +75,7 @@ def _left_out(context: ReportContext, lines: RecordedLines) -> str:
         said.append("The corrected model is not drawn, because the experiment is not loaded.")
     elif context.replays:
         said.append("The corrected model in each trial is learned from the other trials.")
-    return " ".join(said)
+    return paragraph(" ".join(said)) if said else Markup("")
 
 
 def _table(context: ReportContext, lines: RecordedLines) -> Markup:
@@ -116,15 +118,16 @@ def _worst(context: ReportContext) -> Markup:
         return paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")
     parts = [heading(f"The {counted(len(worst), 'worst task')}")]
     for trial in worst:
-        head = f"Trial {trial.number}: {quantity(trial.distance, context.labels.units)} at {_where(context, trial)}"
+        head = f"Trial {trial.number}: {quantity(trial.distance, context.labels.units)} at {task_of(context, trial)}"
         charts = small_charts(_signals(context, trial.number))
         parts.append(details(head, charts, opened=trial is worst[0]))
     return joined(parts)
 
 
-def _where(context: ReportContext, trial: Trial) -> str:
-    values = context.coordinates([trial])[0].tolist()
-    listed = [f"{label} = {number(value)}" for label, value in zip(context.space.labels, values, strict=True)]
+def task_of(context: ReportContext, trial: Trial) -> str:
+    """Return the task of a trial: its first parameters with their units."""
+    values, labels = context.coordinates([trial])[0].tolist(), map(parted, context.space.labels)
+    listed = [f"{name} = {quantity(value, unit)}" for (name, unit), value in zip(labels, values, strict=True)]
     return ", ".join(listed[:4]) + (f" and {len(listed) - 4} more" if len(listed) > 4 else "")
 
 

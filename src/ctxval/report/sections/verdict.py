@@ -1,133 +1,154 @@
-"""The verdict in one sentence, the diagnostics, and what was not tested."""
+"""The first screen: the verdict in one sentence, the distance over the tasks, and what to do next."""
 
 from __future__ import annotations
+
+import shlex
 
 from markupsafe import Markup
 
 from ctxval._util.representation import call, counted
-from ctxval.certificates.bounds import as_text, at_most, with_error
+from ctxval.certificates import Certificate
+from ctxval.certificates.bounds import at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
-from ctxval.report.diagnostics import diagnostics, not_tested
-from ctxval.report.findings import WORDS, Finding
-from ctxval.report.markup import bullets, details, element, heading, joined, number, paragraph, quantity, table
+from ctxval.report.diagnostics import diagnostics
+from ctxval.report.findings import WORDS
+from ctxval.report.insights import insights
+from ctxval.report.markup import code, element, heading, joined, paragraph, percent, quantity, table
+from ctxval.report.sections.convergence import distances_in_order
+from ctxval.report.sections.repeat import command_of, path_of
+from ctxval.report.sections.tasks import distance_over_task
+from ctxval.report.sections.trials import task_of
 from ctxval.storage.other_stores import other_stores
 
-_SHAPES = {"good": "\u25cf", "note": "\u25c6", "attention": "\u25b2", "bad": "\u25a0", "unknown": "\u25cb"}
-"""A shape for each light, because colours alone tell nothing in grey print."""
+_SHAPES = {"validated": "\u2714", "falsified": "\u2718", "undecided": "?", "no verdict": "\u2013"}
+"""A shape for each verdict, because colours alone tell nothing in grey print."""
 
+_MORE = 10
+"""Number of further executions that are advised if none can be forecast."""
 
 _STORES = 5
 """Largest number of other stores that are named."""
 
 
 class VerdictSection:
-    """The verdict, with what it rests on."""
+    """The verdict, with the picture that shows it best."""
 
     title = "Verdict"
 
     def render(self, context: ReportContext) -> Markup:
-        """Return the sentence, the facts, the diagnostics and what was not tested."""
+        """Return the verdict, its sentence, the picture, the next step and the numbers."""
+        answer = "no verdict" if context.verdict is None else context.verdict.answer
+        shape = element("span", _SHAPES[answer], class_="shape", aria_hidden="true")
+        word = element("p", shape, " ", answer.capitalize(), class_="word")
+        chart = (distance_over_task(context) if context.space.dimension == 1 else None) or distances_in_order(context)
+        drawn = paragraph("No distance is known yet.") if chart is None else chart
+        said, command = _next(context)
+        block = code(command, "Next command") if command else None
+        beside = element("div", heading("What next"), paragraph(said), block, _facts(context), *_remarks(context))
         return joined(
             [
-                paragraph(element("strong", _answer(context)), " ", _sentence(context), class_="verdict"),
-                _facts(context),
-                _other_stores(context),
-                heading("Diagnostics"),
-                lights(diagnostics(context)),
-                heading("What was not tested"),
-                bullets(not_tested(context)),
-                _assumptions(context),
+                element("div", word, paragraph(_sentence(context), class_="sentence"), class_=f"answer {answer}"),
+                element("div", element("div", drawn, class_="picture"), beside, class_="first"),
             ]
         )
 
     __repr__ = call
 
 
-def _answer(context: ReportContext) -> str:
-    return "No verdict." if context.verdict is None else f"{context.verdict.answer.capitalize()}."
-
-
 def _sentence(context: ReportContext) -> str:
-    """Return the verdict in one sentence."""
-    verdict = context.verdict
+    """Return the verdict in one sentence; remarks on designs and starts follow it."""
+    verdict, certificate, units = context.verdict, context.certificate, context.labels.units
     if verdict is None:
-        worst = context.worst_first[0] if context.worst_first else None
-        largest = "no distance is known" if worst is None else f"the largest executed distance is {_of(context)}"
-        return f"No threshold was given; {largest}."
-    without = len(context.failed)
-    lost = "each gave a distance" if not without else f"{without} of the trials have no distance"
-    effort = f"{context.executions} executions were spent, and {lost}."
-    reason = f"{verdict.reason[:1].upper()}{verdict.reason[1:]} {effort}"
-    return reason if verdict.rests_on is None else f"{reason} {verdict.rests_on}"
+        return "No threshold was given."
+    if verdict.answer != "validated" or certificate is None or certificate.kind != "dynamics":
+        return f"{verdict.reason[:1].upper()}{verdict.reason[1:]}"
+    designs = "" if context.designs is None else f" Note: {context.designs}."
+    return (
+        f"Every task keeps the threshold of {quantity(verdict.threshold, units)}: the largest distance is at most "
+        f"{_bound(context, certificate)} with {percent(certificate.confidence)} confidence, if what M misses depends "
+        f"on the recorded state and input alone, alike in every task.{designs}"
+        f"{context.provenance.caution(verdict.threshold)}"
+    )
 
 
-def _of(context: ReportContext) -> str:
-    worst = context.worst_first[0]
-    return f"{quantity(distance_of(worst), context.labels.units)} in trial {worst.number}"
+def _next(context: ReportContext) -> tuple[str, str]:
+    """Return what to do next, and the command that does it; empty if there is none."""
+    verdict, path = context.verdict, str(path_of(context))
+    if not context.executions:
+        return "Execute tasks.", command_of(context)
+    if verdict is None:
+        said = "State the threshold that the distance must keep. The recorded trials are then judged."
+        return said, shlex.join(["ctxval", "report", path, "--threshold", "VALUE"])
+    if verdict.answer == "validated":
+        said = (
+            "Use the model for these tasks. Validate it again if the system, the model, the design of the controllers "
+            "or the tasks change."
+        )
+        budget = max(context.budget or 0, context.executions + _MORE)
+        command = command_of(context, budget, "--audited", "--store", path)
+        if not command or context.settings.get("audited") or getattr(verdict.certificate, "kind", "") != "dynamics":
+            return said, ""
+        return f"{said} If an error would be costly, test the assumptions with eight fresh random tasks:", command
+    if verdict.answer == "falsified":
+        largest = quantity(distance_of(context.worst_first[0]), context.labels.units)
+        said = f"Do not rely on the model at this threshold. Improve it, narrow the tasks, or accept {largest} or more."
+        if not context.settings:
+            return said, ""
+        better = "This learns a better model from the recorded executions, and validates it:"
+        return f"{said} {better}", shlex.join(["ctxval", "refine", path])
+    by_hand = any(trial.told for trial in context.trials)
+    if context.failed:
+        number = context.failed[0].number
+        again = shlex.join(["ctxval", "ask", path, "--again", str(number)]) if by_hand else ""
+        return f"Find out why trial {number} has no distance, and execute its task again.", again
+    expected = None if verdict.expected is None else verdict.expected.executions
+    said = f"about {expected} are expected to decide" if expected else "how many will decide cannot be forecast"
+    # A search that explores may never execute what the certificate lacks.
+    decide = ["--decide"] if getattr(verdict.certificate, "kind", "") in ("dynamics", "posterior") else []
+    command = command_of(context, context.executions + (expected or _MORE), *decide, "--store", path)
+    return f"Execute more tasks: {said}.", shlex.join(["ctxval", "ask", path]) if by_hand else command
+
+
+def _bound(context: ReportContext, certificate: Certificate) -> str:
+    return f"{with_error(certificate.upper_bound, certificate.error)} {context.labels.units}".rstrip()
 
 
 def _facts(context: ReportContext) -> Markup:
     verdict, certificate, units = context.verdict, context.certificate, context.labels.units
-    failed = len(context.failed)
-    rows: list[tuple[str, object]] = [
-        ("Experiment", context.name or "without a name"),
-        ("Threshold", None if verdict is None else quantity(verdict.threshold, units)),
-        ("Largest executed distance", _of(context) if context.worst_first else None),
-        ("Executions", f"{context.executions}" + ("" if context.budget is None else f" of {context.budget}")),
-        ("Executions without a distance", str(failed)),
-    ]
+    rows: list[tuple[str, object]] = []
+    if context.worst_first:
+        worst = context.worst_first[0]
+        at = f"{quantity(distance_of(worst), units)} at {task_of(context, worst)} (trial {worst.number})"
+        rows.append(("Largest executed", at))
     if certificate is not None:
-        rows += [
-            ("Certificate", certificate.kind + (" (withdrawn)" if certificate.doubt is not None else "")),
-            ("Bound", f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()),
-            ("Confidence", number(certificate.confidence)),
-            ("Volume left out", f"{at_most(100 * certificate.volume, 3)} %"),
-        ]
-    if verdict is not None and verdict.expected is not None:
-        rows.append(("Forecast", str(verdict.expected)))
-    facts = table("The verdict in numbers", ("Quantity", "Value"), rows, class_="facts")
-    if not context.missing:
-        return facts
-    return joined([facts, paragraph(f"The experiment is not loaded: {context.missing}", class_="note")])
+        how = "withdrawn" if certificate.doubt is not None else f"{percent(certificate.confidence)} confidence"
+        rows.append(("Bound on all tasks", f"{_bound(context, certificate)} ({certificate.kind}, {how})"))
+        if certificate.volume:
+            rows.append(("Tasks left out", f"{at_most(100 * certificate.volume, 3)} %"))
+    if verdict is not None:
+        rows.append(("Threshold", quantity(verdict.threshold, units)))
+    without = f", {len(context.failed)} without a distance" if context.failed else ""
+    total = "" if context.budget is None else f" of at most {context.budget}"
+    rows.append(("Executions", f"{context.executions}{total}{without}"))
+    return table("In numbers", ("Quantity", "Value"), rows, class_="facts")
 
 
-def _other_stores(context: ReportContext) -> Markup:
-    """Return a warning if the folder has other campaigns of the same experiment."""
+def _remarks(context: ReportContext) -> list[Markup]:
+    """Return what must not be overlooked in what is folded below, and around the store."""
+    said = []
+    # The sentence of the verdict says why a certificate is refused or withdrawn.
+    found = [one for one in [*diagnostics(context), *insights(context)] if one.name != "Certificate"]
+    for light in ("bad", "attention"):
+        names = [one.name for one in found if one.light == light]
+        if names:
+            word = element("span", WORDS[light].capitalize(), class_=f"light {light}")
+            said.append(paragraph(word, f" {'; '.join(names)} (below)"))
+    if context.missing:
+        said.append(paragraph(f"The experiment is not loaded: {context.missing}", class_="note"))
     others = [] if context.store.path is None else other_stores(context.store.path)
-    if not others:
-        return Markup("")
-    count = counted(len(others), "other store")
-    return paragraph(
-        f"The folder contains {count} of this experiment: {', '.join(other.name for other in others[:_STORES])}. The "
-        "best result of several campaigns is wrong more often than its confidence states."
-    )
-
-
-def _assumptions(context: ReportContext) -> Markup:
-    certificate = context.certificate
-    if certificate is None:
-        return Markup("")
-    return joined(
-        [
-            heading("What the certificate assumes"),
-            paragraph(certificate.statement) if certificate.doubt is None else Markup(""),
-            bullets(f"{one[:1].upper()}{one[1:]}." for one in certificate.assumptions),
-            details("Numbers of the certificate", _numbers(certificate.numbers)),
-        ]
-    )
-
-
-def _numbers(numbers: dict[str, object]) -> Markup:
-    rows = ((name.replace("_", " "), as_text(value)) for name, value in numbers.items())
-    return table("Numbers of the certificate", ("Name", "Value"), rows)
-
-
-def lights(findings: list[Finding]) -> Markup:
-    """Return findings as a list with their lights: a shape, a colour and a word."""
-    return element("ul", *map(_light, findings), class_="lights")
-
-
-def _light(finding: Finding) -> Markup:
-    shape = element("span", _SHAPES[finding.light], class_="shape", aria_hidden="true")
-    word = element("span", shape, " ", WORDS[finding.light], class_=f"light {finding.light}")
-    return element("li", word, " ", element("strong", f"{finding.name}."), " ", finding.text)
+    if others:
+        count = counted(len(others), "other store")
+        names = [other.name for other in others[:_STORES]]
+        sentence = f"The folder contains {count} of this experiment: {', '.join(names)}. The best result of several "
+        said.append(paragraph(f"{sentence}campaigns is wrong more often than its confidence states.", class_="note"))
+    return said
