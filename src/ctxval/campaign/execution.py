@@ -14,7 +14,6 @@ from ctxval.campaign.choices import Choice, OpenTrial
 from ctxval.campaign.remeasuring import remeasure
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import ExecutionResult, WorkerPool, execute_task
-from ctxval.certificates.bounds import with_error
 from ctxval.core.plan import Measurement, Plan
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.core.validation import Validation
@@ -22,6 +21,9 @@ from ctxval.errors import CtxvalError, ExecutionError, InputError
 
 _SLOW = 1.0
 """Seconds from which on the duration of an execution is said."""
+
+_CLEAR = 5e-4
+"""Share of a predicted distance from which on its standard deviation is said."""
 
 OnTrial = Callable[[Trial], None]
 """Called with each trial that has ended."""
@@ -97,7 +99,8 @@ def _result(recorder: TrialRecorder, ended: Trial) -> str:
     validation, predicted = recorder.validation, recorder.dynamics.stored_prediction(ended)
     parts = [f"trial {ended.number:<2}", str(named(ended.parameters, validation.space.units))]
     if predicted is not None:
-        parts.append(f"predicted {with_error(predicted.median, predicted.deviation)}")
+        clear = predicted.deviation >= _CLEAR * predicted.median
+        parts.append(f"predicted {predicted.median:.4g}" + (f" ± {predicted.deviation:.1g}" if clear else ""))
     if ended.distance is None:
         parts.append(f"failed: {ended.failure}")
     else:
