@@ -60,7 +60,8 @@ def best_of_random(case: str, budget: int) -> Array:
 @pytest.mark.slow
 @pytest.mark.parametrize(("case", "budget"), [("hidden-load", 14), ("corner-stop", 8)])
 def test_the_search_falls_back_says_why_and_beats_random(case: str, budget: int) -> None:
-    campaign = Campaign(misleading.CASES[case](0).validation, search=Thrifty(), seed=0).run(budget)
+    campaign = Campaign(misleading.CASES[case](0).validation, search=Thrifty(), seed=0)
+    campaign.run(budget, explore=True)
     reasons = [trial.note["why"] for trial in campaign.trials if trial.note is not None and "why" in trial.note]
     assert "leaving one out, the prediction errs by" in reasons[0]
     assert campaign.worst is not None

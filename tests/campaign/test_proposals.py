@@ -73,7 +73,7 @@ def test_a_campaign_keeps_its_number_of_designs_when_it_is_resumed(tmp_path: Pat
     def campaign(design: float, reason: str | None = None) -> Campaign:
         return Campaign(validation(design, 0.0), seed=1, store=tmp_path / "a.sqlite", accept_change=reason)
 
-    campaign(0.02).run(2).store.close()
+    campaign(0.02).run(2, explore=True).store.close()
     assert designs_of(campaign(0.0, "the same design, computed faster").run(4, explore=True)) == [22]
 
 

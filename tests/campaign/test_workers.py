@@ -183,7 +183,7 @@ def test_until_stops_new_executions_and_takes_the_running_ones(tmp_path: Path) -
 
 def test_every_ended_trial_is_reported(tmp_path: Path) -> None:
     seen: list[Trial] = []
-    logged(None, str(tmp_path), 0).run(6, seen.append, workers=2)
+    logged(None, str(tmp_path), 0).run(6, on_trial=seen.append, workers=2)
     assert sorted(trial.number for trial in seen) == list(range(6))
 
 

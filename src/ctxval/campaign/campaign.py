@@ -22,7 +22,7 @@ from ctxval.core.distance import Distance
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError, InputError
-from ctxval.searches import Search
+from ctxval.searches import Auto, Search
 from ctxval.storage.store import Store
 
 __all__ = ["Campaign", "OpenTrial"]
@@ -141,7 +141,7 @@ class Campaign(OperatedCampaign):
         """
         options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         if explore is None:
-            explore = threshold is None and not self._recorder.search.uses_prediction
+            explore = threshold is None and not isinstance(self.search, Auto)
         decides = None
         if not explore:
             decides = IntervalSearch(self._recorder, options, budget, threshold, within, audited)
