@@ -161,7 +161,8 @@ def test_asking_by_command_chooses_what_a_campaign_chooses(invoke: Any) -> None:
     import my_rig  # type: ignore[import-not-found]
 
     for number in range(7):
-        report = asked(invoke, "a.sqlite", "--explore") if number else new(invoke)
+        target = ("a.sqlite",) if number else ("my_rig:experiment", "--store", "a.sqlite")
+        report = asked(invoke, *target, "--explore")
         record(report["folder"])
         assert invoke("tell", "a.sqlite", str(number), "--trajectory", "run.csv").exit_code == 0
     sys.path.remove(os.getcwd())
