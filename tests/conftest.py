@@ -33,6 +33,10 @@ from ctxval.certificates import (
 )
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
+from ctxval.learning.dynamics_posterior import PosteriorSettings
+from ctxval.learning.hyperparameters import FAMILIES
+from ctxval.learning.worst_case import WorstCaseSettings
+from ctxval.searches.auto import FAST
 
 # A shell starts what is in the background deaf to Ctrl-C, and tests may run there.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -132,6 +136,25 @@ def interrupt_at_once() -> None:
     signal.raise_signal(signal.SIGINT)
 
 
+def take_few_draws(replace: Callable[[str, Any], None]) -> None:
+    """Make the draws of d* fewer, by a function that replaces an attribute."""
+
+    def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
+        return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
+
+    for module in ("stopping", "posterior", "maxima"):
+        replace(f"ctxval.certificates.{module}.draw_maxima", fewer)
+
+
+def run_few_loops(replace: Callable[[str, Any], None]) -> None:
+    """Make searches of the learned dynamics smaller, by a function that replaces an attribute."""
+    loops = WorstCaseSettings(pool=64, evaluations=200, elites=8, shared=16, moves=4, rounds=2, relevant=300, peaks=2)
+    draws = PosteriorSettings(hyperparameters=10, learned_from=60, centres=120, pivots=60, families=FAMILIES[:1])
+    replace("ctxval.learning.worst_case.WorstCaseSettings.for_dimension", lambda *_: loops)
+    replace("ctxval.learning.dynamics_posterior.PosteriorSettings.for_horizon", lambda *_: draws)
+    replace("ctxval.searches.auto._SHARES", (FAST,))
+
+
 @pytest.fixture(scope="session")
 def state_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Folders, one for each test; pytest would look through all earlier ones to number the next."""
@@ -156,9 +179,10 @@ def validation() -> Validation:
 @pytest.fixture
 def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take few draws of d*, for what does not depend on how many there are."""
+    take_few_draws(monkeypatch.setattr)
 
-    def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
-        return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
 
-    for module in ("stopping", "posterior", "maxima"):
-        monkeypatch.setattr(f"ctxval.certificates.{module}.draw_maxima", fewer)
+@pytest.fixture
+def few_loops(few_draws: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run few closed loops on few draws of the learned dynamics, for what does not depend on how many there are."""
+    run_few_loops(monkeypatch.setattr)
