@@ -13,7 +13,7 @@ from ctxval import Store
 from ctxval.cli import app
 from ctxval.config import signatures
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
 
 
 def invoke(*arguments: str) -> Result:
@@ -24,7 +24,8 @@ def invoke(*arguments: str) -> Result:
 def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of the pendulum with six trials of the search."""
     store = tmp_path_factory.mktemp("runs") / "pendulum.sqlite"
-    assert invoke("run", "pendulum", "--budget", "6", "--store", str(store), "--no-report").exit_code == 0
+    searched = ("run", "pendulum", "--search", "gp-ucb", "--explore", "--budget", "6", "--no-report")
+    assert invoke(*searched, "--store", str(store)).exit_code == 0
     return store
 
 

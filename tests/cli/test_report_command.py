@@ -31,7 +31,7 @@ def experiment(seed=0):
     )
 """
 
-pytestmark = [pytest.mark.usefixtures("few_draws"), pytest.mark.slow]
+pytestmark = [pytest.mark.usefixtures("few_loops"), pytest.mark.slow]
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def store(invoke: Any) -> Path:
 @pytest.mark.parametrize(
     "options",
     [
-        ["--decide", "--threshold", "5", "--confidence", "0.9"],
+        ["--decide", "--threshold", "5", "--confidence", "0.9", "--budget", "6"],
         ["--decide", "--audited", "--budget", "3"],
         ["--resolution", "1", "--budget", "3", "--stochastic"],
     ],
