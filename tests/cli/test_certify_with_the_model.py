@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from conftest import run_few_loops
 from ctxval import Store
 from ctxval.cli import app
 from ctxval.config import signatures
@@ -25,7 +26,9 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of the pendulum with six trials of the search."""
     store = tmp_path_factory.mktemp("runs") / "pendulum.sqlite"
     searched = ("run", "pendulum", "--search", "gp-ucb", "--explore", "--budget", "6", "--no-report")
-    assert invoke(*searched, "--store", str(store)).exit_code == 0
+    with pytest.MonkeyPatch.context() as patch:
+        run_few_loops(patch.setattr)
+        assert invoke(*searched, "--store", str(store)).exit_code == 0
     return store
 
 
