@@ -9,7 +9,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 # Before numpy is imported: small algebra is faster on one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -25,18 +24,12 @@ from ctxval.cases import pendulum
 from ctxval.certificates import (
     CheckedPrediction,
     DynamicsEvidence,
-    Maxima,
-    Sample,
     StateInputCoverage,
     StateInputGap,
-    draw_maxima,
 )
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
-from ctxval.learning.dynamics_posterior import PosteriorSettings
-from ctxval.learning.hyperparameters import FAMILIES
-from ctxval.learning.worst_case import WorstCaseSettings
-from ctxval.searches.auto import FAST
+from small_searches import run_few_loops, take_few_draws
 
 # A shell starts what is in the background deaf to Ctrl-C, and tests may run there.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -134,25 +127,6 @@ def interrupt_at_once() -> None:
     """Do what a person does who presses Ctrl-C twice."""
     signal.raise_signal(signal.SIGINT)
     signal.raise_signal(signal.SIGINT)
-
-
-def take_few_draws(replace: Callable[[str, Any], None]) -> None:
-    """Make the draws of d* fewer, by a function that replaces an attribute."""
-
-    def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
-        return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
-
-    for module in ("stopping", "posterior", "maxima"):
-        replace(f"ctxval.certificates.{module}.draw_maxima", fewer)
-
-
-def run_few_loops(replace: Callable[[str, Any], None]) -> None:
-    """Make searches of the learned dynamics smaller, by a function that replaces an attribute."""
-    loops = WorstCaseSettings(pool=64, evaluations=200, elites=8, shared=16, moves=4, rounds=2, relevant=300, peaks=2)
-    draws = PosteriorSettings(hyperparameters=10, learned_from=40, centres=80, pivots=40, families=FAMILIES[:1])
-    replace("ctxval.learning.worst_case.WorstCaseSettings.for_dimension", lambda *_: loops)
-    replace("ctxval.learning.dynamics_posterior.PosteriorSettings.for_horizon", lambda *_: draws)
-    replace("ctxval.searches.auto._SHARES", (FAST,))
 
 
 @pytest.fixture(scope="session")

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from conftest import run_few_loops
 from ctxval import Store
 from ctxval.cli import app
 from ctxval.config import signatures
+from small_searches import run_few_loops
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
 

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 from typer.testing import Result
 
-from conftest import run_few_loops, take_few_draws
 from ctxval import Store, models
 from rig_cli import SMALL, Invoke, calling
+from small_searches import run_few_loops, take_few_draws
 
 pytestmark = pytest.mark.usefixtures("few_loops")
 

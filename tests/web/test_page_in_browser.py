@@ -279,7 +279,7 @@ def test_the_keyboard_reaches_everything_in_order(browser: Any, folder: Path, ad
 
 def test_the_page_fits_a_small_screen_and_is_accessible(browser: Any, folder: Path, address: str) -> None:
     ctxval("tell", "a.sqlite", "0", "--distance", "3", folder=folder)
-    ctxval("ask", "a.sqlite", folder=folder)
+    ctxval("ask", "a.sqlite", "--explore", folder=folder)
     for scheme in ("light", "dark"):
         one = Operator(browser, folder, address, viewport={"width": 400, "height": 800}, color_scheme=scheme)
         one.opened()
