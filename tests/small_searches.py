@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
-from ctxval.cases import arm
 from ctxval.certificates import Maxima, Sample, draw_maxima
 from ctxval.learning.dynamics_posterior import PosteriorSettings
 from ctxval.learning.hyperparameters import FAMILIES
@@ -25,10 +23,9 @@ def take_few_draws(replace: Callable[[str, Any], None]) -> None:
 
 
 def run_few_loops(replace: Callable[[str, Any], None]) -> None:
-    """Make searches of the learned dynamics smaller, and teach the arm's network less."""
+    """Make searches of the learned dynamics smaller, by a function that replaces an attribute."""
     loops = WorstCaseSettings(pool=64, evaluations=200, elites=8, shared=16, moves=4, rounds=2, relevant=300, peaks=2)
     draws = PosteriorSettings(hyperparameters=10, learned_from=40, centres=80, pivots=40, families=FAMILIES[:1])
     replace("ctxval.learning.worst_case.WorstCaseSettings.for_dimension", lambda *_: loops)
     replace("ctxval.learning.dynamics_posterior.PosteriorSettings.for_horizon", lambda *_: draws)
     replace("ctxval.searches.auto._SHARES", (FAST,))
-    replace("ctxval.cases.arm.Settings", partial(arm.Settings, restarts=1))
