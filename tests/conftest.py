@@ -9,7 +9,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 # Before numpy is imported: small algebra is faster on one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -25,14 +24,12 @@ from ctxval.cases import pendulum
 from ctxval.certificates import (
     CheckedPrediction,
     DynamicsEvidence,
-    Maxima,
-    Sample,
     StateInputCoverage,
     StateInputGap,
-    draw_maxima,
 )
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
+from small_searches import run_few_loops, take_few_draws
 
 # A shell starts what is in the background deaf to Ctrl-C, and tests may run there.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -156,9 +153,10 @@ def validation() -> Validation:
 @pytest.fixture
 def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take few draws of d*, for what does not depend on how many there are."""
+    take_few_draws(monkeypatch.setattr)
 
-    def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
-        return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
 
-    for module in ("stopping", "posterior", "maxima"):
-        monkeypatch.setattr(f"ctxval.certificates.{module}.draw_maxima", fewer)
+@pytest.fixture
+def few_loops(few_draws: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run few closed loops on few draws of the learned dynamics, for what does not depend on how many there are."""
+    run_few_loops(monkeypatch.setattr)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from typer.testing import CliRunner, Result
@@ -11,6 +13,9 @@ from typer.testing import CliRunner, Result
 from ctxval.cli import app
 
 Invoke = Callable[..., Result]
+
+SMALL = [sys.executable, str(Path(__file__).with_name("small_ctxval.py"))]
+"""Starts ``ctxval`` in a process of its own, as the fixture ``few_loops`` makes it here."""
 
 
 def calling(*before: str) -> Invoke:

@@ -21,7 +21,7 @@ import numpy as np
 
 from ctxval.core.exchange import read_controller, read_task
 from ctxval.core.rollout import rollout
-from rig_cli import calling
+from rig_cli import SMALL, calling
 
 MODULE = """
 from ctxval import Experiment, Task, TaskSpace, Validation, controllers, distances, models, systems
@@ -61,8 +61,6 @@ def slow(seed):
     made.validation.synthesizer = Slow()
     return made
 """
-
-COMMAND = [sys.executable, "-c", "from ctxval.cli import main; main()"]
 
 
 def ctxval(*arguments: str, folder: Path) -> dict[str, Any]:
@@ -150,7 +148,7 @@ class Response:
 @contextmanager
 def serving(folder: Path, *arguments: str, port: int = 0) -> Iterator[Server]:
     """Serve the store of a folder; port 0 is any free one."""
-    command = [*COMMAND, "serve", "a.sqlite", "--port", str(port), *arguments]
+    command = [*SMALL, "serve", "a.sqlite", "--port", str(port), *arguments]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(
         command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -13,13 +13,13 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from matplotlib import pyplot
 
 import ctxval
 
 ROOT = Path(__file__).parents[1]
 GALLERY = sorted((ROOT / "examples" / "gallery").glob("plot_*.py"))
 NEEDS = {"plot_2_arm": "mujoco", "plot_7_replay": "mcap", "plot_8_fit": "onnx"}
-GOALS = ("-W", "ignore:the model itself does not complete its tasks")  # the models of some cases do not
 BUILT = ("_build", "api", "auto_examples", "__pycache__")
 
 
@@ -95,14 +95,21 @@ def pages_left_out(manual: Path) -> Iterator[Path]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
+@pytest.mark.filterwarnings("ignore:FigureCanvasAgg:UserWarning")
 @pytest.mark.parametrize("script", GALLERY, ids=lambda path: path.stem)
-def test_a_script_of_the_gallery_runs(script: Path, tmp_path: Path) -> None:
+def test_a_script_of_the_gallery_runs(
+    script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The whole searches are run by `make docs`."""
     pytest.importorskip(NEEDS.get(script.stem, "ctxval"))
-    command = [sys.executable, "-W", "error", "-W", "ignore:FigureCanvasAgg:UserWarning", *GOALS, str(script)]
-    environment = {**os.environ, "MPLBACKEND": "agg"}
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout
+    monkeypatch.chdir(tmp_path)
+    pyplot.switch_backend("agg")
+    try:
+        runpy.run_path(str(script), run_name="__main__")
+    finally:
+        pyplot.close("all")
+    assert capsys.readouterr().out
     assert not list(tmp_path.iterdir())
 
 

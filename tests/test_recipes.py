@@ -73,6 +73,8 @@ TESTS = (
     "tests/benchmarks/test_parts_page.py",
 )
 """Tests that hold any part against what all parts must be."""
+NOT_OF_PARTS = "not (load or loads or without_the_parts or all_brings or new_process or importing_ctxval)"
+"""Leaves out tests of what processes load, and of what is installed."""
 
 
 def not_needed(folder: str, names: list[str]) -> set[str]:
@@ -149,20 +151,44 @@ def test_what_the_recipes_give_passes_make_check(tree: Path) -> None:
 @pytest.mark.slow
 def test_what_the_recipes_give_passes_its_tests_and_those_of_all_parts(tree: Path) -> None:
     own = [recipe.test for recipe in RECIPES.values()]
-    done = run(tree, "pytest", "-q", "-p", "no:cacheprovider", *own, *TESTS)
+    done = run(tree, "pytest", "-q", "-p", "no:cacheprovider", "-k", NOT_OF_PARTS, *own, *TESTS)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+CHECK_ALL = """
+import json, sys
+from typer.testing import CliRunner
+from ctxval.cli import app
+
+calls = {part: CliRunner().invoke(app, ["check", f"{part}.toml", "--json"]) for part in sys.argv[1:]}
+print(json.dumps({part: [done.exit_code, done.stdout, done.stderr] for part, done in calls.items()}))
+"""
+
+
+@pytest.fixture(scope="module")
+def checked(tree: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str, str]]:
+    """What `ctxval check` says of the experiment file of each recipe: exit status, standard output and error."""
+    folder = tmp_path_factory.mktemp("files")
+    (folder / "my_rig.py").write_text(MY_RIG)
+    (folder / "check_all.py").write_text(CHECK_ALL)
+    for part, recipe in RECIPES.items():
+        content = recipe.toml if part == "case" else {**WHOLE, **recipe.toml}
+        (folder / f"{part}.toml").write_text("".join(f"{key} = {written(value)}\n" for key, value in content.items()))
+    done = run(tree, "check_all", *RECIPES, cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found: dict[str, tuple[int, str, str]] = json.loads(done.stdout)
+    return found
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", RECIPES)
-def test_a_part_is_found_in_an_experiment_file_and_in_the_page(part: str, tree: Path, tmp_path: Path) -> None:
+def test_a_part_is_found_in_an_experiment_file_and_in_the_page(
+    part: str, tree: Path, checked: dict[str, tuple[int, str, str]]
+) -> None:
+    status, said, problems = checked[part]
+    assert status == 0, said + problems
+    assert json.loads(said)["ok"]
     toml = RECIPES[part].toml
-    content = toml if part == "case" else {**WHOLE, **toml}
-    (tmp_path / "e.toml").write_text("".join(f"{key} = {written(value)}\n" for key, value in content.items()))
-    (tmp_path / "my_rig.py").write_text(MY_RIG)
-    done = run(tree, "ctxval.cli", "check", "e.toml", "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert json.loads(done.stdout)["ok"]
     table = toml.get(part, toml)
     name = table.get("type") or table.get("name") or table.get("kind") or table["experiment"]
     assert f"| `{name}` |" in (tree / "docs" / "parts.md").read_text()

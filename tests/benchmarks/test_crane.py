@@ -37,11 +37,11 @@ def test_designs_that_rounding_stops_are_like_those_next_to_them(seed: int) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
+@pytest.mark.usefixtures("few_loops")
 def test_verdicts_on_the_crane_are_true_and_its_worst_task_can_be_typed_again() -> None:
     validation = experiment(0).validation
     largest = truth(validation, 600)
-    campaign = Campaign(validation, search=searches.Auto(150), seed=0).run(8, explore=True)
+    campaign = Campaign(validation, search=searches.Auto(50), seed=0).run(8, explore=True)
     options = CertificateOptions(Posterior())
     assert campaign.verdict(0.9 * largest, certificate=options).answer == "falsified"
     above = campaign.verdict(1.1 * largest, certificate=options)

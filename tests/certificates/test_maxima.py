@@ -213,7 +213,7 @@ def test_one_task_with_two_distances_is_not_deterministic() -> None:
 @pytest.mark.slow
 def test_the_error_is_what_seeds_differ_by() -> None:
     trials = sample(7)
-    found = [draw_maxima(trials, draws=48, paths=4, seed=seed) for seed in range(24)]
+    found = [draw_maxima(trials, draws=48, paths=4, seed=seed) for seed in range(12)]
     for confidence in (0.8, 0.9):
         bounds = np.array([maxima.upper(confidence) for maxima in found])
         errors = np.array([maxima.error(confidence) for maxima in found])

@@ -120,7 +120,7 @@ def test_the_test_of_unordered_trials_sees_as_much_as_that_of_trials_in_order() 
         ):
             trials = Sample(X[rows][:, None], y[rows], [origin] * 25, ["completed"] * 25)  # type: ignore[list-item]
             fired[name] += (
-                certify_posterior(trials, 0.8, found=draw_maxima(trials, draws=24, paths=1)).doubt is not None
+                certify_posterior(trials, 0.8, found=draw_maxima(trials, draws=12, paths=1)).doubt is not None
             )
     assert fired["worst first"] == 0
     assert fired["unordered"] >= max(4, fired["in order"])

@@ -12,8 +12,9 @@ from typer.testing import CliRunner, Result
 from ctxval import Store
 from ctxval.cli import app
 from ctxval.config import signatures
+from small_searches import run_few_loops, take_few_draws
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
 
 
 def invoke(*arguments: str) -> Result:
@@ -24,7 +25,11 @@ def invoke(*arguments: str) -> Result:
 def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of the pendulum with six trials of the search."""
     store = tmp_path_factory.mktemp("runs") / "pendulum.sqlite"
-    assert invoke("run", "pendulum", "--budget", "6", "--store", str(store), "--no-report").exit_code == 0
+    searched = ("run", "pendulum", "--search", "gp-ucb", "--explore", "--budget", "6", "--no-report")
+    with pytest.MonkeyPatch.context() as patch:
+        take_few_draws(patch.setattr)
+        run_few_loops(patch.setattr)
+        assert invoke(*searched, "--store", str(store)).exit_code == 0
     return store
 
 

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from ctxval import Store
 from ctxval.cli import app
 from ctxval.errors import StoreError
-from rig_cli import Invoke, calling
+from rig_cli import SMALL, Invoke, calling, report
 
 FILE = """
 name = "cart"
@@ -45,6 +45,8 @@ name = "gp-ucb"
 [synthesizer]
 type = "LQR"
 """
+pytestmark = pytest.mark.usefixtures("few_loops")
+
 STEP = """
 def step(x, u):
     return [x[0] + 0.05 * x[1], x[1] + 0.05 * (u[0] - 0.3 * x[1] * abs(x[1]))]
@@ -66,20 +68,20 @@ def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Invoke:
 
 @pytest.mark.slow
 def test_two_files_are_compared_and_the_result_is_printed_and_written(invoke: Invoke) -> None:
-    found = invoke("gentle.toml", "stiff.toml", "--question", "mean", "--out", "result.md")
-    assert found.exit_code == 0, found.stderr
-    assert "expected distance: gentle < stiff" in found.stdout
-    assert "rare large distances" in " ".join(found.stdout.split())
+    said = invoke("gentle.toml", "stiff.toml", "--question", "mean", "--out", "result.md")
+    assert said.exit_code == 0, said.stderr
+    assert "expected distance: gentle < stiff" in said.stdout
+    assert "rare large distances" in " ".join(said.stdout.split())
     assert Path("result.md").read_text().startswith("## Comparison")
     assert Path("result.png").read_bytes().startswith(b"\x89PNG")
-    report: dict[str, Any] = json.loads(invoke("gentle.toml", "stiff.toml", "--question", "mean", "--json").stdout)
-    assert report["decided"]
-    assert report["rankings"] == {"mean": [["gentle"], ["stiff"]]}
-    assert set(report["stores"]) == {"gentle", "stiff"}
-    before = report["executions"]
-    longer = json.loads(invoke("gentle.toml", "stiff.toml", "--question", "mean", "--budget", "300", "--json").stdout)
+    found: dict[str, Any] = report(invoke("gentle.toml", "stiff.toml", "--question", "mean", "--json"))
+    assert found["decided"]
+    assert found["rankings"] == {"mean": [["gentle"], ["stiff"]]}
+    assert set(found["stores"]) == {"gentle", "stiff"}
+    before = found["executions"]
+    longer = report(invoke("gentle.toml", "stiff.toml", "--question", "mean", "--budget", "300", "--json"))
     assert longer["executions"] == before  # nothing is executed again
-    shown = CliRunner().invoke(app, ["status", report["stores"]["gentle"]])
+    shown = CliRunner().invoke(app, ["status", found["stores"]["gentle"]])
     assert shown.exit_code == 0
 
 
@@ -132,17 +134,16 @@ def trials(folder: Path) -> dict[str, list[tuple[list[float], float | None, str]
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL")
 def test_a_comparison_that_is_killed_makes_the_same_choices(invoke: Invoke) -> None:
-    def started(folder: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "ctxval.cli", "compare", "gentle.toml", "stiff.toml", "--stores", folder]
-        return subprocess.Popen([*command, "--budget", "18", "--json"], stdout=subprocess.PIPE, text=True)
+    def arguments(folder: str) -> list[str]:
+        return ["gentle.toml", "stiff.toml", "--stores", folder, "--budget", "10", "--json"]
 
-    whole = json.loads(started("whole").communicate()[0])
-    for count in (3, 11):
-        process = started("parts")
+    whole = report(invoke(*arguments("whole")))
+    for count in (3, 7):
+        process = subprocess.Popen([*SMALL, "compare", *arguments("parts")], stdout=subprocess.DEVNULL)
         while process.poll() is None and sum(map(len, trials(Path("parts")).values())) < count:
             time.sleep(0.02)
         process.send_signal(signal.SIGKILL)
-        process.communicate()
-    parts = json.loads(started("parts").communicate()[0])
+        process.wait()
+    parts = report(invoke(*arguments("parts")))
     assert trials(Path("parts")) == trials(Path("whole"))
     assert {**parts, "stores": None} == {**whole, "stores": None}

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from rig_cli import calling
+
 pty = pytest.importorskip("pty", reason="there are no pseudo-terminals here")
 
 RIG = '''
@@ -49,8 +51,10 @@ by_hand = Experiment("slow-by-hand", validation(Manual()))
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "rig.py").write_text(RIG)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "rig", raising=False)
     return tmp_path
 
 
@@ -109,24 +113,20 @@ def test_a_run_shows_its_executions_and_what_it_is_doing(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_a_log_has_a_line_for_each_trial(folder: Path) -> None:
-    arguments = ("run", "rig:experiment", "--budget", "2", "--search", "random", "--store", "a.sqlite")
-    done = subprocess.run(command(*arguments), cwd=folder, env=environment(folder), capture_output=True, text=True)
-    assert done.returncode == 0
+    arguments = ("rig:experiment", "--search", "random", "--store", "a.sqlite", "--no-report")
+    done = calling("run")(*arguments, "--budget", "2")
+    assert done.exit_code == 0
     assert [line.split()[:2] for line in done.stderr.splitlines()] == [["trial", "0"], ["trial", "1"]]
-    quiet = subprocess.run(
-        command(*arguments[:3], "3", *arguments[4:], "--json"), cwd=folder, env=environment(folder), capture_output=True
-    )
-    assert quiet.stderr == b""
+    assert calling("run")(*arguments, "--budget", "3", "--json").stderr == ""
 
 
 @pytest.mark.slow
 def test_asking_and_waiting_for_the_lock_are_shown(folder: Path) -> None:
-    first, _, status = at_terminal(folder, "ask", "rig:by_hand", "--store", "a.sqlite")
-    assert status == 0
-    assert "choosing a task" in first
+    assert calling("ask")("rig:by_hand", "--store", "a.sqlite").exit_code == 0
     with Holding(folder):
         screen, _, status = at_terminal(folder, "ask", "a.sqlite", release_after=b"waiting for another process")
     assert status == 0
+    assert "choosing a task" in screen
     assert re.search(r"waiting for another process that is running the store +\S+ +\d+/60 s", screen)
 
 
@@ -154,13 +154,8 @@ class Holding:
 
 @pytest.mark.slow
 def test_certifying_is_shown(folder: Path) -> None:
-    subprocess.run(
-        command("run", "rig:experiment", "--budget", "6", "--search", "random", "--store", "a.sqlite"),
-        cwd=folder,
-        env=environment(folder),
-        check=True,
-        capture_output=True,
-    )
+    run = calling("run")("rig:experiment", "--budget", "6", "--search", "random", "--store", "a.sqlite", "--no-report")
+    assert run.exit_code == 0
     screen, out, _ = at_terminal(folder, "certify", "a.sqlite", "--threshold", "9", "--kind", "posterior")
     assert re.search(r"drawing the largest distance +\S+ +[\d,]+/[\d,]+ draws", screen)
     assert "draws," not in out

@@ -16,7 +16,10 @@ import pytest
 from typer.testing import Result
 
 from ctxval import Store, models
-from rig_cli import Invoke, calling
+from rig_cli import SMALL, Invoke, calling
+from small_searches import run_few_loops, take_few_draws
+
+pytestmark = pytest.mark.usefixtures("few_loops")
 
 PLANT = """
 import time
@@ -131,6 +134,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
     """What an unbroken refinement prints, and its folder."""
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
+        take_few_draws(patch.setattr)
+        run_few_loops(patch.setattr)
         prepare(folder, patch)
         return calling()(*REFINE), folder
 
@@ -167,9 +172,8 @@ def test_a_function_of_the_user_learns_the_model(invoke: Invoke) -> None:
 def test_a_killed_refinement_loses_nothing_and_ends_as_an_unbroken_one(
     whole: tuple[Result, Path], invoke: Invoke, folder: Path
 ) -> None:
-    code = "from ctxval.cli import main; main()"
     quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    killed = subprocess.Popen([sys.executable, "-c", code, *REFINE], cwd=folder, **quiet)
+    killed = subprocess.Popen([*SMALL, *REFINE], cwd=folder, **quiet)
     stores = folder / "runs"
     deadline = time.monotonic() + 300
     while executions(stores) < 2 and killed.poll() is None and time.monotonic() < deadline:

@@ -31,7 +31,7 @@ def experiment(seed=0):
     )
 """
 
-pytestmark = [pytest.mark.usefixtures("few_draws"), pytest.mark.slow]
+pytestmark = [pytest.mark.usefixtures("few_loops"), pytest.mark.slow]
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def store(invoke: Any) -> Path:
     "options",
     [
         [],
-        ["--search", "gp-ucb", "--decide", "--threshold", "5", "--confidence", "0.9"],
+        ["--search", "gp-ucb", "--decide", "--threshold", "5", "--confidence", "0.9", "--budget", "6"],
         ["--search", "gp-ucb", "--decide", "--audited", "--budget", "3"],
         ["--search", "gp-ucb", "--resolution", "1", "--budget", "3", "--stochastic"],
     ],

@@ -87,7 +87,7 @@ def test_repeats_that_never_agree_end_at_the_limit_and_leave_a_doubt() -> None:
     def noise(x: np.ndarray) -> np.ndarray:
         return np.mod(1e6 * np.sin(1e4 * x).sum(axis=-1), 1.0)
 
-    truth = search_truth(of_surface(noise), agreement=1e-12, repeats=3, population=4, generations=2)
+    truth = search_truth(of_surface(noise), agreement=1e-12, repeats=3, population=4, generations=2, climbs=4)
     assert "3 repeats" in truth.method
     assert truth.method.endswith("so the maximum may well be larger")
 

@@ -333,7 +333,7 @@ import gc
 from ctxval import Task
 from ctxval.systems import FMU
 system = FMU({str(path)!r}, states=["position", "speed"], inputs=["force"])
-for _ in range(30):
+for _ in range(10):
     system.execute(lambda t, x: -x[:1], Task([1.0, -0.5], horizon=5, dt=0.1))
     system.execute(lambda t, x: -x[:1], Task([1.0, 200.0], horizon=5, dt=0.1))
     gc.collect()
@@ -559,6 +559,7 @@ name = "gp-ucb"
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
 def test_an_experiment_file_validates_a_learned_model_on_an_fmu(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -580,8 +581,10 @@ def test_an_experiment_file_validates_a_learned_model_on_an_fmu(
     assert (ran["executions"], ran["failed"], ran["threshold"]) == (7, 0, 5.0)
     assert ran["worst"]["distance"] > 0
     assert report("status", "cart.sqlite")["executions"] == 7
-    again = report("run", "experiment.toml", "--budget", "8")
+    again = report("run", "experiment.toml", "--budget", "8", "--no-report")
     assert again["executions"] == 8
     assert len(Store("cart.sqlite").trials()) == 8
-    status = CliRunner().invoke(app, ["run", "experiment.toml", "--budget", "8", "--threshold", "1e-9", "--json"])
+    status = CliRunner().invoke(
+        app, ["run", "experiment.toml", "--budget", "8", "--threshold", "1e-9", "--no-report", "--json"]
+    )
     assert (status.exit_code, json.loads(status.stdout)["verdict"]) == (1, "falsified")

@@ -18,7 +18,7 @@ from ctxval.storage.store import Store
 from ctxval.web.security import HEADERS, MOST_UPLOAD
 from rig_page import Response, Server, ctxval, new_store, record, serving
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
 
 SHORT = b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n"
 """A recording of two times."""
@@ -396,34 +396,29 @@ def test_the_choices_are_those_of_the_command_line(tmp_path: Path, how: str, opt
     for number in range(2):
         ctxval("tell", "a.sqlite", str(number), "--distance", "0.25", folder=by_hand)
         ctxval("ask", "a.sqlite", *options, folder=by_hand)
-    with serving(by_page) as server:
+    with serving(by_page, "--budget", "9") as server:
         page = server.request("GET", "/")
         assert 'value="decides"' in page.text  # the experiment has a threshold
         for number in range(2):
             assert post(server, f"/trials/{number}/distance", page, {"distance": "0.25"}).status == 303
             assert post(server, "/choose", page, {"how": how, "seen": str(number + 1)}).status == 303
             wait_for(server, f'id="trial-{number + 1}"', page)
+        if how == "decides":  # no task is opened for a verdict that is reached
+            assert post(server, "/trials/2/distance", page, {"distance": "2.5"}).status == 303
+            assert post(server, "/choose", page, {"how": how, "seen": "3"}).status == 303
+            found = wait_for(server, 'class="done">The verdict is reached', page)
+            assert "No further execution is needed for it." in found
+            assert "No task was chosen" not in found
+            assert "<strong>3</strong> of 9 executions" in found
     for one, other in zip(trials(by_hand), trials(by_page), strict=True):
         assert one.unit_point.tobytes() == other.unit_point.tobytes()
         assert one.note == other.note
 
 
-def test_no_task_is_opened_for_a_verdict_that_is_reached(tmp_path: Path) -> None:
+def test_other_computers_need_the_token_and_a_name_can_be_allowed(tmp_path: Path) -> None:
     new_store(tmp_path)
-    ctxval("tell", "a.sqlite", "0", "--distance", "2.5", folder=tmp_path)
-    with serving(tmp_path, "--budget", "9") as server:
-        page = server.request("GET", "/")
-        assert post(server, "/choose", page, {"how": "decides", "seen": "1"}).status == 303
-        found = wait_for(server, 'class="done">The verdict is reached', page)
-        assert "No further execution is needed for it." in found
-        assert "No task was chosen" not in found
-        assert "<strong>1</strong> of 9 executions" in found
-    assert len(trials(tmp_path)) == 1
-
-
-def test_other_computers_need_the_token(tmp_path: Path) -> None:
-    new_store(tmp_path)
-    with serving(tmp_path, "--host", "0.0.0.0") as server:
+    allowed = ("--allow-host", "rig.example", "--threshold", "0.5")
+    with serving(tmp_path, "--host", "0.0.0.0", *allowed) as server:
         token = server.address.partition("?token=")[2]
         assert len(token) == 32
         bare = server.request("GET", "/")
@@ -441,6 +436,8 @@ def test_other_computers_need_the_token(tmp_path: Path) -> None:
         assert server.request("POST", "/enter", f"token={token}".encode(), **typed).status == 200
         assert server.request("POST", "/enter", b"token=guess", **typed).status == 401
         assert server.request("GET", "/", Host="evil.example", Cookie=entered.cookie).status == 403
+        named = server.request("GET", "/", Host="rig.example", Cookie=entered.cookie)
+        assert (named.status, "0.5 m" in wait_for(server, "against 0.5 m", entered)) == (200, True)
 
 
 def test_the_server_ends_at_once_although_a_task_is_being_chosen(tmp_path: Path) -> None:
@@ -456,13 +453,6 @@ def test_the_server_ends_at_once_although_a_task_is_being_chosen(tmp_path: Path)
         status, _ = server.stop()
     assert status in (130, -signal.SIGINT)  # the second one may come when Python itself is ending
     assert [trial.state for trial in trials(tmp_path)] == ["completed"]
-
-
-def test_a_name_can_be_allowed(tmp_path: Path) -> None:
-    new_store(tmp_path)
-    with serving(tmp_path, "--allow-host", "rig.example", "--threshold", "0.5") as server:
-        page = server.request("GET", "/", Host="rig.example")
-        assert (page.status, "0.5 m" in wait_for(server, "against 0.5 m", page)) == (200, True)
 
 
 def test_a_store_that_is_run_elsewhere_stays_usable(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from ctxval.core.trial import Trial
 from ctxval.storage.store import Store
 from rig_page import ctxval, new_store, record, serving
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
 
 WAIT = 60_000
 """Milliseconds to wait for a choice or a verdict."""

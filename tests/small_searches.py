@@ -1,0 +1,31 @@
+"""Few draws and few closed loops, for what does not depend on how many there are. Processes of tests use it, too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ctxval.certificates import Maxima, Sample, draw_maxima
+from ctxval.learning.dynamics_posterior import PosteriorSettings
+from ctxval.learning.hyperparameters import FAMILIES
+from ctxval.learning.worst_case import WorstCaseSettings
+from ctxval.searches.auto import FAST
+
+
+def take_few_draws(replace: Callable[[str, Any], None]) -> None:
+    """Make the draws of d* fewer, by a function that replaces an attribute."""
+
+    def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
+        return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
+
+    for module in ("stopping", "posterior", "maxima"):
+        replace(f"ctxval.certificates.{module}.draw_maxima", fewer)
+
+
+def run_few_loops(replace: Callable[[str, Any], None]) -> None:
+    """Make searches of the learned dynamics smaller, by a function that replaces an attribute."""
+    loops = WorstCaseSettings(pool=64, evaluations=200, elites=8, shared=16, moves=4, rounds=2, relevant=300, peaks=2)
+    draws = PosteriorSettings(hyperparameters=10, learned_from=40, centres=80, pivots=40, families=FAMILIES[:1])
+    replace("ctxval.learning.worst_case.WorstCaseSettings.for_dimension", lambda *_: loops)
+    replace("ctxval.learning.dynamics_posterior.PosteriorSettings.for_horizon", lambda *_: draws)
+    replace("ctxval.searches.auto._SHARES", (FAST,))
