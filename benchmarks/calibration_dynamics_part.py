@@ -11,6 +11,9 @@ from calibrate_dynamics import BUDGETS, FALSE, FEW, GROUPS, RULE, STORED, TRUE, 
 from calibration_verdicts_part import false_of, table
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import dynamics_diagnostics as rule
+from study_interval import BUDGET as INTERVAL_BUDGET
+from study_interval import SEEDS as INTERVAL_SEEDS
+from study_interval import rows as interval_rows
 from study_posterior_ranks import FRESH
 from study_posterior_ranks import KEY as RANK_KEY
 from study_posterior_ranks import STORED as RANKS
@@ -47,6 +50,15 @@ is true of these systems as well; the column says how often it was given. Execut
 
 These campaigns are from before `sharpness` and `jump` ([theory](theory.md#what-withdraws-it)), which can only withdraw
 a bound.
+
+### Without a threshold
+
+These campaigns have no threshold. They end when the bound exceeds the largest executed distance by at most 5 %, or
+after {interval_budget} executions. The systems are the same, with {interval_seeds} seeds. `largest` and `bound` are the ends
+of the interval, as shares of d*, each the smallest of the campaigns that ended; a bound below 1 is false. A copy is an
+execution next to an earlier one, within 2 % of the range of each task parameter.
+
+{intervals}
 
 ### False verdicts
 
@@ -141,6 +153,9 @@ def by_dynamics() -> str:
         **_decided(mild, TRUE[0], "11"),
         **_decided(mild, TRUE[1], "125"),
         reporting=_table(reported),
+        interval_budget=INTERVAL_BUDGET,
+        interval_seeds=INTERVAL_SEEDS,
+        intervals=table(["system", "ended", "executions", "largest", "bound", "copies"], interval_rows()),
         false=_false(reported),
         rough=_table(rough),
         rough_seeds=FEW,
