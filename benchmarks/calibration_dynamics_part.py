@@ -54,9 +54,9 @@ a bound.
 ### Without a threshold
 
 These campaigns have no threshold. They end when the bound exceeds the largest executed distance by at most 5 %, or
-after {interval_budget} executions. The systems are the same, with {interval_seeds} seeds. `largest` and `bound` are the ends
-of the interval, as shares of d*, each the smallest of the campaigns that ended; a bound below 1 is false. A copy is an
-execution next to an earlier one, within 2 % of the range of each task parameter.
+after {interval_budget} executions. The systems are the same, with {interval_seeds} seeds. The ends of the interval are
+shares of d*, each the smallest one of the campaigns that ended; a bound below 1 is false. A copy is an execution next
+to an earlier one, within 2 % of the range of each task parameter.
 
 {intervals}
 
