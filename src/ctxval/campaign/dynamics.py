@@ -132,25 +132,28 @@ class CampaignDynamics:
             learned = self.learned(trials)
             return None if learned is None else self._guarded(lambda: self._evidence(learned, trials, learned.screened))
 
-    def evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
-        """Return what the learned dynamics say about d*; None if nothing can be learned."""
+    def evidence(self, trials: Sequence[Trial], confidence: float, *, keep: bool = False) -> DynamicsEvidence | None:
+        """Return what the learned dynamics say about d*; None if nothing can be learned.
+
+        Args:
+            trials: the trials.
+            confidence: the probability with which a bound is to hold.
+            keep: whether the store keeps it, with the trials that it follows from.
+        """
         known = self.kept_evidence(trials, confidence)
         if known is not None:
             return known
-        draws = draws_for(confidence)
+        digest, draws = self._store.digest(), draws_for(confidence)
         with stage("searching the learned dynamics", self._study.search.expected_loops(draws), "closed loops"):
             learned = self.learned(trials)
-            return None if learned is None else self._guarded(lambda: self._whole(learned, trials, draws, confidence))
+            found = None if learned is None else self._guarded(lambda: self._whole(learned, trials, draws, confidence))
+        if keep and found is not None and not self.elsewhere():
+            self._store.keep_computed(_key(trials, confidence), found.to_json(), digest)
+        return found
 
     def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
         """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""
         return None if self.elsewhere() else DynamicsEvidence.from_json(self._store.computed(_key(trials, confidence)))
-
-    def keep_evidence(self, found: DynamicsEvidence, trials: Sequence[Trial], confidence: float, digest: str) -> None:
-        """Keep evidence in the store, which had this digest when it was computed."""
-        key = _key(trials, confidence)
-        if not self.elsewhere() and self._store.computed(key) is None:
-            self._store.keep_computed(key, found.to_json(), digest)
 
     def _guarded(self, function: Callable[[], DynamicsEvidence]) -> DynamicsEvidence | None:
         try:

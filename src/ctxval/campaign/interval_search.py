@@ -95,7 +95,8 @@ class IntervalSearch:
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides."""
         trials, limit = self.recorder.trials, self.limit
-        if largest_distance(trials) > limit:
+        best = largest_distance(trials)
+        if best > limit:
             return None
         if isinstance(self.options.kind, AnytimeAudit):
             return self._by_draws(trials, self.options.kind)
@@ -103,17 +104,14 @@ class IntervalSearch:
         if evidence is None or self._fails(evidence):
             return self._by_distance(trials)
         if self._may_decide(trials, evidence):
-            digest = self.recorder.store.digest()
-            evidence = self.recorder.dynamics.evidence(trials, self.options.confidence)
+            evidence = self.recorder.dynamics.evidence(trials, self.options.confidence, keep=True)
             if evidence is None:
                 return self._by_distance(trials)
-            self.recorder.dynamics.keep_evidence(evidence, trials, self.options.confidence, digest)
             if self._decides(trials, evidence):
                 return self._audit(evidence) if self.audited else None
         if isinstance(self.options.kind, Automatic) and self.recorder.executions >= _PATIENCE:
             return self._by_distance(trials)
         known = _points(trials, self._dimension)
-        best = largest_distance(trials)
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
         point = next_task(evidence, known, best, limit, self.options.confidence, steady)

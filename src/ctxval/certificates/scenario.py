@@ -242,7 +242,7 @@ def _require_one_number(sample: Sample, kind: str) -> None:
     plans = list(dict.fromkeys(planned for planned in sample.planned if planned is not None))
     if 0 in plans:
         raise CertificateError(
-            f"the draws ended with the verdict, so their number depended on their distances, which a "
+            "the draws ended with the verdict, so their number depended on their distances, which a "
             f"{kind} bound does not allow; certify --audit N counts draws that are made from now on."
         )
     if len(plans) > 1:

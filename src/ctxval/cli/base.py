@@ -32,6 +32,9 @@ from ctxval.storage.disks import StoreWarning
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 _BAD = (InputError, StoreError, CertificateError)
 
+RUN = "run"
+"""Key under which a store keeps the verdict of its last run and the report that was written."""
+
 out = Screen()
 err = Screen(stderr=True)
 

@@ -19,7 +19,7 @@ from ctxval.cli.base import FALSIFIED, command, out, print_verdict
 from ctxval.cli.commands import app
 from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, Threshold, named_values
 from ctxval.cli.outputs import Force, require_folder
-from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, limit_of, open_store, require_target
+from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, budget_of, limit_of, open_store, require_target
 from ctxval.config.settings import read_settings
 from ctxval.core.exchange import TASK_FORMAT
 from ctxval.core.trial import CONVERGED, Trial
@@ -137,8 +137,8 @@ def ask(
     if trial is not None:
         found = opened.campaign.reopen(trial)
     elif limit is not None and not stated and (threshold is not None or not opened.settings.explores):
-        totals = (budget, opened.settings.budget, opened.experiment.budget)
-        total, options = next(one for one in totals if one is not None), opened.settings.certificate_options
+        total = budget_of(opened.experiment, opened.settings, budget)
+        options = opened.settings.certificate_options
         asked = opened.campaign.ask_for_verdict(limit, total, certificate=options, wait=_WAIT)
         if asked is None:
             return _decided(opened, limit, as_json)

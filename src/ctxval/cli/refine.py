@@ -27,7 +27,7 @@ from ctxval.cli.options import (
 )
 from ctxval.cli.outputs import Force
 from ctxval.cli.screen import line
-from ctxval.cli.trust import Named, Trust, open_store, require_limit, require_target
+from ctxval.cli.trust import Named, Trust, budget_of, open_store, require_limit, require_target
 from ctxval.config.references import reference, require_function
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment
@@ -195,8 +195,7 @@ def _opened(target: str, seed: int | None, option: list[str] | None, experiment:
 def _budget(given: int | None, opened: _Opened) -> int:
     if given is not None:
         return given
-    own = opened.experiment.budget if opened.settings.budget is None else opened.settings.budget
-    return opened.campaign.executions + own
+    return opened.campaign.executions + budget_of(opened.experiment, opened.settings)
 
 
 @dataclass(frozen=True, eq=False)

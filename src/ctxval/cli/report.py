@@ -17,7 +17,7 @@ from ctxval.cli.certify import KindOptions, Volume
 from ctxval.cli.commands import app
 from ctxval.cli.options import AsJson, Confidence, StoreArgument, Threshold, named_values
 from ctxval.cli.outputs import Force, require_outputs
-from ctxval.cli.trust import Named, Trust, open_store
+from ctxval.cli.trust import Named, Trust, budget_of, open_store
 from ctxval.config.settings import Settings
 from ctxval.config.stored_settings import planned_settings
 from ctxval.core.labels import Labels, labels_of
@@ -127,8 +127,7 @@ def _context(store: Store, path: Path, asked: _Asked, experiment: str | None, tr
             raise
         return _of_data(store, asked, str(error))
     limit = asked.limit(opened.settings.threshold, opened.experiment.threshold)
-    budget = opened.experiment.budget if opened.settings.budget is None else opened.settings.budget
-    options = asked.options(opened.settings)
+    budget, options = budget_of(opened.experiment, opened.settings), asked.options(opened.settings)
     return context_of_campaign(opened.campaign, threshold=limit, certificate=options, budget=budget)
 
 

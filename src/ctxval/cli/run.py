@@ -17,6 +17,7 @@ from ctxval.certificates.verdict import Verdict, usable_bound
 from ctxval.cli.base import (
     CANNOT_GO_ON,
     FALSIFIED,
+    RUN,
     command,
     err,
     failures_of,
@@ -45,7 +46,7 @@ from ctxval.cli.options import (
     named_values,
 )
 from ctxval.cli.report import page_path
-from ctxval.cli.trust import AcceptChange, limit_of
+from ctxval.cli.trust import AcceptChange, budget_of, limit_of
 from ctxval.config.settings import Settings, read_settings
 from ctxval.core.experiment import Experiment
 from ctxval.core.trial import designs_sentence
@@ -54,9 +55,6 @@ from ctxval.errors import CertificateError, InputError
 from ctxval.report.context import context_of_campaign
 from ctxval.report.page import write_page
 from ctxval.storage.other_stores import other_stores
-
-RUN = "run"
-"""Key under which a store keeps the verdict of its last run and the report that was written."""
 
 Target = Annotated[
     str,
@@ -166,7 +164,7 @@ def run(
     limit = limit_of(experiment, settings)
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
-    total = experiment.budget if settings.budget is None else settings.budget
+    total = budget_of(experiment, settings)
     if limit is not None:
         certificate.kind.require_usable(certificate.confidence, total)  # before executions are paid for
     if not as_json:
@@ -250,10 +248,7 @@ def _report(
         "estimate": campaign.estimate,
         "interval": None if campaign.worst is None else [campaign.worst.distance, usable_bound(bound)],
         "units": experiment.units,
-        "verdict": None if verdict is None else verdict.answer,
-        "reason": None if verdict is None else verdict.reason,
-        "rests_on": None if verdict is None else verdict.rests_on,
-        "threshold": None if verdict is None else verdict.threshold,
+        **(dict.fromkeys(("verdict", "reason", "rests_on", "threshold")) if verdict is None else verdict.to_json()),
         "certificate": None if bound is None else bound.to_json(),
         "expected": None if verdict is None or verdict.expected is None else asdict(verdict.expected),
         "store": str(path),

@@ -9,11 +9,10 @@ from typing import Annotated, Any
 
 import typer
 
-from ctxval._util.checked import PositiveInt, require
 from ctxval.cli.base import command, out
 from ctxval.cli.commands import app
 from ctxval.cli.options import StoreArgument, Threshold
-from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, limit_of, open_store, settings_of
+from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, budget_of, limit_of, open_store, settings_of
 from ctxval.config.settings import Settings
 from ctxval.errors import InputError
 from ctxval.storage.store import Store
@@ -102,8 +101,7 @@ class _Reopening:
 
 def _served(opened: Opened, threshold: float | None, budget: int | None) -> ServedCampaign:
     limit = limit_of(opened.experiment, opened.settings, threshold)
-    totals = (budget, opened.settings.budget, opened.experiment.budget)
-    total = require("budget", PositiveInt, next(one for one in totals if one is not None))
+    total = budget_of(opened.experiment, opened.settings, budget)
     return ServedCampaign(opened.experiment, opened.campaign, limit, opened.settings.certificate_options, total)
 
 

@@ -9,11 +9,10 @@ from typing import Annotated, Any
 import typer
 
 from ctxval._util.files import MADE_BY
-from ctxval.cli.base import command, failures_of, out, print_failures, print_table, worst_of
+from ctxval.cli.base import RUN, command, failures_of, out, print_failures, print_table, worst_of
 from ctxval.cli.commands import app
 from ctxval.cli.options import AsJson, StoreArgument
 from ctxval.cli.outputs import Force, require_folder
-from ctxval.cli.run import RUN
 from ctxval.errors import StoreAccessError
 from ctxval.storage.recovery import export, recover
 from ctxval.storage.store import Store

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ctxval._util.checked import PositiveFloat, require
+from ctxval._util.checked import PositiveFloat, PositiveInt, require
 from ctxval.campaign.campaign import Campaign
 from ctxval.cli.base import err
 from ctxval.cli.options import TARGET
@@ -60,6 +60,12 @@ def limit_of(experiment: Experiment, settings: Settings, given: float | None = N
     """Return the threshold of the verdict: the given one, or else that of the settings, or else of the experiment."""
     known = (one for one in (given, settings.threshold, experiment.threshold) if one is not None)
     return require("threshold", PositiveFloat | None, next(known, None))  # type: ignore[no-any-return]
+
+
+def budget_of(experiment: Experiment, settings: Settings, given: int | None = None) -> int:
+    """Return the budget: the given one, or else that of the settings, or else of the experiment."""
+    known = (one for one in (given, settings.budget, experiment.budget) if one is not None)
+    return require("budget", PositiveInt, next(known))  # type: ignore[no-any-return]
 
 
 def require_target(target: str) -> None:

@@ -31,6 +31,7 @@ _CONTENT = (
     "SELECT trial, side, checksum FROM trajectories ORDER BY trial, side",
     "SELECT number, what, why, content FROM history ORDER BY number",
 )
+"""Queries of all that results follow from."""
 
 _ENDED = "state = ?, distance = ?, failure = ?, executed = ?, checksum = ?"
 """The assignments that take the values of :func:`_ended`."""
@@ -120,8 +121,7 @@ class Store:
 
     def _write_description(self, description: dict[str, Any]) -> None:
         self._database.execute("DELETE FROM experiment WHERE key != ?", (_DRAWS,))
-        for pair in description.items():
-            self._database.execute("INSERT INTO experiment VALUES (?, ?)", rows.pair_of(*pair))
+        self._insert_pairs("experiment", description)
 
     def description(self) -> dict[str, Any]:
         """Return the stored description of the experiment; empty in a new store."""
@@ -143,12 +143,15 @@ class Store:
             return
         with self._database.transaction():
             self._database.execute("DELETE FROM settings")
-            for pair in settings.items():
-                self._database.execute("INSERT INTO settings VALUES (?, ?)", rows.pair_of(*pair))
+            self._insert_pairs("settings", settings)
 
     def settings(self) -> dict[str, Any]:
         """Return the settings that make the experiment again; empty if no command made the store."""
         return self._pairs("settings")
+
+    def _insert_pairs(self, table: str, pairs: dict[str, Any]) -> None:
+        for pair in pairs.items():
+            self._database.execute(f"INSERT INTO {table} VALUES (?, ?)", rows.pair_of(*pair))
 
     def _pairs(self, table: str) -> dict[str, Any]:
         bounded = (f"CASE WHEN length({cell}) <= {rows.MOST_CHARACTERS} THEN {cell} END" for cell in ("key", "value"))
@@ -161,11 +164,7 @@ class Store:
     # The history
 
     def history(self) -> list[Change]:
-        """Return the later changes of the store in order, each with its reason.
-
-        Raises:
-            ForeignStoreError: if the history is damaged.
-        """
+        """Return the later changes of the store in order, each with its reason."""
         with self._database.rows("SELECT what, why, content, at FROM history ORDER BY number") as found:
             try:
                 return [Change(str(what), str(why), rows.read_json(text), str(at)) for what, why, text, at in found]
@@ -216,7 +215,7 @@ class Store:
         with self._database.transaction():
             self._require_unchanged(changes)
             self._insert(trial)
-            self._write_trajectory(trial.number, "model", model_trajectory)
+            self._trajectories.write(trial.number, "model", model_trajectory)
 
     def record_failed_plan(self, trial: Trial, *, changes: int | None = None) -> None:
         """Store a new trial that failed before an execution of S."""
@@ -232,9 +231,9 @@ class Store:
             self._require_unchanged(changes)
             for trial, model_trajectory, system_trajectory in ended:
                 self._insert(trial)
-                self._write_trajectory(trial.number, "model", model_trajectory)
+                self._trajectories.write(trial.number, "model", model_trajectory)
                 if system_trajectory is not None:
-                    self._write_trajectory(trial.number, "system", system_trajectory)
+                    self._trajectories.write(trial.number, "system", system_trajectory)
 
     def _insert(self, trial: Trial) -> None:
         row = row_of(trial)
@@ -282,7 +281,7 @@ class Store:
             if changed != 1:
                 raise self._not_open(trial.number)
             if system_trajectory is not None:
-                self._write_trajectory(trial.number, "system", system_trajectory)
+                self._trajectories.write(trial.number, "system", system_trajectory)
 
     def replace_result(
         self, before: Trial, after: Trial, trajectory: Trajectory | None, why: str, *, changes: int | None = None
@@ -303,7 +302,7 @@ class Store:
             )
             self._trajectories.remove(after.number, "system")
             if trajectory is not None:
-                self._write_trajectory(after.number, "system", trajectory)
+                self._trajectories.write(after.number, "system", trajectory)
             self._insert_change(Change("replaced", why, {"before": {str(before.number): result}}))
 
     def _not_open(self, number: int) -> InputError:
@@ -312,11 +311,7 @@ class Store:
         return InputError(f"trial {number} is {state}, so nothing more can be told of it.")
 
     def trials(self) -> list[Trial]:
-        """Return all trials in their order.
-
-        Raises:
-            ForeignStoreError: if a trial is damaged.
-        """
+        """Return all trials in their order. Raises a :class:`ForeignStoreError` if one is damaged."""
         found: list[Trial] = []
         with self._database.rows(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number") as cursor:
             for *row, checksum in cursor:
@@ -346,11 +341,11 @@ class Store:
 
     def computed(self, key: str) -> Any:
         """Return what was computed from the present content and kept under a key; None if nothing was."""
-        query = "SELECT value FROM computed WHERE key = ? AND digest = ?"
+        query = f"SELECT value, digest FROM computed WHERE key = ? AND length(value) <= {rows.MOST_CHARACTERS}"
         with self._database.translated_errors():
-            row = self._database.execute(query, (key, self.digest())).fetchone()
+            row = self._database.execute(query, (key,)).fetchone()
         try:
-            return None if row is None else rows.read_json(row[0], finite=False)
+            return rows.read_json(row[0], finite=False) if row is not None and row[1] == self.digest() else None
         except InputError:
             return None  # it can be computed again
 
@@ -358,7 +353,8 @@ class Store:
         """Keep what was computed from the content with a digest, and forget what other content gave."""
         with self._database.transaction():
             self._database.execute("DELETE FROM computed WHERE digest != ?", (digest,))
-            self._database.execute("INSERT OR REPLACE INTO computed VALUES (?, ?, ?)", (key, digest, json.dumps(value)))
+            key, text = rows.pair_of(key, value)
+            self._database.execute("INSERT OR REPLACE INTO computed VALUES (?, ?, ?)", (key, digest, text))
 
     def trajectory(self, number: int, side: Side) -> Trajectory | None:
         """Return a stored trajectory of a trial, whose arrays may be changed. Returns None if there is none.
@@ -387,9 +383,6 @@ class Store:
             ForeignStoreError: if a trajectory is damaged.
         """
         return self._trajectories.read(numbers, side)
-
-    def _write_trajectory(self, number: int, side: Side, trajectory: Trajectory) -> None:
-        self._trajectories.write(number, side, trajectory)
 
     def __repr__(self) -> str:
         place = Shown("in memory") if self.path is None else self.path
