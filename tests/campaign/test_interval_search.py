@@ -55,6 +55,23 @@ def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_draws")
+def test_an_undecided_verdict_names_the_task_that_is_executed_next() -> None:
+    validation, largest = linear(2)
+    campaign = Campaign(validation).run(3, 1.1 * largest)
+    stored = campaign.store.digest()
+    verdict = campaign.verdict(1.1 * largest)
+    assert verdict.answer == "undecided"
+    assert verdict.next_task is not None
+    assert verdict.expected is not None
+    assert verdict.expected.fewest
+    assert str(verdict.expected) in verdict.reason
+    assert "next task: x_init[0] " in verdict.reason
+    assert campaign.store.digest() == stored
+    assert campaign.run(4, 1.1 * largest).trials[3].parameters == verdict.next_task
+
+
+@pytest.mark.slow
 def test_a_threshold_below_the_maximum_is_falsified() -> None:
     validation, largest = linear(2)
     campaign = Campaign(validation).run(12, 0.95 * largest)

@@ -29,7 +29,7 @@ def test_without_a_threshold_there_is_a_certificate_and_no_verdict() -> None:
 
 def test_against_a_threshold_the_verdict_comes_first() -> None:
     report = assess(DRAWN, AUDIT, 0.6).to_json()
-    assert list(report)[:5] == ["verdict", "reason", "rests_on", "threshold", "kind"]
+    assert list(report)[:6] == ["verdict", "reason", "rests_on", "threshold", "next_task", "kind"]
     assert (report["verdict"], report["threshold"]) == ("validated", 0.6)
     assert "tasks that were drawn independently" in report["rests_on"]
     stricter = assess(DRAWN, CertificateOptions(Audit(), 0.9), 0.6)

@@ -17,14 +17,15 @@ from ctxval.certificates import (
     CertificateOptions,
     Dynamics,
     DynamicsEvidence,
+    Forecast,
     Posterior,
     Provenance,
     Sample,
     certify_dynamics,
 )
 from ctxval.certificates.dynamics import bound_of
-from ctxval.certificates.dynamics_diagnostics import GAP, PREDICTIONS
-from ctxval.certificates.verdict import judge
+from ctxval.certificates.dynamics_diagnostics import ACCURATE, GAP, PREDICTIONS
+from ctxval.certificates.verdict import judge, judge_by
 from ctxval.errors import CertificateError
 from rig_evidence import COVERED, GOOD, gap, prediction
 
@@ -98,6 +99,27 @@ def test_a_bound_that_a_diagnostic_withdraws_keeps_no_threshold() -> None:
     found = certify_dynamics(sample(), replace(GOOD, executions=2))
     assert "needs at least 3" in (found.doubt or "")
     assert not found.covers(1e9)
+
+
+def test_a_prediction_that_failed_matters_by_the_margin_to_the_threshold() -> None:
+    found = certify_dynamics(sample(), replace(GOOD, predictions=(*GOOD.predictions, prediction(4, 0.6, 0.5))))
+    assert found.doubt is None
+    assert found.details["raised_from"] == pytest.approx(np.sort(GOOD.maxima)[38])
+    assert found.upper_bound == pytest.approx(found.details["raised_from"] + 0.1 / ACCURATE)
+    assert found.covers(3.0)
+    assert not found.covers(1.1 * found.details["raised_from"])
+    reason = judge_by(found, trials(4), 1.5).reason
+    assert "trial 4 came out at 0.5 where 0.6 was predicted, which raises the bound from 0.997" in reason
+    assert "a state that is not recorded" in reason
+
+
+def test_an_undecided_verdict_says_how_many_executions_are_needed_and_what_the_samples_say() -> None:
+    fewer = replace(sample(), learned=Learned(replace(GOOD, predictions=GOOD.predictions[:1])))
+    certificate, expected = Dynamics().certify_against(fewer, 1.2)
+    assert certificate.doubt is not None
+    assert expected == Forecast(2, 1.0, 0.0, fewest=True)
+    assert "at least 2 more executions are needed, and 100 % of the posterior samples" in str(expected)
+    assert Dynamics().certify_against(sample(), 1.2)[1] is None
 
 
 def test_a_draw_that_diverges_leaves_no_bound() -> None:

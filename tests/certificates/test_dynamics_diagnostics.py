@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctxval.certificates import DynamicsEvidence, UntriedParameter
+from ctxval.certificates import CheckedPrediction, DynamicsEvidence, UntriedParameter
 from ctxval.certificates.dynamics_diagnostics import (
     ACCURATE,
     AGREE,
@@ -27,6 +27,9 @@ from ctxval.certificates.dynamics_diagnostics import (
     TESTED,
     TOLERATED,
     doubt_of,
+    failed,
+    fewest_missing,
+    raised,
     uncovered,
     untested,
 )
@@ -44,7 +47,6 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"executions": FEWEST - 1}, "needs at least 3"),
     ({"unplanned": 0.01}, "for 1 % of the tasks no controller can be designed"),
     ({"predictions": (*GOOD.predictions, AUDITED)}, "audit failed: the distance of trial 4"),
-    ({"predictions": (prediction(1), prediction(2, 0.5, 0.5 + 1.1 * ACCURATE), prediction(3))}, "trial 2: distance"),
     ({"predictions": GOOD.predictions[:2]}, "2 executions of different tasks were predicted"),
     ({"noise": 2 * NOISE}, "2 % of the variance of the residual"),
     ({"left_out": 1.1 * LEFT_OUT}, "leave out 55 % of the largest variance"),
@@ -95,12 +97,47 @@ def test_predictions_that_could_not_fail_do_not_count() -> None:
     for one in (same, imported):
         said = doubt(predictions=(*GOOD.predictions[:2], one)) or ""
         assert "2 executions of different tasks were predicted" in said
-        assert "failed" in (doubt(predictions=(*GOOD.predictions, replace(one, distance=0.9))) or "")
+        wrong = replace(GOOD, predictions=(*GOOD.predictions, replace(one, distance=0.9)))
+        assert failed(wrong, BOUND) == wrong.predictions[-1]
 
 
-def test_a_prediction_that_was_too_high_has_failed_as_well() -> None:
-    too_high = (prediction(1), prediction(2, 0.9, 0.5), prediction(3))
-    assert "contact or dry friction" in (doubt(predictions=too_high) or "")
+def after(*predictions: CheckedPrediction) -> DynamicsEvidence:
+    return replace(GOOD, predictions=predictions)
+
+
+@pytest.mark.parametrize("distance", [0.5 - 1.1 * ACCURATE, 0.5 + 1.1 * ACCURATE])
+def test_a_prediction_that_failed_raises_the_bound_until_its_error_is_small_beside_the_rise(distance: float) -> None:
+    evidence = after(prediction(1), prediction(2, 0.5, distance), prediction(3))
+    assert doubt_of(evidence, BEST, BOUND) is None
+    assert raised(evidence, BOUND) == pytest.approx(BOUND + 1.1)
+    assert raised(GOOD, BOUND) == BOUND
+
+
+def test_the_largest_error_raises_the_bound() -> None:
+    assert raised(after(prediction(1, 0.5, 0.6), prediction(2, 0.5, 0.3), prediction(3)), BOUND) == pytest.approx(5.0)
+    assert raised(after(*GOOD.predictions, prediction(4, np.inf)), BOUND) == np.inf
+
+
+def test_large_distances_count_as_tested_if_the_raised_bound_leaves_room_for_their_errors() -> None:
+    beside = [prediction(k, 0.1, 0.1) for k in range(2)]
+    assert doubt_of(after(*beside, prediction(2, 0.5, 0.6)), BEST, BOUND) is None
+    assert "small distances hardly" in (doubt_of(after(*beside, prediction(2, 0.1, 0.2)), BEST, BOUND) or "")
+
+
+@pytest.mark.parametrize(
+    ("evidence", "fewest"),
+    [
+        (GOOD, 1),
+        (replace(GOOD, executions=1), FEWEST - 1),
+        (after(prediction(1), prediction(2)), 1),
+        (after(), 3),
+        (after(*GOOD.predictions, prediction(4, 0.5, 0.7)), 3),
+        (after(prediction(0, 0.5, 0.7), *GOOD.predictions), 1),
+        (replace(GOOD, coverage=replace(COVERED, beyond=gap(2 * BEYOND), marginal=gap(1.1 * GAP))), 2),
+    ],
+)
+def test_the_fewest_executions_that_can_decide(evidence: DynamicsEvidence, fewest: int) -> None:
+    assert fewest_missing(evidence, BEST, BOUND) == fewest
 
 
 def test_an_audited_distance_above_its_prediction_withdraws_the_bound() -> None:
@@ -112,7 +149,9 @@ def test_an_audited_distance_above_its_prediction_withdraws_the_bound() -> None:
 
 
 def test_a_failure_long_ago_is_forgiven() -> None:
-    assert doubt(predictions=(prediction(0, 0.1, 0.5), *GOOD.predictions)) is None
+    long_ago = after(prediction(0, 0.1, 0.5), *GOOD.predictions)
+    assert doubt_of(long_ago, BEST, BOUND) is None
+    assert raised(long_ago, BOUND) == BOUND
 
 
 def test_many_coordinates_may_leave_their_ranges_as_far_as_they_may_leave_gaps() -> None:

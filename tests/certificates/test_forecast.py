@@ -67,4 +67,9 @@ def test_beyond_the_horizon_nothing_is_promised(sample: Sample, found: Maxima, m
 
 
 def test_a_forecast_speaks_in_words() -> None:
-    assert str(Forecast(7, 0.5, 0.5)) == "about 7 more executions are expected to decide"
+    likely = "about 7 more executions are expected to decide (validated in 80 % of the simulated futures)"
+    assert str(Forecast(7, 0.8, 0.2)) == likely
+    assert "falsified in 90 %" in str(Forecast(1, 0.0, 0.9))
+    fewest = Forecast(1, 0.95, 0.05, fewest=True)
+    share = "95 % of the posterior samples of the dynamics stay below the threshold"
+    assert str(fewest) == f"at least 1 more execution is needed, and {share}"

@@ -67,6 +67,45 @@ def test_a_wrong_prediction_does_not_keep_the_top_hidden() -> None:
     assert "leaving one out, the prediction errs by" in fallen[0]["why"]
 
 
+def engines(search: TrustRegion) -> list[str]:
+    return [note["engine"] for note in search.notes if note is not None]
+
+
+def doubtful(X: Array) -> Array:
+    return np.full(len(X), 7.0)
+
+
+def test_if_a_doubtful_prediction_was_far_off_every_second_point_is_that_of_the_surrogate() -> None:
+    search = TrustRegion()
+    run(search, hill, lambda X: 220.0 * X[:, 0] ** 4, 5, doubt=doubtful)
+    assert engines(search) == ["climb", "scalar", "climb", "scalar", "climb"]
+    hedges = [note["why"] for note in search.notes if note is not None and note["engine"] == "scalar"]
+    assert all("the last prediction erred by" in why and "is in doubt" in why for why in hedges)
+    never = TrustRegion(settings=TrustRegionSettings(hedge=False))
+    run(never, hill, lambda X: 220.0 * X[:, 0] ** 4, 5, doubt=doubtful)
+    assert engines(never) == ["climb"] * 5
+
+
+@pytest.mark.parametrize("doubt", [None, doubtful])
+def test_right_predictions_are_not_hedged(doubt: Function | None) -> None:
+    search = TrustRegion()
+    run(search, hill, lambda X: 0.8 * hill(X), 4, doubt=doubt)
+    assert engines(search) == ["climb"] * 4
+
+
+def test_predictions_that_find_nothing_larger_are_hedged_though_they_are_right() -> None:
+    search = TrustRegion(settings=TrustRegionSettings(compare_with_surrogate=False))
+
+    def plain(X: Array) -> Array:
+        return np.exp(-4 * ((X - 0.2) ** 2).sum(axis=1))
+
+    values = run(search, lambda X: plain(X) + 3 * (X > 0.75).all(axis=1), plain, 30)
+    hedges = [note["why"] for note in search.notes if note is not None and note["engine"] == "scalar"]
+    assert engines(search)[:6] == ["climb"] * 6
+    assert all("found nothing larger" in why for why in hedges)
+    assert values.max() > 3
+
+
 @pytest.mark.slow
 def test_without_a_prediction_the_scalar_search_goes_on_and_says_so() -> None:
     search, random = TrustRegion(), Random()
@@ -204,18 +243,18 @@ def test_settings_leave_parts_of_the_search_out() -> None:
     def wrong(X: Array) -> Array:
         return 1.0 - 0.9 * hill(X)
 
-    def engines(settings: TrustRegionSettings) -> set[str]:
+    def used(settings: TrustRegionSettings) -> set[str]:
         search = TrustRegion(settings=settings)
         run(search, hill, wrong, 12)
-        return {note["engine"] for note in search.notes if note is not None}
+        return set(engines(search))
 
     def regions(settings: TrustRegionSettings) -> set[tuple[int, float]]:
         search = TrustRegion(settings=settings)
         run(search, hill, lambda X: 0.8 * hill(X), 6)
         return {(note["climb"], note["radius"]) for note in search.notes if note is not None and "climb" in note}
 
-    assert engines(TrustRegionSettings()) == {"climb", "scalar"}
-    assert engines(TrustRegionSettings(compare_with_surrogate=False)) == {"climb"}
+    assert used(TrustRegionSettings()) == {"climb", "scalar"}
+    assert used(TrustRegionSettings(compare_with_surrogate=False, hedge=False)) == {"climb"}
     assert len(regions(TrustRegionSettings())) > 1
     assert regions(TrustRegionSettings(restrict=False)) == {(0, 1.0)}
 

@@ -29,6 +29,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     FEWEST,
     doubt_of,
     held,
+    raised,
     uncovered,
     untested,
     untried_parameter,
@@ -59,6 +60,7 @@ class IntervalSearch:
         threshold: tau, in the distance's units; None if there is none.
         within: without a threshold, the share by which the bound may exceed the largest executed distance at the end.
         audited: whether the bound from learned dynamics must also pass a prediction audit.
+        keeps: whether the store keeps the evidence that may decide.
 
     Raises:
         InputError: if the certificate cannot be used, or an anytime audit may leave out no volume or has no threshold.
@@ -70,6 +72,7 @@ class IntervalSearch:
     threshold: float | None = None
     within: float = WITHIN
     audited: bool = False
+    keeps: bool = True
 
     def __post_init__(self) -> None:
         require_decisive(self.options)
@@ -94,9 +97,8 @@ class IntervalSearch:
 
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides."""
-        trials, limit = self.recorder.trials, self.limit
-        best = largest_distance(trials)
-        if best > limit:
+        trials = self.recorder.trials
+        if largest_distance(trials) > self.limit:
             return None
         if isinstance(self.options.kind, AnytimeAudit):
             return self._by_draws(trials, self.options.kind)
@@ -104,16 +106,26 @@ class IntervalSearch:
         if evidence is None or self._fails(evidence):
             return self._by_distance(trials)
         if self._may_decide(trials, evidence):
-            evidence = self.recorder.dynamics.evidence(trials, self.options.confidence, keep=True)
+            evidence = self.recorder.dynamics.evidence(trials, self.options.confidence, keep=self.keeps)
             if evidence is None:
                 return self._by_distance(trials)
             if self._decides(trials, evidence):
                 return self._audit(evidence) if self.audited else None
         if isinstance(self.options.kind, Automatic) and self.recorder.executions >= _PATIENCE:
             return self._by_distance(trials)
+        return self._narrowing(trials, evidence)
+
+    def by_dynamics(self) -> Array | None:
+        """Return the next task, a point ``(d,)``; None if it is decided or learned dynamics do not choose the task."""
+        evidence = self._evidence(self.recorder.trials)
+        choice = None if evidence is None or self._fails(evidence) else self.choose()
+        return None if choice is None else choice.unit_point
+
+    def _narrowing(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> Choice:
         known = _points(trials, self._dimension)
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
+        best, limit = largest_distance(trials), self.limit
         point = next_task(evidence, known, best, limit, self.options.confidence, steady)
         # The results decide when the campaign ends, so the number of independent draws is not planned.
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
@@ -136,9 +148,9 @@ class IntervalSearch:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
         if isinstance(self.options.kind, Dynamics):
             return False
-        last = evidence.predictions[-_FAILING:]
-        bound = min(evidence.upper(self.options.confidence), self.limit)
-        return len(last) == _FAILING and 2 * sum(held(one, bound) for one in last) < _FAILING
+        last, bound = evidence.predictions[-_FAILING:], evidence.upper(self.options.confidence)
+        tolerated = max(min(bound, self.limit), self.limit - bound)  # as far as the margin to the limit allows
+        return len(last) == _FAILING and 2 * sum(held(one, tolerated) for one in last) < _FAILING
 
     def _may_decide(self, trials: Sequence[Trial], screened: DynamicsEvidence) -> bool:
         """Return whether the whole evidence may decide: nothing that a few draws show leaves the verdict open."""
@@ -146,7 +158,7 @@ class IntervalSearch:
             return False
         best = largest_distance(trials)
         bound = bound_of(screened, best, self.options.confidence)
-        return bound <= self.limit and doubt_of(screened, best, bound) is None
+        return raised(screened, bound) <= self.limit and doubt_of(screened, best, bound) is None
 
     def _decides(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> bool:
         ended = [trial for trial in trials if trial.state != "open"]

@@ -13,9 +13,11 @@ from ctxval._util.progress import stage
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display
 from ctxval.campaign.history import executed_trials
+from ctxval.campaign.interval_search import IntervalSearch, is_decisive
 from ctxval.campaign.learned import LearnedFromTrials
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
+from ctxval.certificates.dynamics_evidence import with_units
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.preflight import StartOffset, start_offset
 from ctxval.core.trajectory import Trajectory
@@ -116,7 +118,8 @@ class CampaignResults:
         """Return whether the model can be trusted up to a threshold tau.
 
         The model is falsified if an executed distance exceeds the threshold, and validated if a certificate bounds d*
-        by the threshold. Otherwise the verdict is undecided, with a forecast of the executions that would decide.
+        by the threshold. Otherwise the verdict is undecided, with a forecast of the executions that would decide
+        and, if learned dynamics choose it, the next task.
 
         Args:
             threshold: tau, in the units of the distance.
@@ -133,7 +136,25 @@ class CampaignResults:
         """
         chosen = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         with progress_shown(progress), stage("certifying"):
-            return judge(self.trials, threshold, chosen, self.provenance)
+            verdict = judge(self.trials, threshold, chosen, self.provenance)
+            return self._with_next_task(verdict, chosen) if verdict.answer == "undecided" else verdict
+
+    def _with_next_task(self, verdict: Verdict, options: CertificateOptions) -> Verdict:
+        """Return an undecided verdict with the task to execute next, if learned dynamics choose it."""
+        if not is_decisive(options) or self.failed:
+            return verdict
+        budget = self.executions + 1
+        unit_point = IntervalSearch(self._recorder, options, budget, verdict.threshold, keeps=False).by_dynamics()
+        if unit_point is None:
+            return verdict
+        space = self.validation.space
+        point = space.from_unit(space.rounded(unit_point))
+        sentence = f"next task: {with_units(dict(zip(space.labels, point.tolist(), strict=True)))}"
+        return replace(
+            verdict,
+            reason=f"{verdict.reason.removesuffix('.')}; {sentence}.",
+            next_task=space.describe_point(point),
+        )
 
     @checked
     def certify(

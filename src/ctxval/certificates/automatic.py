@@ -76,7 +76,7 @@ class Automatic(CertificateKind):
         if not isinstance(by_distance, tuple) or _decides(by_distance[0], threshold):
             return by_dynamics if not isinstance(by_distance, tuple) else by_distance
         supported = threshold is not None and Dynamics.support(by_dynamics[0], threshold)
-        return by_dynamics if by_dynamics[0].doubt is None or supported else by_distance
+        return by_dynamics if _is_sound(by_dynamics[0]) or supported else by_distance
 
 
 def _tried(
@@ -91,8 +91,13 @@ def _tried(
 
 
 def _decides(certificate: Certificate, threshold: float | None) -> bool:
-    """Return whether a certificate keeps a threshold; if there is none, whether it is not withdrawn."""
-    return certificate.doubt is None if threshold is None else certificate.covers(threshold)
+    """Return whether a certificate keeps a threshold; if there is none, whether it is sound."""
+    return _is_sound(certificate) if threshold is None else certificate.covers(threshold)
+
+
+def _is_sound(certificate: Certificate) -> bool:
+    """Return whether a certificate is not withdrawn, and no prediction failed that raises its bound."""
+    return certificate.doubt is None and certificate.details.get("raised_from") is None
 
 
 def _required(found: Found | CertificateError) -> Found:

@@ -230,7 +230,7 @@ class CertificateKind(ABC):
 
     @classmethod
     def shortfall(cls, certificate: Certificate) -> str:
-        """Return the end of a sentence on why the volume left out is not smaller; empty if there is no reason."""
+        """Return the end of a sentence on why the bound or the volume left out is not smaller; empty if unknown."""
         return ""
 
     __repr__ = record

@@ -9,7 +9,7 @@ rougher than the system, a linear model takes its place in r (:mod:`ctxval.learn
 The bound lies if the prior is wrong: if a state is not recorded, or the dynamics jump. So it is withdrawn by
 :mod:`ctxval.certificates.dynamics_diagnostics` unless predictions that were made before executions held, and unless the
 records cover what the closed loops visit. It is raised by half of the largest excess of the last executions over their
-predictions.
+predictions, and by far more if one of these predictions failed.
 """
 
 from __future__ import annotations
@@ -23,8 +23,17 @@ from ctxval._util.checked import Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
 from ctxval.certificates.bounds import with_error
-from ctxval.certificates.dynamics_diagnostics import PREDICTIONS, counted, doubt_of, held
+from ctxval.certificates.dynamics_diagnostics import (
+    PREDICTIONS,
+    counted,
+    doubt_of,
+    failed,
+    fewest_missing,
+    held,
+    raised,
+)
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence, with_units
+from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.learned import require_learned
 from ctxval.certificates.posterior import both_outcomes
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
@@ -77,6 +86,21 @@ class Dynamics(CertificateKind):
         Raises:
             CertificateError: if the experiment is not loaded, an execution failed, or no dynamics can be learned.
         """
+        return certify_dynamics(sample, self._evidence(sample, confidence), confidence)
+
+    def certify_against(
+        self, sample: Sample, threshold: float, confidence: float = 0.95
+    ) -> tuple[Certificate, Forecast | None]:
+        """Return the certificate and, if it does not keep the threshold, the fewest executions that can decide."""
+        evidence = self._evidence(sample, confidence)
+        certificate = certify_dynamics(sample, evidence, confidence)
+        if certificate.covers(threshold):
+            return certificate, None
+        bound = bound_of(evidence, sample.best, confidence)
+        kept = float((evidence.maxima <= threshold).mean())
+        return certificate, Forecast(fewest_missing(evidence, sample.best, bound), kept, 1 - kept, fewest=True)
+
+    def _evidence(self, sample: Sample, confidence: float) -> DynamicsEvidence:
         learned = require_learned(sample, self.name)
         require_executions(sample)
         evidence = learned.dynamics(confidence)
@@ -85,7 +109,7 @@ class Dynamics(CertificateKind):
                 "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
                 "controller can be designed."
             )
-        return certify_dynamics(sample, evidence, confidence)
+        return evidence
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
@@ -109,6 +133,20 @@ class Dynamics(CertificateKind):
             f"supported by the model: no draw of the learned dynamics exceeds {threshold:.6g} in a search of "
             f"{details['evaluations']} closed loops; {predictions['held']} of the last {predictions['last_ones']} "
             "predictions held"
+        )
+
+    @classmethod
+    def shortfall(cls, certificate: Certificate) -> str:
+        """Return which failed prediction raises the bound; empty if all held."""
+        details = certificate.details
+        if details["raised_from"] is None:
+            return ""
+        worst = next(one for one in details["checked"] if one["trial"] == details["raised_by_trial"])
+        return (
+            f": trial {worst['trial']} came out at {worst['distance']:.4g} where {worst['median']:.4g} was predicted, "
+            f"which raises the bound from {details['raised_from']:.4g} until {PREDICTIONS} predictions in a row hold. "
+            "If predictions go on failing, a state that is not recorded, a jump such as a contact or dry friction, or "
+            "noise is the likely cause: record more states, or use --kind posterior or an audit"
         )
 
 
@@ -145,8 +183,9 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         CertificateError: if the confidence is too high for the number of draws, or draws diverge.
     """
     _require_draws(len(evidence.maxima), confidence)
-    raised, error = bound_of(evidence, sample.best, confidence), evidence.error(confidence)
-    if not np.isfinite(raised + error):
+    bound, error = bound_of(evidence, sample.best, confidence), evidence.error(confidence)
+    upper = raised(evidence, bound)
+    if not np.isfinite(upper + error):
         raise CertificateError(
             "the dynamics give no bound: the closed loops of some draws diverge, or an execution could not be "
             "predicted. More executions narrow the draws."
@@ -155,15 +194,15 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         kind="dynamics",
         statement=(
             f"With probability {confidence} under the prior on the residual dynamics, d* is at most "
-            f"{with_error(raised, error)}."
+            f"{with_error(upper, error)}."
         ),
-        upper_bound=raised,
+        upper_bound=upper,
         confidence=confidence,
         volume=0.0,
         trials=len(sample),
         assumptions=(*_assumptions(evidence), *sample.remarks, ONE_CAMPAIGN),
-        details=_details(sample, evidence, raised, error),
-        doubt=both_outcomes(sample, stochastic=False) or doubt_of(evidence, sample.best, raised),
+        details=_details(sample, evidence, bound, error),
+        doubt=both_outcomes(sample, stochastic=False) or doubt_of(evidence, sample.best, bound),
         error=error,
     )
 
@@ -174,7 +213,9 @@ def _require_draws(draws: int, confidence: float) -> None:
 
 
 def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> float:
-    """Return the bound: the order statistic of the maxima, raised by what searches and predictions have missed.
+    """Return the order statistic of the maxima, raised by what searches and predictions have missed.
+
+    If predictions failed, the bound is much higher: see :func:`~ctxval.certificates.dynamics_diagnostics.raised`.
 
     Args:
         evidence: what the learned dynamics say.
@@ -222,10 +263,12 @@ def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
 
 def _details(sample: Sample, evidence: DynamicsEvidence, bound: float, error: float) -> dict[str, Any]:
     finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
-    coverage = evidence.coverage
+    coverage, worst, upper = evidence.coverage, failed(evidence, bound), raised(evidence, bound)
     return {
         "best": sample.best,
-        "gap": bound - sample.best,
+        "gap": upper - sample.best,
+        "raised_from": None if worst is None else bound,
+        "raised_by_trial": None if worst is None else worst.trial,
         "error": error,
         "executions": evidence.executions,
         "draws": len(evidence.maxima),

@@ -23,7 +23,7 @@ def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
     Args:
         evidence: what the learned dynamics say.
         best: the largest executed distance.
-        bound: the bound.
+        bound: the bound before failed predictions raise it.
     """
     return _first(DIAGNOSTICS, evidence, best, bound)
 
@@ -48,6 +48,20 @@ def untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
         bound: the bound.
     """
     return _first(LARGE_DISTANCES, evidence, best, bound)
+
+
+def fewest_missing(evidence: DynamicsEvidence, best: float, bound: float) -> int:
+    """Return the fewest executions after which nothing could withdraw or raise the bound any more, at least 1.
+
+    Args:
+        evidence: what the learned dynamics say.
+        best: the largest executed distance.
+        bound: the bound before failed predictions raise it.
+    """
+    checked = counted(evidence, bound)
+    in_a_row = next((k for k, one in enumerate(reversed(checked)) if not held(one, bound)), len(checked))
+    gaps = sum(one(evidence, best, bound) is not None for one in (*COVERAGE, *LARGE_DISTANCES))
+    return max(FEWEST - evidence.executions, PREDICTIONS - in_a_row, gaps, 1)
 
 
 def _first(diagnostics: Iterable[Diagnostic], evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
@@ -99,7 +113,8 @@ PREDICTIONS = 3
 """Number of the last predictions that must have held."""
 
 ACCURATE = 0.05
-"""Largest difference between a distance and its prediction that held, as a share of the bound."""
+"""Largest difference between a distance and its prediction that held, as a share of the bound or, if a prediction
+failed, of the margin that is left above the bound; see :func:`raised`."""
 
 
 def agrees(distance: float, predicted: float, bound: float) -> bool:
@@ -124,18 +139,20 @@ def counted(evidence: DynamicsEvidence, bound: float) -> list[CheckedPrediction]
     return [one for one in evidence.predictions if not held(one, bound) or (one.new and (one.stored or not one.chosen))]
 
 
-def _failed_predictions(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    last = counted(evidence, bound)[-PREDICTIONS:]
-    failed = [one for one in last if not held(one, bound)]
-    if not failed:
-        return None
-    worst = max(failed, key=lambda one: abs(one.distance - one.median))
-    return (
-        f"of the last {len(last)} predictions {len(failed)} failed (trial {worst.trial}: distance {worst.distance:.4g} "
-        f"where {worst.median:.4g} was predicted); {PREDICTIONS} must hold in a row. After few executions, more of "
-        "them help. If predictions go on failing, a state that is not recorded, a jump such as a contact or dry "
-        "friction, or noise is the likely cause: record more states, or use --kind posterior or an audit"
-    )
+def failed(evidence: DynamicsEvidence, bound: float) -> CheckedPrediction | None:
+    """Return the one that failed most of the last predictions that count; None if all of them held."""
+    last = [one for one in counted(evidence, bound)[-PREDICTIONS:] if not held(one, bound)]
+    return max(last, key=lambda one: one.error, default=None)
+
+
+def raised(evidence: DynamicsEvidence, bound: float) -> float:
+    """Return a bound that the errors of the last predictions leave credible.
+
+    A prediction that failed raises the bound by so much that its error is a small share of the rise. So a threshold far
+    above the bound is kept in spite of it, and one near the bound is not.
+    """
+    worst = failed(evidence, bound)
+    return bound if worst is None else bound + worst.error / ACCURATE
 
 
 def _few_predictions(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
@@ -254,7 +271,8 @@ MATTERS = 0.3
 
 
 def _only_small_distances(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    if any(one.distance >= MATTERS * bound and held(one, bound) for one in counted(evidence, bound)):
+    allowed = raised(evidence, bound)
+    if any(one.distance >= MATTERS * bound and held(one, allowed) for one in counted(evidence, bound)):
         return None
     return (
         f"no prediction held at a distance of at least {100 * MATTERS:g} % of the bound: small distances hardly "
@@ -324,7 +342,6 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
     _few_executions,
     _unplanned,
     _audit_failed,
-    _failed_predictions,
     _few_predictions,
     _noisy,
     _variance_left_out,

@@ -47,6 +47,11 @@ class CheckedPrediction:
         """How far the distance exceeds the prediction's median; infinity if nothing was predicted."""
         return max(self.distance - self.median, 0.0) if np.isfinite(self.median) else np.inf
 
+    @property
+    def error(self) -> float:
+        """The difference between the distance and the prediction's median; infinity if nothing was predicted."""
+        return abs(self.distance - self.median) if np.isfinite(self.median) else np.inf
+
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON: numbers that are not finite are None."""
         return {

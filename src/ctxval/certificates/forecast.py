@@ -1,4 +1,4 @@
-"""Forecast of the executions until a verdict, from simulated continuations of the campaign under the posterior."""
+"""Forecast of the executions until a verdict: how many there are at least or about, and what they would decide."""
 
 from __future__ import annotations
 
@@ -26,21 +26,30 @@ _JITTER = 1e-9
 
 @dataclass(frozen=True)
 class Forecast:
-    """Forecast of further executions, from simulated futures of the campaign.
+    """Forecast of further executions.
 
     Attributes:
-        executions: number of executions after which half of the futures are decided; None if it exceeds ``HORIZON``.
-        validated: share of the futures that validate the threshold.
-        falsified: share of the futures that find a counterexample.
+        executions: number of executions after which half of the simulated futures are decided, or the fewest that can
+            decide; None if it exceeds ``HORIZON``.
+        validated: share of the futures, or of the posterior samples of the dynamics, that validate the threshold.
+        falsified: share of them in which a distance exceeds the threshold.
+        fewest: whether ``executions`` is the fewest that can decide.
     """
 
     executions: int | None
     validated: float
     falsified: float
+    fewest: bool = False
 
     def __str__(self) -> str:
+        plural = "execution is" if self.executions == 1 else "executions are"
+        if self.fewest:
+            shares = f"{100 * self.validated:.0f} % of the posterior samples of the dynamics stay below the threshold"
+            return f"at least {self.executions} more {plural} needed, and {shares}"
         many = f"about {self.executions}" if self.executions is not None else f"more than {HORIZON}"
-        return f"{many} more executions are expected to decide"
+        answer, share = max(("validated", self.validated), ("falsified", self.falsified), key=lambda one: one[1])
+        outcome = f" ({answer} in {100 * share:.0f} % of the simulated futures)" if share else ""
+        return f"{many} more {plural} expected to decide{outcome}"
 
 
 def forecast(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -40,6 +40,8 @@ class Verdict:
         certificate: the certificate that validates or does not suffice; None if there is none.
         expected: a forecast of further executions; None if the answer is decided or nothing can be predicted.
         rests_on: one sentence on the conditions of a validation; None if the answer is not "validated".
+        next_task: the parameters of the task to execute next, if the answer is "undecided" and learned dynamics choose
+            it; else None.
     """
 
     answer: Answer
@@ -49,6 +51,7 @@ class Verdict:
     certificate: Certificate | None = None
     expected: Forecast | None = None
     rests_on: str | None = None
+    next_task: Mapping[str, Any] | None = None
 
     @property
     def bound(self) -> float | None:
@@ -72,6 +75,7 @@ class Verdict:
             "reason": self.reason,
             "rests_on": self.rests_on,
             "threshold": self.threshold,
+            "next_task": self.next_task,
         }
 
 
@@ -159,8 +163,9 @@ def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
     if KINDS.of(certificate).never_validates:
         return f"{KINDS.of(certificate).never_validates}."
     upper, limit = _bound_and_limit(certificate, tau)
+    shortfall = KINDS.of(certificate).shortfall(certificate)
     if certificate.upper_bound > tau:
-        return f"no distance above {limit} was executed, but d* may be up to {upper}."
+        return f"no distance above {limit} was executed, but d* may be up to {upper}{shortfall}."
     if not certificate.covers(tau, certificate.volume):
         return (
             f"the {certificate.kind} bound is {upper}, and {limit} is too near to it for the random draws that it is "
@@ -169,7 +174,7 @@ def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
     return (
         f"the {certificate.kind} bound of {certificate.trials} trials leaves out "
         f"{at_most(100 * certificate.volume, 3)} % {of_tasks(certificate.distribution)}, more than "
-        f"the {100 * volume:.3g} % that are acceptable{KINDS.of(certificate).shortfall(certificate)}; it is no bound "
+        f"the {100 * volume:.3g} % that are acceptable{shortfall}; it is no bound "
         "on d*."
     )
 

@@ -5,6 +5,10 @@ w. The prediction is trusted inside a box around the best point. The box grows i
 value. It shrinks if an execution does not and the prediction was wrong. If no improvement is predicted in a region, or
 if several executions have not improved, a new region starts at the point of the whole cube with the largest optimistic
 value for a larger kappa. A larger kappa favours points where the dynamics are not known.
+
+A prediction may be wrong in a way that its doubt does not show. So the search hedges: if the last prediction was far
+off and the next one is in doubt, or if several executions have found nothing larger, every second point is that of
+Bayesian optimisation on the values alone.
 """
 
 from __future__ import annotations
@@ -55,6 +59,9 @@ class TrustRegionSettings:
         compared_from: number of known values from which on the prediction must be better than the surrogate.
         compared_on: largest number of known values, the latest ones, on which the two are compared.
         good_enough: mean error of the logarithm up to which a prediction needs no comparison.
+        hedge: whether a prediction that may mislead alternates with the surrogate.
+        far_off: relative error of the last prediction from which on the search hedges if the doubt exceeds 1.
+        fruitless: number of executions that found nothing larger, from which on it hedges in any case.
         distinct: least distance of a suggestion from each known point, in at least one coordinate.
         apart: least distance of a suggestion from pending and failed points, as a share of the cube's diagonal.
     """
@@ -71,6 +78,9 @@ class TrustRegionSettings:
     compared_from: int = 6
     compared_on: int = 24
     good_enough: float = 0.1
+    hedge: bool = True
+    far_off: float = 0.5
+    fruitless: int = 6
     distinct: float = 1e-6
     apart: float = 0.05
 
@@ -145,7 +155,8 @@ class TrustRegion(SequentialSearch):
                 doubtful = self._why_not(prediction, surrogate_error)
                 point = self._promising(prediction, rng) if doubtful is None else None
             if point is not None:
-                return point
+                why_hedge = self._why_hedge()
+                return point if why_hedge is None else self._without_prediction(rng, why_hedge)
             why = doubtful or "nothing is predicted anywhere"
             prediction = None if prediction.otherwise is None else prediction.otherwise()
         return self._without_prediction(rng, why)
@@ -183,6 +194,24 @@ class TrustRegion(SequentialSearch):
         kept = represented(points, values)  # it ends with the latest values, which are compared
         latest = slice(-min(len(values), self._settings.compared_on), None)
         return log_error(left_out_by_surrogate(points[kept], values[kept])[latest], values[latest])
+
+    def _why_hedge(self) -> str | None:
+        """Return why the surrogate chooses in place of the prediction, every second time; None if it does not."""
+        rows = [
+            row for row in np.flatnonzero(np.isfinite(self.values)) if (self.notes[row] or {}).get("engine") == _ENGINE
+        ]
+        if not rows or not self._settings.hedge or (self.notes[-1] or {}).get("engine") != _ENGINE:
+            return None
+        value, expected = self.values[rows[-1]], (self.notes[rows[-1]] or {})["expected"]
+        error = abs(value - expected) / max(value, expected, 1e-300)
+        if (self._last_note or {})["doubt"] > 1 and error > self._settings.far_off:
+            return f"the last prediction erred by {100 * error:.0f} % and the next one is in doubt"
+        values = self.values[np.isfinite(self.values)]
+        gains = values[1:] > (1 + self._settings.improvement) * np.maximum.accumulate(values)[:-1]
+        fruitless = len(gains) - int(np.flatnonzero(gains).max(initial=-1)) - 1
+        if fruitless >= self._settings.fruitless:
+            return f"the last {fruitless} executions found nothing larger"
+        return None
 
     # Where to execute next
 
