@@ -90,9 +90,11 @@ def add_store_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--store", action="store_true", help="keep the ratios for docs/searches.md")
 
 
-def beside_landed(script: str | Path, *arguments: str, repeats: int = 1) -> tuple[list[Any], list[Any]]:
+def beside_landed(
+    script: str | Path, *arguments: str, repeats: int = 1, revision: str = LANDED
+) -> tuple[list[Any], list[Any]]:
     """Return what a script reports in several repeats with the earlier package, and with the present one."""
-    pairs = [(figures(script, *arguments, revision=LANDED), figures(script, *arguments)) for _ in range(repeats)]
+    pairs = [(figures(script, *arguments, revision=revision), figures(script, *arguments)) for _ in range(repeats)]
     return [earlier for earlier, _ in pairs], [now for _, now in pairs]
 
 

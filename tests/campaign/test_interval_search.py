@@ -277,6 +277,20 @@ def test_what_is_learned_of_the_same_executions_is_learned_once(monkeypatch: pyt
 
 
 @pytest.mark.slow
+def test_before_a_bound_is_possible_nothing_but_the_mean_is_searched() -> None:
+    validation, largest = linear()
+    campaign = Campaign(validation).run(3, 10 * largest, until=lambda running: running.executions == 3)
+    dynamics = campaign.recorder.dynamics
+    before, after = (dynamics.screening(campaign.trials[:count]) for count in (2, 3))
+    assert before is not None
+    assert after is not None
+    assert len(before.maxima) == 1
+    assert before.upper(0.95) == before.highest
+    np.testing.assert_array_equal(before.points, before.elites[:1])
+    assert len(after.maxima) > 1
+
+
+@pytest.mark.slow
 def test_a_decided_campaign_that_is_run_again_computes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     validation, largest = linear()
     store = tmp_path / "a.sqlite"

@@ -15,7 +15,7 @@ from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.history import executed_trials, for_known_values, largest_distance
 from ctxval.certificates.dynamics import bound_of, draws_for
-from ctxval.certificates.dynamics_diagnostics import DENSE, PREDICTIONS, doubt_of, jumps
+from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, jumps
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
     DynamicsEvidence,
@@ -127,10 +127,18 @@ class CampaignDynamics:
             return None
 
     def screening(self, trials: Sequence[Trial]) -> DynamicsEvidence | None:
-        """Return quick evidence of a few draws, whose bound is too low and whose diagnostics lack expensive ones."""
+        """Return quick evidence, whose bound is too low and whose diagnostics lack expensive ones.
+
+        It has a few draws, and none but the posterior mean after fewer executions than a bound needs.
+        """
         with stage("searching the learned dynamics", self._study.search.screening_loops, "closed loops"):
             learned = self.learned(trials)
-            return None if learned is None else self._guarded(lambda: self._evidence(learned, trials, learned.screened))
+            if learned is None:
+                return None
+            few = len(learned.executed) < FEWEST
+            return self._guarded(
+                lambda: self._evidence(learned, trials, learned.worst_of_mean if few else learned.screened)
+            )
 
     def evidence(self, trials: Sequence[Trial], confidence: float, *, keep: bool = False) -> DynamicsEvidence | None:
         """Return what the learned dynamics say about d*; None if nothing can be learned.

@@ -31,7 +31,7 @@ from ctxval.learning.execution_prediction import ExecutionPrediction, predict_ex
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.vector import predict_composed
-from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings
+from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings, WorstOfMean
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 
@@ -232,9 +232,25 @@ class LearnedDynamics:
     @functools.cached_property
     def screened(self) -> WorstCase:
         """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""
-        search = self.study.search
-        of_mean = search.on_mean(self.posterior, self._on_pool[0], self.executed, self._rng(4), globally=False)
-        return search.screened(self.posterior, of_mean, self.executed, self._rng(5))
+        return self.study.search.screened(self.posterior, self._screened_mean, self.executed, self._rng(5))
+
+    @property
+    def worst_of_mean(self) -> WorstCase:
+        """The largest distance over some tasks on the posterior mean alone, as if it were the only draw."""
+        found = self._screened_mean
+        return WorstCase(
+            np.array([found.highest]),
+            found.elites[:1],
+            found.highest,
+            found.elites,
+            found.evaluations,
+            0.0,
+            self.study.search.unplanned,
+        )
+
+    @functools.cached_property
+    def _screened_mean(self) -> WorstOfMean:
+        return self.study.search.on_mean(self.posterior, self._on_pool[0], self.executed, self._rng(4), globally=False)
 
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""

@@ -210,7 +210,8 @@ class WorstCaseSearch:
         return np.array([one.values[0] for one in found]), np.array([one.points[0] for one in found])
 
     @functools.cached_property
-    def _unplanned(self) -> float:
+    def unplanned(self) -> float:
+        """The share of the pool's tasks for which no controller can be designed, or on which M diverges."""
         planned = sum(int(np.sum(one.promised.finite)) for one in self.plans)
         return 1 - planned / len(self.pool)
 
@@ -302,7 +303,7 @@ class WorstCaseSearch:
             of_mean.elites,
             of_mean.evaluations + len(draws) * loops,
             max(draws.left_out),
-            self._unplanned,
+            self.unplanned,
             sharpness,
         )
 
