@@ -46,7 +46,7 @@ SECTIONS = (
     Section(
         "Certificates",
         certificates.KINDS,
-        '`[certificate]` with `kind = "audit"`; `--kind audit`; `certificates.certify(sample, "audit", 0.95)`',
+        '`[certificate]` with `kind = "audit"`; `--kind audit`; `certificates.Audit().certify(sample, 0.95)`',
     ),
     Section(
         "Cases",

@@ -14,7 +14,7 @@ import numpy as np
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, searches, systems
 from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
-from ctxval.certificates import Options, Sample, certify
+from ctxval.certificates import Audit, Sample
 from ctxval.certificates.verdict import judge_by
 
 STORED = JsonLines(Path(__file__).parent / "results" / "retrain.jsonl", ("second_audit",))
@@ -75,7 +75,7 @@ def second_verdict(seed: int, *, same_draws: bool) -> dict[str, float | bool]:
     if same_draws:  # what a seed alone gave: the tasks of the first audit again
         distances_of_seen = validation.distances(seen)
         return {"validated": bool((distances_of_seen <= threshold).all()), "above": float((wrong > threshold).mean())}
-    certificate = certify(Sample.of(second.trials), "audit", CONFIDENCE, Options())
+    certificate = Audit().certify(Sample.of(second.trials), CONFIDENCE)
     verdict = judge_by(certificate, second.trials, threshold, volume=VOLUME)
     return {"validated": verdict.answer == "validated", "above": float((wrong > threshold).mean())}
 

@@ -17,10 +17,10 @@ from ctxval.certificates import (
     KINDS,
     Certificate,
     CertificateKind,
-    Options,
     Posterior,
     Sample,
-    certify,
+    SamplingDiscarding,
+    Scenario,
     require_use,
 )
 from ctxval.certificates.registry import KindRegistry
@@ -38,16 +38,14 @@ def sample(n: int = 9, origin: str = "acquisition") -> Sample:
 # The kinds of this package
 
 
-def everything(kind: str) -> tuple[Sample, Options]:
-    trials = sample(30, origin="iid")
-    return trials, Options(discard=2)
+EVERYTHING = sample(30, origin="iid")
 
 
 def certified(kind: str, confidence: float) -> Certificate:
-    trials, options = everything(kind)
-    if KINDS.find(kind).needs_threshold:
-        return KINDS.find(kind)().certify_against(trials, 1.5, confidence)[0]
-    return certify(trials, kind, confidence, options)
+    chosen = KINDS.find(kind).of({"discard": 2})
+    if chosen.needs_threshold:
+        return chosen.certify_against(EVERYTHING, 1.5, confidence)[0]
+    return chosen.certify(EVERYTHING, confidence)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "posterior"])
@@ -66,22 +64,20 @@ def test_every_kind_has_its_name_on_its_certificate(kind: str) -> None:
     assert isinstance(certificate, Certificate)
     assert certificate.kind == ("dynamics" if kind == "auto" else kind)  # auto takes what decides
     if not KINDS.find(kind).needs_threshold:
-        assert certificate.upper_bound >= np.sort(everything(kind)[0].distances)[-3]
+        assert certificate.upper_bound >= np.sort(EVERYTHING.distances)[-3]
     assert certificate.assumptions
 
 
 def test_what_a_kind_needs_and_is_not_given_is_asked_for() -> None:
-    trials, _ = everything("scenario")
     with pytest.raises(CertificateError, match="how many to discard"):
-        certify(trials, "sampling-discarding", 0.9)
+        SamplingDiscarding().certify(EVERYTHING, 0.9)
     with pytest.raises(UnknownNameError, match="did you mean 'posterior'"):
-        certify(trials, "posteriour", 0.9)
+        KINDS.find("posteriour")
 
 
 def test_a_confidence_below_1_is_not_printed_as_1() -> None:
-    certificate = certify(
-        Sample(np.zeros((9, 1)), np.arange(9.0), ["iid"] * 9, ["completed"] * 9), "scenario", 0.9999999
-    )
+    draws = Sample(np.zeros((9, 1)), np.arange(9.0), ["iid"] * 9, ["completed"] * 9)
+    certificate = Scenario().certify(draws, 0.9999999)
     assert "confidence 0.9999999," in certificate.statement
 
 

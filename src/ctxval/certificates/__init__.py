@@ -32,7 +32,7 @@ from ctxval.certificates.posterior import Posterior, certify_posterior, instanta
 from ctxval.certificates.posterior_diagnostics import Diagnosis, diagnose
 from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.region import Region, certify_region
-from ctxval.certificates.registry import KINDS, Options, certify, require_possible, require_use
+from ctxval.certificates.registry import KINDS, require_use
 from ctxval.certificates.sample import PLANNED, MadeGood, Sample
 from ctxval.certificates.scenario import (
     SamplingDiscarding,
@@ -70,7 +70,6 @@ __all__ = [
     "MadeGood",
     "Maxima",
     "Mean",
-    "Options",
     "Posterior",
     "Provenance",
     "Region",
@@ -85,7 +84,6 @@ __all__ = [
     "Verdict",
     "assess",
     "bare_corners",
-    "certify",
     "certify_anytime",
     "certify_audit",
     "certify_dynamics",
@@ -105,7 +103,6 @@ __all__ = [
     "most_contested",
     "rate",
     "require_learned",
-    "require_possible",
     "require_use",
     "samples_needed",
     "settle_maxima",

@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from ctxval._util.checked import Probability, checked
 from ctxval._util.registry import Registry
-from ctxval._util.representation import record
 from ctxval.certificates.base import Certificate, CertificateKind
-from ctxval.certificates.covering import RESOLUTION
-from ctxval.certificates.sample import Sample
-from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 
 Kind = TypeVar("Kind", bound=type[CertificateKind])
@@ -81,43 +75,6 @@ KINDS = KindRegistry()
 """Kinds of certificates by name."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """Options of the built-in kinds in one record, for :func:`certify`; each kind uses those that are its own.
-
-    Attributes:
-        stochastic: for the posterior bound: whether two executions of one task may differ.
-        discard: for sampling and discarding: how many of the largest distances are discarded.
-        resolution: for the posterior bound: largest distance from a task to its nearest trial, in diagonals of the task
-            space.
-        remarks: sentences that the certificate lists among its assumptions, such as what was changed on the system.
-    """
-
-    stochastic: bool = False
-    discard: int | None = None
-    resolution: float = RESOLUTION
-    remarks: tuple[str, ...] = ()
-    __repr__ = record
-
-
-@checked
-def certify(sample: Sample, kind: str, confidence: Probability, options: Options | None = None) -> Certificate:
-    """Return the certificate of a kind.
-
-    Args:
-        sample: the trials.
-        kind: the name of the kind.
-        confidence: the probability with which the statement must hold.
-        options: options of the kind; its defaults if None.
-
-    Raises:
-        UnknownNameError: if no kind has that name.
-        CertificateError: if its theory does not allow these trials, or an option that it needs is missing.
-    """
-    chosen = Options() if options is None else options
-    return KINDS.find(kind).of(vars(chosen)).certify(sample, confidence).with_remarks(chosen.remarks)
-
-
 def require_use(kind: str, given: Iterable[str]) -> None:
     """Refuse options that a kind would ignore: a user who gives one expects it to have an effect.
 
@@ -133,13 +90,3 @@ def require_use(kind: str, given: Iterable[str]) -> None:
         if not kinds:
             raise UnknownNameError.among(f"option of the certificate {kind!r}", option, own)
         raise CertificateError(f"{option} is for certificates of the kind {kinds}; the kind here is {kind}.")
-
-
-def require_possible(origins: Iterable[Origin], kind: str, options: Options) -> None:
-    """Check that a kind of certificate can use independent draws, before they are executed.
-
-    Raises:
-        CertificateError: if the certificate would be refused whatever the distances of the draws are.
-        UnknownNameError: if no kind has that name.
-    """
-    KINDS.find(kind).of(vars(options)).require_audit_helps(origins)
