@@ -11,7 +11,7 @@ from ctxval._util.arrays import Array, Rows
 from ctxval._util.describe import describe
 from ctxval.errors import InputError, ShapeError
 from ctxval.searches import Auto, BayesianOptimisation, Prediction, Random, TrustRegion, TrustRegionSettings
-from ctxval.searches.base import Note
+from ctxval.searches.base import Note, Pending
 from ctxval.testing import check_search
 
 Function = Callable[[Array], Array]
@@ -264,3 +264,35 @@ def test_a_store_has_the_settings_if_they_are_not_the_usual_ones() -> None:
     assert describe(Auto()) == {"type": "Auto", "optimism": 2.0, "misses": 3, "thinking": "balanced"}
     other = describe(TrustRegion(settings=TrustRegionSettings(first_radius=0.3)))
     assert other["settings"]["first_radius"] == 0.3
+
+
+def asked_while_pending(at: list[float], after: Function) -> Array:
+    """Return the point that is asked for while another one is being evaluated, which leads to another prediction."""
+    search, pending = TrustRegion(), np.array([at])
+    search.reset(2, 0)
+    search.tell(np.array([[0.9, 0.1], *pending]), [0.2, np.nan])
+    search.use_prediction(replace(predicting(hill), pending=Pending(pending, lambda: predicting(after))))
+    return search.ask(1)[0]
+
+
+def test_a_pending_point_does_not_delay_what_is_best_without_it() -> None:
+    np.testing.assert_allclose(asked_while_pending([0.9, 0.9], lambda X: 1 - X[:, 0]), [0.3, 0.8], atol=0.02)
+
+
+def test_if_the_best_point_is_pending_the_next_one_is_chosen_as_if_it_were_known() -> None:
+    found = asked_while_pending([0.3, 0.8], lambda X: 2.0 - ((X - [0.7, 0.3]) ** 2).sum(axis=1))
+    np.testing.assert_allclose(found, [0.7, 0.3], atol=0.02)
+
+
+def test_a_pending_point_that_is_expected_to_be_small_is_no_miss_before_it_is_known() -> None:
+    search = TrustRegion(misses=1)
+    search.reset(2, 0)
+    search.use_prediction(predicting(hill))
+    first = search.ask(1)
+    search.tell(first, hill(first))
+    search.tell(np.array([[0.9, 0.1]]), [np.nan])
+    search.remember([search.notes[0], {**(search.notes[0] or {}), "expected": 0.1}])
+    pending = Pending(np.array([[0.9, 0.1]]), lambda: predicting(hill))
+    search.use_prediction(replace(predicting(lambda X: 2 * hill(X)), pending=pending))
+    search.ask(1)
+    assert (search.note() or {})["climb"] == 0

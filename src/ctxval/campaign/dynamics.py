@@ -13,7 +13,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
-from ctxval.campaign.history import executed_trials, for_known_values, largest_distance
+from ctxval.campaign.history import executed_trials, for_known_values, largest_distance, waiting_points
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, jumps
 from ctxval.certificates.dynamics_evidence import (
@@ -30,8 +30,10 @@ from ctxval.core.validation import Validation
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
+from ctxval.learning.error_vectors import Executed
 from ctxval.learning.worst_case import WorstCase
 from ctxval.searches import Prediction
+from ctxval.searches.base import Pending
 from ctxval.storage.store import Store
 
 PREDICTION = "prediction"
@@ -103,13 +105,50 @@ class CampaignDynamics:
         _, found, self.failure = self._learned[key]
         return found
 
-    def prediction(self, trials: Sequence[Trial]) -> Prediction | None:
-        """Return the distance predicted from the executed trajectories, for a search; None if there is none."""
+    def prediction(self, trials: Sequence[Trial], *, pending: bool = False) -> Prediction | None:
+        """Return the distance predicted from the executed trajectories, for a search; None if there is none.
+
+        Args:
+            trials: the trials.
+            pending: whether open trials count as if they had been executed as predicted.
+        """
         executed = executed_trials(self._store, trials)
         learned = self._learned_from(executed, self.elsewhere())
         pairs = [(trial.unit_point, trajectory) for trial, trajectory in executed]
         found = self._study.prediction_of(learned, pairs)
-        return None if found is None else for_known_values(found, trials, [trial for trial, _ in executed])
+        if found is None:
+            return None
+        found = for_known_values(found, trials, [trial for trial, _ in executed])
+        return self._with_pending(found, learned, pairs, trials) if pending else found
+
+    def _with_pending(
+        self, found: Prediction, learned: LearnedDynamics | None, executed: Executed, trials: Sequence[Trial]
+    ) -> Prediction:
+        """Return a prediction to which open trials are executions that have gone as predicted.
+
+        How good a prediction is, is still seen from what was executed.
+        """
+        waiting = waiting_points(trials)
+        if not len(waiting):
+            return found
+        otherwise = found.otherwise
+
+        def after() -> Prediction:
+            as_if = None if learned is None else self._as_if(learned, executed, waiting)
+            return (None if as_if is None else self._study.prediction_of(as_if, executed)) or found
+
+        def fallback() -> Prediction | None:
+            other = None if otherwise is None else otherwise()
+            return None if other is None else replace(other, pending=Pending(waiting, lambda: other))
+
+        return replace(found, otherwise=fallback, pending=Pending(waiting, after))
+
+    def _as_if(self, learned: LearnedDynamics, executed: Executed, waiting: Array) -> LearnedDynamics | None:
+        """Return what is learned as if tasks ``(k, d)`` had been executed as predicted; None if it cannot be said."""
+        try:
+            return self._study.as_if_executed(learned, executed, learned.trajectories(waiting), self.elsewhere())
+        except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
+            return None
 
     def predict(self, trials: Sequence[Trial], point: Array, *, alone: bool = False) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task from completed trials; None if nothing can be predicted.
@@ -126,19 +165,25 @@ class CampaignDynamics:
         except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
             return None
 
-    def screening(self, trials: Sequence[Trial]) -> DynamicsEvidence | None:
+    def screening(self, trials: Sequence[Trial], *, pending: bool = False) -> DynamicsEvidence | None:
         """Return quick evidence, whose bound is too low and whose diagnostics lack expensive ones.
 
         It has a few draws, and none but the posterior mean after fewer executions than a bound needs.
+
+        Args:
+            trials: the trials.
+            pending: as in :meth:`prediction`. Such evidence helps to choose a task; it decides nothing.
         """
         with stage("searching the learned dynamics", self._study.search.screening_loops, "closed loops"):
             learned = self.learned(trials)
+            few = learned is not None and len(learned.executed) < FEWEST
+            if learned is not None and pending:
+                executed = [(trial.unit_point, one) for trial, one in executed_trials(self._store, trials)]
+                learned = self._as_if(learned, executed, waiting_points(trials))
             if learned is None:
                 return None
-            few = len(learned.executed) < FEWEST
-            return self._guarded(
-                lambda: self._evidence(learned, trials, learned.worst_of_mean if few else learned.screened)
-            )
+            found = learned
+            return self._guarded(lambda: self._evidence(found, trials, found.worst_of_mean if few else found.screened))
 
     def evidence(self, trials: Sequence[Trial], confidence: float, *, keep: bool = False) -> DynamicsEvidence | None:
         """Return what the learned dynamics say about d*; None if nothing can be learned.

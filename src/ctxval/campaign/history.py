@@ -43,6 +43,11 @@ def largest_distance(trials: Sequence[Trial]) -> float:
     return max((trial.distance or 0.0 for trial in trials), default=0.0)
 
 
+def waiting_points(trials: Sequence[Trial]) -> Array:
+    """Return the points of open trials, which are being executed, ``(k, d)``."""
+    return np.array([trial.unit_point for trial in trials if trial.state == "open"])
+
+
 def for_known_values(prediction: Prediction, trials: Sequence[Trial], executed: Sequence[Trial]) -> Prediction:
     """Return a prediction learned from executed trials, with one row for each known value of a search."""
     known = [trial for trial in history_of(trials) if trial.distance is not None]

@@ -16,7 +16,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import AUDIT, NEAR
-from ctxval.campaign.history import largest_distance
+from ctxval.campaign.history import largest_distance, waiting_points
 from ctxval.campaign.steadiness import Steadiness
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
@@ -113,22 +113,29 @@ class IntervalSearch:
                 return self._audit(evidence) if self.audited else None
         if isinstance(self.options.kind, Automatic) and self.recorder.executions >= _PATIENCE:
             return self._by_distance(trials)
-        return self._narrowing(trials, evidence)
+        learned = self.recorder.dynamics.learned(trials)
+        steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
+        best, limit = largest_distance(trials), self.limit
+        ended = _points([trial for trial in trials if trial.state != "open"], self._dimension)
+        point = next_task(evidence, ended, best, limit, self.options.confidence, steady)
+        waiting = waiting_points(trials)
+        if len(waiting) and (point is None or np.abs(waiting - point).max(axis=1).min() <= NEAR):
+            # It is being executed already. Another worker prepares for the results that are expected.
+            if learned is not None:
+                expected = learned.expected(waiting)
+                best = max(best, float(expected[np.isfinite(expected)].max(initial=0.0)))
+                limit = (1 + self.within) * best if self.threshold is None else limit
+            after = self.recorder.dynamics.screening(trials, pending=True) or evidence
+            known = _points(trials, self._dimension)
+            point = next_task(after, known, best, limit, self.options.confidence, steady)
+        # The results decide when the campaign ends, so the number of independent draws is not planned.
+        return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     def by_dynamics(self) -> Array | None:
         """Return the next task, a point ``(d,)``; None if it is decided or learned dynamics do not choose the task."""
         evidence = self._evidence(self.recorder.trials)
         choice = None if evidence is None or self._fails(evidence) else self.choose()
         return None if choice is None else choice.unit_point
-
-    def _narrowing(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> Choice:
-        known = _points(trials, self._dimension)
-        learned = self.recorder.dynamics.learned(trials)
-        steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
-        best, limit = largest_distance(trials), self.limit
-        point = next_task(evidence, known, best, limit, self.options.confidence, steady)
-        # The results decide when the campaign ends, so the number of independent draws is not planned.
-        return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     @property
     def _dimension(self) -> int:

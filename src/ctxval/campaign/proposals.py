@@ -16,6 +16,7 @@ from ctxval._util.texts import enumerated, shortened
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.costs import costs_of
 from ctxval.campaign.dynamics import AUDIT, PREDICTION, CampaignDynamics
+from ctxval.campaign.history import waiting_points
 from ctxval.campaign.steadiness import Steadiness
 from ctxval.core.trial import CONVERGED, UNSTEADY, Trial
 from ctxval.core.validation import Validation
@@ -24,6 +25,10 @@ from ctxval.searches import BaseSearch, SequentialSearch
 
 _MOVED = 0x6D6F
 """Identifies the random stream of moves away from tasks that are not steady."""
+
+
+_SPREAD = 512
+"""Number of random tasks of which the one farthest from all that are being executed is taken."""
 
 
 class Proposals:
@@ -44,7 +49,7 @@ class Proposals:
         if not self._search.uses_prediction:
             return self._executable(self._asked(), trials, steady, rejected)
         with stage("choosing a task", unit="designs"):
-            prediction = self._dynamics.prediction(trials)
+            prediction = self._dynamics.prediction(trials, pending=True)
             if prediction is not None:
                 expected = prediction.expected
                 steady = Steadiness(self._dynamics.planner, lambda points: expected(points)[0])
@@ -52,6 +57,24 @@ class Proposals:
                 prediction = replace(prediction, costs=costs, steady=steady)
             self._search.use_prediction(prediction)
             return self._executable(self._asked(), trials, steady, rejected)
+
+    def spread(self, trials: Sequence[Trial]) -> Array | None:
+        """Return a task far from all that are being executed, a point ``(d,)``, if nothing at all is known yet.
+
+        Guesses of a search that knows nothing are random; far apart, and mostly with parameters at their bounds, they
+        teach more. The first task is that of the search, also if others follow at once.
+        """
+        known = any(trial.distance is not None for trial in trials)
+        waiting = waiting_points(trials)
+        if known or not len(waiting) or not self._search.uses_prediction:
+            return None
+        if self._dynamics.prediction(trials) is not None:
+            return None
+        rng = np.random.default_rng([len(trials), _MOVED])
+        some = rng.random((_SPREAD, waiting.shape[1]))
+        some = np.where(rng.random(some.shape) < rng.random((_SPREAD, 1)), np.round(some), some)
+        gaps = np.linalg.norm(some[:, None] - waiting, axis=2).min(axis=1)
+        return np.asarray(some[gaps.argmax()])
 
     def tested(self, choice: Choice, trials: Sequence[Trial]) -> tuple[Array, dict[str, Any] | None]:
         """Return the point ``(d,)`` of a choice that another part has made, rounded and tested, and its note."""

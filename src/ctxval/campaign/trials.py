@@ -224,6 +224,8 @@ class TrialRecorder:
         if choice.unit_point is None and self.search.iid and self.validation.space.distribution is not None:
             # The points of such a search are uniform, and the tasks are not.
             choice = replace(choice, unit_point=self.draw(), origin="iid")
+        if choice.unit_point is None and (spread := self._proposals.spread(self._trials)) is not None:
+            choice = replace(choice, unit_point=spread, origin="initial")
         if choice.unit_point is None:
             first = len(self._trials) < self.search.initial
             origin: Origin = "iid" if self.search.iid else "initial" if first else "acquisition"

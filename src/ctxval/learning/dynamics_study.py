@@ -144,6 +144,24 @@ class DynamicsStudy:
         points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)
         return LearnedDynamics(self, posterior, points)
 
+    def as_if_executed(
+        self, learned: LearnedDynamics, executed: Executed, pending: Executed, logged: Sequence[Trajectory] = ()
+    ) -> LearnedDynamics | None:
+        """Return what executions teach with those that are pending, as if these had gone as predicted.
+
+        The hyperparameters and the predicted distances stay, and the doubt is less near the pending executions.
+
+        Args:
+            learned: what the executions teach.
+            executed, logged: as in :meth:`learn`.
+            pending: :meth:`LearnedDynamics.trajectories` of the tasks that are being executed.
+        """
+        recorded = self._recorded([*executed, *pending], logged)
+        posterior = None if recorded is None else condition(learned.posterior.covariances, *recorded)
+        if posterior is None or not np.isfinite(posterior.most_probable.weights).all():
+            return None
+        return LearnedDynamics(self, posterior, np.array([point for point, _ in (*executed, *pending)]))
+
     def _learned_covariances(
         self, executed: Executed, logged: Sequence[Trajectory], recorded: tuple[Transitions, Rows] | None
     ) -> LearnedCovariances | None:
@@ -223,6 +241,18 @@ class LearnedDynamics:
         planner = self.study.planner
         with single_threaded():
             return np.asarray(planner.distances(self.posterior.mean, planner.plan(points), len(points))[0])
+
+    def trajectories(self, points: Array) -> list[tuple[Array, Trajectory]]:
+        """Return tasks ``(m, d)`` with their closed loops on the posterior mean, without those that diverge."""
+        planner, found = self.study.planner, list[tuple[Array, Trajectory]]()
+        with single_threaded():
+            for point in points:
+                for one in planner.plan(point[None]):
+                    (loops,) = planner.run(self.posterior.mean, [one])
+                    executed = Trajectory(one.promised.times, loops.states[0, 0], loops.inputs[0, 0])
+                    if executed.finite:
+                        found.append((point, executed))
+        return found
 
     @property
     def worst_case(self) -> WorstCase:

@@ -44,6 +44,19 @@ class Costs:
 
 
 @dataclass(frozen=True, eq=False)
+class Pending:
+    """Points that are being evaluated.
+
+    Attributes:
+        points: points of the unit cube ``(k, d)``.
+        prediction: returns the prediction as if they had the expected values: the doubt near them is less.
+    """
+
+    points: Array
+    prediction: Callable[[], Prediction]
+
+
+@dataclass(frozen=True, eq=False)
 class Prediction:
     """A prediction of values at points of the unit cube that have not been evaluated.
 
@@ -60,6 +73,7 @@ class Prediction:
         costs: measures the costs, which takes some predictions; None if they cannot be measured.
         rough: an approximation of ``expected`` that is cheaper to evaluate; None if there is none.
         steady: whether a point ``(d,)`` has the value of its neighbours, and may be evaluated; None if all may.
+        pending: the points that are being evaluated; None if there are none.
     """
 
     expected: Callable[[Array], tuple[Array, Array]]
@@ -69,6 +83,7 @@ class Prediction:
     costs: Callable[[], Costs] | None = None
     rough: Callable[[Array], tuple[Array, Array]] | None = None
     steady: Callable[[Array], bool] | None = None
+    pending: Pending | None = None
 
     def with_rows(self, left_out_of: Callable[[Prediction], Callable[[Rows], Array]]) -> Prediction:
         """Return the prediction with other rows, also in those that it may turn to.

@@ -110,6 +110,21 @@ class _Region:
         return np.clip(centre - self.radius, 0, 1), np.clip(centre + self.radius, 0, 1)
 
 
+@dataclass(frozen=True, eq=False)
+class _History:
+    """What a choice follows from.
+
+    Attributes:
+        points, values, notes: the points ``(n, d)``, their values ``(n,)``, NaN if not known, and the notes on them.
+        others: pending and failed points ``(k, d)``, from which the choice keeps a distance.
+    """
+
+    points: Array
+    values: Array
+    notes: tuple[Note | None, ...]
+    others: Array
+
+
 @part("trust-region", aliases=("climbs",))
 class TrustRegion(SequentialSearch):
     """Trust-region search with restarts on a prediction of the values; Bayesian optimisation if no prediction is good.
@@ -216,35 +231,61 @@ class TrustRegion(SequentialSearch):
     # Where to execute next
 
     def _promising(self, prediction: Prediction, rng: np.random.Generator) -> Array | None:
-        """Return the next point of the last region or of a new one; None if no point can be predicted."""
+        """Return the next point of the last region or of a new one; None if no point can be predicted.
+
+        The point that follows from the known values alone comes first. If it is being evaluated already, the next one
+        is chosen as if all pending points had the expected values.
+        """
+        points, values, notes = self.points, self.values, self.notes
+        whole = _History(points, values, notes, points[~np.isfinite(values)])
+        pending = prediction.pending
+        if pending is None:
+            return self._noted(*self._next(prediction, whole, rng))
+        waiting = np.isnan(values) & (points[:, None] == pending.points).all(axis=2).any(axis=1)
+        ended = [note for note, waits in zip(notes, waiting, strict=True) if not waits]
+        known = _History(points[~waiting], values[~waiting], tuple(ended), points[np.isnan(values) & ~waiting])
+        found, region = self._next(prediction, known, rng)
+        if found is None or self._is_new(found.point[None], whole)[0]:
+            return self._noted(found, region)
+        expected = values.copy()
+        expected[waiting] = prediction.expected(points[waiting])[0]
+        as_if = pending.prediction()
+        after = replace(prediction, expected=as_if.expected, rough=as_if.rough)
+        return self._noted(*self._next(after, replace(whole, values=expected), rng))
+
+    def _next(
+        self, prediction: Prediction, history: _History, rng: np.random.Generator
+    ) -> tuple[Candidate | None, _Region]:
+        """Return the next candidate after a history, None if no point can be predicted, and its region."""
         settings, value = self._settings, OptimisticValue(prediction, self.optimism)
         if not settings.restrict:
-            return self._noted(self._best(value, _Region(), rng), _Region())
-        region = self._state()
+            return self._best(value, _Region(), history, rng), _Region()
+        region = self._state(history)
         if region.misses < self.misses and region.radius >= settings.least_radius:
-            found = self._best(value, region, rng)
-            if found is not None and self._is_worth(found, region.best):
-                return self._noted(found, region)
+            found = self._best(value, region, history, rng)
+            if found is not None and self._is_worth(found, region.best, float(np.nanmax(history.values, initial=0.0))):
+                return found, region
         # The optimism grows with every region that finds nothing larger, so the search explores more.
         bold = replace(value, optimism=self.optimism * settings.boldness ** (1 + region.stale))
         new = _Region(region.number + 1, settings.first_radius)
-        return self._noted(self._best(bold, _Region(), rng), new)
+        return self._best(bold, _Region(), history, rng), new
 
-    def _is_worth(self, found: Candidate, best: float) -> bool:
-        """Return whether a value may exceed a region's best value and, with more optimism, all values."""
-        largest = float(np.nanmax(self.values, initial=0.0))
+    def _is_worth(self, found: Candidate, best: float, largest: float) -> bool:
+        """Return whether a value may exceed a region's best value and, with more optimism, the largest of all."""
         return self._exceeds(found, 1.0, best) and self._exceeds(found, self._settings.patience, largest)
 
     def _exceeds(self, found: Candidate, patience: float, other: float) -> bool:
         """Return whether the value with so many times the usual optimism exceeds another by the least improvement."""
         return found.optimistic(patience * self.optimism) > other * (1 + self._settings.improvement)
 
-    def _best(self, value: OptimisticValue, region: _Region, rng: np.random.Generator) -> Candidate | None:
+    def _best(
+        self, value: OptimisticValue, region: _Region, history: _History, rng: np.random.Generator
+    ) -> Candidate | None:
         """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
         budget = min(value.prediction.budget, self._settings.points * self.dimension)
         ascent = Ascent(value, *region.box(self.dimension), budget, value.rough)
-        points, promised = ascent.run(best_first(self.points, self.values)[:_STARTS], rng)
-        points = points[self._is_new(points) & np.isfinite(promised)]
+        points, promised = ascent.run(best_first(history.points, history.values)[:_STARTS], rng)
+        points = points[self._is_new(points, history) & np.isfinite(promised)]
         steady = value.prediction.steady or (lambda point: True)
         best = next(filter(steady, points), points[0]) if len(points) else None
         return None if best is None else value.at(best)
@@ -262,17 +303,17 @@ class TrustRegion(SequentialSearch):
         }
         return found.point
 
-    def _is_new(self, points: Array) -> Mask:
+    def _is_new(self, points: Array, history: _History) -> Mask:
         """Return which of some points ``(m, d)`` are far enough from all known, pending and failed ones."""
-        known, reach = np.isfinite(self.values), self._settings.apart * np.sqrt(self.dimension)
-        gaps = cdist(points, self.points[known], "chebyshev").min(axis=1, initial=np.inf)
-        others = cdist(points, self.points[~known]).min(axis=1, initial=np.inf)
+        known, reach = np.isfinite(history.values), self._settings.apart * np.sqrt(self.dimension)
+        gaps = cdist(points, history.points[known], "chebyshev").min(axis=1, initial=np.inf)
+        others = cdist(points, history.others).min(axis=1, initial=np.inf)
         return np.asarray((gaps > self._settings.distinct) & (others > reach))
 
-    def _state(self) -> _Region:
-        """Return the state of the last region."""
+    def _state(self, history: _History) -> _Region:
+        """Return the state of the last region after a history."""
         region, largest = _Region(), -np.inf
-        for point, value, note in zip(self.points, self.values.tolist(), self.notes, strict=True):
+        for point, value, note in zip(history.points, history.values.tolist(), history.notes, strict=True):
             if note is not None and note.get("engine") == _ENGINE:
                 if note["climb"] > region.number:
                     region = _Region(note["climb"], note["radius"], stale=region.stale + 1)
