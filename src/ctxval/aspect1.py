@@ -162,10 +162,6 @@ def check(
         tasks: number of simulated tasks.
         search: chooses the tasks; Bayesian optimisation by default.
         seed: seed of the search.
-
-    Raises:
-        InputError: if the tasks have neither a goal nor a reference and no distance is given.
-        DistanceError: if the distance fails.
     """
     measured = completion(validation) if distance is None else distance
     on_model = validation.on_model(measured, units=None if distance is None else "")
@@ -185,9 +181,6 @@ def completion(validation: Validation) -> Distance:
     :class:`ctxval.distances.GoalError`, and for tasks with a changing reference
     :class:`ctxval.distances.TrackingError`. If the distance compares all states, those are left out that the
     synthesizer does not bring to a goal.
-
-    Raises:
-        InputError: if the tasks have neither a goal nor a reference.
     """
     space, own = validation.space, validation.distance
     task = validation.task(space.parameters(0.5 * (space.low + space.high)))

@@ -23,9 +23,6 @@ class JsonLines(Mapping[Key, Record]):
     Args:
         path: of the file; it is made, with its folder, by the first record.
         key: the fields of a record that identify it. Their values are numbers, texts, booleans or null.
-
-    Raises:
-        InputError: when the file is read, if a line is no JSON object or lacks a field of the key.
     """
 
     def __init__(self, path: Path, key: Sequence[str]) -> None:

@@ -27,9 +27,6 @@ class FileLock:
 
     Args:
         path: the file; it is created if it does not exist.
-
-    Raises:
-        OSError: if the file cannot be opened.
     """
 
     def __init__(self, path: str | Path) -> None:

@@ -58,9 +58,6 @@ class Archive:
 
     Attributes:
         names: the names of the arrays.
-
-    Raises:
-        InputError: if the bytes are not an archive of arrays.
     """
 
     def __init__(self, content: bytes, most: int = MOST_BYTES) -> None:

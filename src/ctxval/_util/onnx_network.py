@@ -35,9 +35,6 @@ class OnnxNetwork:
         widths: the number of values in a row of each input; None if the file leaves it open.
         width: the number of values in a row of the output; None if the file leaves it open.
         precision: the relative rounding of the network's numbers: 1e-7 in single, 2e-16 in double precision.
-
-    Raises:
-        InputError: if onnxruntime is not installed, or the file is not a network of real numbers in rows.
     """
 
     def __init__(self, source: str | Path | bytes) -> None:

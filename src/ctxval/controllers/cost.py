@@ -17,10 +17,6 @@ class QuadraticCost:
         Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
         R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``; positive definite.
         Q_final: weight of the last state, in the same form as Q; Q by default.
-
-    Raises:
-        InputError: if a weight is not symmetric positive semidefinite, or R is not positive definite.
-        ShapeError: if a weight is not a square matrix or a diagonal, or Q_final does not have the shape of Q.
     """
 
     def __init__(self, Q: ArrayLike, R: ArrayLike, Q_final: ArrayLike | None = None) -> None:

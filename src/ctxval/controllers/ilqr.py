@@ -74,10 +74,6 @@ class ILQR:
         tolerance: the iteration stops if the next step would lower the cost by less than this fraction of it.
         limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
             rows ``[low, high]``, one for each input.
-
-    Raises:
-        InputError: if a weight is not positive semidefinite, R is not positive definite, or the limits are ambiguous
-            or not low < high.
     """
 
     batched = True

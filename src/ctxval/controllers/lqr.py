@@ -32,10 +32,6 @@ class LQR:
         Q_final: weight of the last state; Q by default.
         limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
             rows ``[low, high]``, one for each input.
-
-    Raises:
-        InputError: if a weight is not positive semidefinite, R is not positive definite, or the limits are ambiguous
-            or not low < high.
     """
 
     batched = True
@@ -84,10 +80,6 @@ class StationaryLQR:
         R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
         limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
             rows ``[low, high]``, one for each input.
-
-    Raises:
-        InputError: if a weight is not positive semidefinite, R is not positive definite, or the limits are ambiguous
-            or not low < high.
     """
 
     batched = True

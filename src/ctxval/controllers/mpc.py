@@ -47,9 +47,6 @@ class MPC:
         state_limits: limits of the states, in the same forms; infinite for states without limits.
         violation_cost: cost of exceeding the state limits by 1, for each predicted step; None makes them hard.
         iterations: largest number of quadratic programs for one input.
-
-    Raises:
-        InputError: if CasADi is not installed, or a weight, limit or number cannot be used.
     """
 
     batched = False
@@ -75,11 +72,7 @@ class MPC:
         _casadi()
 
     def design(self, task: Task, model: Model) -> RecedingHorizon:
-        """Return the controller, which solves an optimal control problem at every step.
-
-        Raises:
-            ShapeError: if the task is a batch, or its number of states differs from that of the weights.
-        """
+        """Return the controller, which solves an optimal control problem at every step."""
         self.cost.require_task(task)
         if task.batch_shape:
             raise ShapeError(f"MPC designs for one task at a time, got a batch of shape {task.batch_shape}.")

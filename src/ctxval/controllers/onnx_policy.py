@@ -36,10 +36,6 @@ class OnnxPolicy:
             a motor of 5 N m.
         limits: limits to which the inputs are clipped: one number h for -h to h, ``Limits(low=, high=)``, a mapping of
             low and high, or rows ``[low, high]``, one for each input.
-
-    Raises:
-        InputError: if onnxruntime is not installed, the file is not a network with one input, or the limits cannot be
-            used.
     """
 
     batched = True
@@ -82,11 +78,7 @@ class BoundOnnxPolicy:
     task: Task
 
     def __call__(self, t: int, x: Array) -> Array:
-        """Return the inputs ``(..., m)`` at step t.
-
-        Raises:
-            ShapeError: if the number of observations differs from the network's.
-        """
+        """Return the inputs ``(..., m)`` at step t."""
         observe, limits = self.settings.observe, self.settings.limits
         observations: Any = x if observe is None else observe(t, x, self.task)
         u = self.settings.network(np.asarray(observations, dtype=np.float64)) * self.settings.scale

@@ -69,10 +69,6 @@ class Limits:
     Attributes:
         low, high: the lower and upper limits: a number for all inputs, or one for each input, shape ``(m,)``; infinite
             if there is no limit.
-
-    Raises:
-        InputError: if a limit is NaN, or a lower limit is not below its upper limit.
-        ShapeError: if the limits are neither numbers nor lists of the same length.
     """
 
     low: Array
@@ -103,10 +99,6 @@ class Limits:
             limits: one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and
                 high, numbers or ``(m,)``; or rows ``[low, high]``, one for each input, shape ``(m, 2)``.
             inputs: the number of inputs m, to which single numbers are expanded; None leaves them as they are.
-
-        Raises:
-            InputError: if the limits are ambiguous or NaN, or a lower limit is not below its upper limit.
-            ShapeError: if the number of limits is not the number of inputs.
         """
         found = limits if isinstance(limits, Limits) else _read_limits(limits)
         if inputs is None:
@@ -211,11 +203,7 @@ class AffineFeedback:
     converged: Mask | None = None
 
     def __call__(self, t: int, x: Array) -> Array:
-        """Return the input at step t, shape ``(..., m)``.
-
-        Raises:
-            InputError: if the task has no such step.
-        """
+        """Return the input at step t, shape ``(..., m)``."""
         steps = self.inputs.shape[-2]
         if not 0 <= t < steps:
             raise InputError(f"the controller has inputs for the steps 0 to {steps - 1}, got step {t}.")
@@ -242,9 +230,6 @@ class Policy:
         vectorized: False if the policy takes only one state ``(n,)`` at a time.
         limits: limits to which the inputs are clipped: one number h for -h to h, ``Limits(low=, high=)``, a mapping of
             low and high, or rows ``[low, high]``, one for each input.
-
-    Raises:
-        InputError: if the limits are ambiguous, or a lower limit is not below its upper limit.
     """
 
     def __init__(

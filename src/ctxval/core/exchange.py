@@ -64,10 +64,6 @@ def write_controller(
         controller: affine feedback, as LQR and iLQR design it.
         dt: length of a step, seconds.
         states, inputs: names and units of the components; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
-
-    Raises:
-        InputError: if the controller is not affine feedback or not finite, or the file cannot be written.
-        ShapeError: if the controller is for a batch of tasks, or the number of names differs from that of components.
     """
     if not isinstance(controller, AffineFeedback):
         raise InputError(
@@ -99,11 +95,7 @@ def write_controller(
 
 
 def read_controller(path: str | Path) -> ControllerFile:
-    """Read a controller from a ``.json`` or ``.npz`` file.
-
-    Raises:
-        InputError: if the file is not a controller file or is damaged; the message says what is wrong.
-    """
+    """Read a controller from a ``.json`` or ``.npz`` file."""
     return _read(Path(path), CONTROLLER_FORMAT, _controller)
 
 

@@ -19,9 +19,6 @@ class Labels:
     Attributes:
         states, inputs: one label ``name [unit]`` for each state and each input; empty if they have no names.
         units: the units of the distance.
-
-    Raises:
-        InputError: if a recording with columns of these names cannot be read.
     """
 
     states: tuple[str, ...] = ()

@@ -33,11 +33,7 @@ class Plan:
     model_trajectory: Trajectory
 
     def of(self, index: int, parameters: Parameters) -> Plan:
-        """Return the plan of one task of a batch, whose parameters are given.
-
-        Raises:
-            TypeError: if the controller of the batch has no ``__getitem__``.
-        """
+        """Return the plan of one task of a batch, whose parameters are given."""
         controller: Any = self.controller
         return Plan(parameters, self.task[index], controller[index], self.model_trajectory[index])
 

@@ -23,9 +23,6 @@ def rollout(step: Step, controller: Controller, task: Task) -> Trajectory:
         step: ``x_next = step(x, u)``.
         controller: ``u = controller(t, x)``.
         task: one task, or a batch.
-
-    Raises:
-        ShapeError: if the step or the controller returns the wrong shape.
     """
     with np.errstate(all="ignore"):
         x = np.array(task.initial_state)

@@ -18,9 +18,6 @@ class Simulated:
     Args:
         step: function ``(x, u) -> x_next``, or an object with such a method ``step`` that takes batches.
         vectorized: whether a plain function takes whole batches ``(..., n)`` and ``(..., m)``.
-
-    Raises:
-        InputError: if ``step`` is neither a function nor a model.
     """
 
     batched = True

@@ -49,9 +49,6 @@ class Normal:
     Args:
         mean: the mean, before the truncation, in the parameter's units; one number, or one for each component.
         deviation: the standard deviation, before the truncation, in the same form.
-
-    Raises:
-        InputError: if they are not finite, or if a standard deviation is not positive.
     """
 
     mean: ArrayLike
@@ -112,10 +109,6 @@ class ByParameter:
         low, high: the bounds of the task space, shape ``(d,)``.
         columns: the columns of each parameter that has a distribution.
         distributions: the distribution of each of these parameters.
-
-    Raises:
-        InputError: if a distribution is none of a continuous variable, does not fit the shape of its parameter, or has
-            no probability within its bounds.
     """
 
     low: Array

@@ -29,9 +29,6 @@ class Transitions:
         u: the inputs, shape ``(N, m)``.
         x_next: the next states, shape ``(N, n)``.
         dt: length of a step in seconds, if it is known.
-
-    Raises:
-        ShapeError: if the shapes of the three arrays do not match.
     """
 
     x: Array
@@ -54,12 +51,7 @@ class Transitions:
 
     @staticmethod
     def joined(parts: Sequence[Transitions]) -> Transitions:
-        """Return several sets of transitions as one set.
-
-        Raises:
-            ShapeError: if they have different numbers of states or inputs.
-            InputError: if their steps have different lengths.
-        """
+        """Return several sets of transitions as one set."""
         sizes = sorted({(part.x.shape[1], part.u.shape[1]) for part in parts})
         if len(sizes) > 1:
             said = " and ".join(f"{n} states and {m} inputs" for n, m in sizes)
@@ -87,9 +79,6 @@ class Trajectory:
         states: the states, shape ``(..., H + 1, n)``.
         inputs: the inputs, shape ``(..., H, m)``.
         ended: ``"complete"``, or the reason why the trajectory ended before its horizon.
-
-    Raises:
-        ShapeError: if the shapes of the three arrays do not match.
     """
 
     times: Array
@@ -158,10 +147,6 @@ class Trajectory:
             source: the bytes, or the path of a regular file.
             shape: shape ``(H + 1, n)`` that the states of a complete trajectory must have; None allows any shape.
             most: largest size in bytes of the file, and of the numbers in it.
-
-        Raises:
-            InputError: if the source is not an NPZ file with a trajectory, or is too large.
-            ShapeError: if the shapes of the arrays do not match each other or ``shape``.
         """
         name = "these bytes" if isinstance(source, bytes) else str(source)
         try:
@@ -189,9 +174,6 @@ class Trajectory:
             path: the file.
             states, inputs: names of the columns of states and inputs; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
                 The column of the times is ``t``.
-
-        Raises:
-            ShapeError: if the trajectory is a batch, or the number of names differs from that of columns.
         """
         if self.batch_shape:
             raise ShapeError(f"a CSV file must hold one trajectory, got a batch of shape {self.batch_shape}.")
@@ -217,11 +199,6 @@ class Trajectory:
                 numbered columns ``x0, x1, ...`` and ``u0, u1, ...`` are read.
             most_rows: largest number of rows below the header; a file with more rows is refused. None allows any
                 number up to the largest size of a file.
-
-        Raises:
-            InputError: if the file cannot be read, is not a regular file or is too large, if a row has more or fewer
-                cells than the header, if a column is missing, is there twice or has a unit that cannot be converted, or
-                if a cell is not a number.
         """
         return Trajectory(*read_columns(path, states, inputs, most_rows))
 
@@ -232,10 +209,6 @@ class Trajectory:
 
         Args:
             times: seconds after the first time of the recording, from 0, shape ``(H + 1,)``.
-
-        Raises:
-            InputError: if the trajectory is a batch, its times do not increase, its steps are much longer than the new
-                ones, or it ends before the last new time.
         """
         own, wanted = self.times - self.times[0], as_floats("times", times)
         if self.batch_shape or not (np.diff(own) > 0).all():

@@ -61,9 +61,6 @@ def grid_truth(validation: Validation, per_axis: AxisPoints = 2001, refinements:
         validation: the map p -> d(p).
         per_axis: number of grid points on each axis.
         refinements: number of refinements, each with a finer grid around the best points.
-
-    Raises:
-        InputError: if every execution failed.
     """
     count = per_axis**validation.space.dimension + 8 * refinements * _FINER**validation.space.dimension
     with stage("searching the largest distance", count, "executions"):
@@ -122,9 +119,6 @@ def search_truth(
         population: number of points in a generation, for each dimension.
         generations: largest number of generations in one repeat.
         climbs: number of climbs from random starts in one repeat; each starts at the best of sixteen random points.
-
-    Raises:
-        InputError: if every execution failed.
     """
     search = _TruthSearch(validation, population, generations, climbs)
     found: list[tuple[float, Array]] = []

@@ -145,7 +145,6 @@ class Validation:
         """Design the controller for the task at ``(d,)`` and run it on the model; S is not executed.
 
         Raises:
-            InputError: if the task function does not return one task for the point.
             DesignError: if the synthesizer failed.
             ModelError: if the model failed, or its closed loop is not finite.
         """
@@ -185,7 +184,7 @@ class Validation:
 
         Raises:
             ExecutionError: if it is not a complete and finite execution.
-            InputError: if it belongs to another task, that is, if its dimensions, its times or its first state differ.
+            InputError: if it belongs to another task.
         """
         if not isinstance(trajectory, Trajectory):
             raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
@@ -208,7 +207,6 @@ class Validation:
 
         Raises:
             ExecutionError: if it is not a complete and finite execution.
-            InputError: if it belongs to another task.
         """
         executed = self.require(plan, trajectory, start_tolerance)
         try:

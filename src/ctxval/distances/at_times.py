@@ -26,9 +26,6 @@ class AtTimes(ErrorNorm):
         components: the states that are compared, by index or name; all states by default.
         times: seconds after the start of the task; each is rounded to the nearest step.
         weights, scales, angles: as in :class:`StateNorm`.
-
-    Raises:
-        InputError: if an argument cannot be used.
     """
 
     norm: Norm = 2
@@ -39,11 +36,7 @@ class AtTimes(ErrorNorm):
         require_numbers("times", self.times, None, zero=True)
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the weighted differences at the times, one after the other, shape ``(..., times k)``.
-
-        Raises:
-            InputError: if a time is after the end of the task.
-        """
+        """Return the weighted differences at the times, one after the other, shape ``(..., times k)``."""
         steps = self._steps(task)
         gap = self.difference(system_trajectory.states[..., steps, :], model_trajectory.states[..., steps, :])
         return np.asarray(gap.reshape(*gap.shape[:-2], -1))

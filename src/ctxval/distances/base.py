@@ -28,9 +28,6 @@ class NamedStates:
 
         Args:
             names: the names of all states; if empty, nothing is replaced.
-
-        Raises:
-            UnknownNameError: if no state has a name.
         """
 
         def index(value: Any) -> Any:
@@ -65,11 +62,6 @@ class StateNorm(NamedStates):
         scales: the unit of comparison of each compared state, a positive number; 1 by default.
         angles: the states that are angles in radians, by index or name: the difference is taken on the circle, so it
             is at most pi.
-
-    Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity, no state is compared, or a weight or a scale
-            cannot be used.
-        ShapeError: if the number of weights or scales is not that of the compared states.
     """
 
     norm: Norm = 1
@@ -97,9 +89,6 @@ class StateNorm(NamedStates):
 
         Args:
             states, others: states, shape ``(..., n)``; each axis before the last must match or be 1.
-
-        Raises:
-            ShapeError: if there is no state of an index, or the number of weights or scales is another one.
         """
         gap = selected(self.unwrapped(states - others), self.components)
         counts = [len(given) for given in (self.weights, self.scales) if given is not None]

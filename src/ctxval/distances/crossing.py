@@ -34,9 +34,6 @@ class AtCrossing(ErrorNorm):
         direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
         crossings: number of crossings that are compared; only the first one by default.
         weights, scales, angles: as in :class:`StateNorm`. An angle crosses the level wherever it does on the circle.
-
-    Raises:
-        InputError: if an argument cannot be used.
     """
 
     norm: Norm = 2
@@ -80,9 +77,6 @@ class CrossingTime(NamedStates):
         level: the level, in the unit of this state.
         direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
         angle: whether the state is an angle in radians, which crosses the level wherever it crosses it on the circle.
-
-    Raises:
-        InputError: if an argument cannot be used.
     """
 
     state: int | str = 0

@@ -20,9 +20,6 @@ class FinalState(ErrorNorm):
         norm: order of the norm: 1, 2 or infinity.
         components: the states that are compared, by index or name; all states by default.
         weights, scales, angles: as in :class:`StateNorm`.
-
-    Raises:
-        InputError: if an argument cannot be used.
     """
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:

@@ -23,9 +23,6 @@ class GoalError(ErrorNorm):
         norm: order of the norm: 1, 2 or infinity.
         components: the states that are compared, by index or name; all states by default.
         weights, scales, angles: as in :class:`StateNorm`.
-
-    Raises:
-        InputError: if an argument cannot be used.
     """
 
     to_task: ClassVar[bool] = True

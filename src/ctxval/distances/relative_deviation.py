@@ -29,10 +29,6 @@ class RelativeDeviation(StateNorm):
         least: smallest range that a gap is divided by, for each compared state in its unit. A smaller range of M counts
             as this one, because a state at rest would otherwise have an unbounded relative error.
         weights, scales, angles: as in :class:`StateNorm`.
-
-    Raises:
-        InputError: if an argument cannot be used.
-        ShapeError: if the number of smallest ranges is not that of the compared states.
     """
 
     norm: Norm = np.inf

@@ -29,9 +29,6 @@ class TrackingError(StateNorm):
         components: the states that are compared, by index or name; all states by default.
         over: ``maximum`` or ``mean``: how the norms at the times are combined.
         weights, scales, angles: as in :class:`StateNorm`.
-
-    Raises:
-        InputError: if an argument cannot be used.
     """
 
     to_task: ClassVar[bool] = True

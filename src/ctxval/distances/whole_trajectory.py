@@ -27,9 +27,6 @@ class WholeTrajectory(StateNorm):
         components: the states that are compared, by index or name; all states by default.
         weights, scales, angles: as in :class:`StateNorm`.
         per_step: whether the norm is divided by the horizon H.
-
-    Raises:
-        InputError: if an argument cannot be used.
     """
 
     norm: Norm = np.inf

@@ -34,10 +34,6 @@ class Correction:
         low, high: the box of the recorded pairs, standardised, shapes ``(n + m,)``.
         fade: standardised distances from the box over which the correction fades, shape ``(n + m,)``.
         limit: largest magnitude of the correction of each state, shape ``(n,)``.
-
-    Raises:
-        ShapeError: if the shapes do not fit together.
-        InputError: if a value is not finite, or a scale is not positive.
     """
 
     shift: Array

@@ -62,10 +62,6 @@ class GaussianProcessModel:
         weights: ``(K + noise I)^-1 Y``, shape ``(M, n)``.
         scaling: of the state-input pair and of the increment.
         data: the transitions that it was learned from, if any.
-
-    Raises:
-        ShapeError: the shapes do not fit together.
-        InputError: a value is not finite.
     """
 
     def __init__(
@@ -103,9 +99,6 @@ class GaussianProcessModel:
             points: how many of them, drawn at random, it is conditioned on; the effort grows with their cube.
             seed: of the draw.
             iterations: of the search for the hyperparameters, at most.
-
-        Raises:
-            InputError: if the data are not finite.
         """
         scaling = IncrementScaling.of(data)
         rows = np.random.default_rng(seed).permutation(len(data))[:points]
@@ -124,11 +117,7 @@ class GaussianProcessModel:
         scaling: IncrementScaling,
         data: Transitions | None = None,
     ) -> GaussianProcessModel:
-        """Return the model with these hyperparameters, given standardised pairs ``(M, n + m)``, increments ``(M, n)``.
-
-        Raises:
-            InputError: the covariance matrix is not positive definite.
-        """
+        """Return the model of standardised pairs ``(M, n + m)`` and increments ``(M, n)`` with these hyperparameters."""
         return cls(covariance, Z, factorise(covariance(Z, Z), noise).solve(Y), scaling, data)
 
     def step(self, x: Array, u: Array) -> Array:

@@ -23,10 +23,6 @@ class Linear:
         B: matrix of the inputs, shape ``(n, m)``.
         c: constant term, shape ``(n,)``; zero by default.
         data: the transitions that the model was learned from, if any.
-
-    Raises:
-        ShapeError: if the shapes of A, B and c do not match.
-        InputError: if a value is not finite.
     """
 
     def __init__(self, A: ArrayLike, B: ArrayLike, c: ArrayLike | None = None, data: Transitions | None = None) -> None:
@@ -53,10 +49,6 @@ class Linear:
         Args:
             data: the recorded transitions.
             intercept: whether c is fitted; otherwise it is zero.
-
-        Raises:
-            InputError: if the data are not finite, or determine the model not at all or with too large a condition
-                number.
         """
         n, m = data.x.shape[1], data.u.shape[1]
         if not all(np.isfinite(array).all() for array in (data.x, data.u, data.x_next)):
@@ -74,11 +66,7 @@ class Linear:
         return cls(weights[:n].T, weights[n : n + m].T, weights[n + m] if intercept else None, data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
-
-        Raises:
-            ShapeError: if the shapes do not fit.
-        """
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         try:
             return np.asarray(x @ self.A.T + u @ self.B.T + self.c)
         except ValueError as error:

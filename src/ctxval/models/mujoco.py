@@ -35,10 +35,6 @@ class MuJoCo:
             one identified model. Its pickle files are never read.
         dt: length of a step in seconds, a multiple of the model's timestep; the timestep by default.
         data: the transitions that the model was identified from, if they are known.
-
-    Raises:
-        InputError: if MuJoCo is not installed, the model cannot be read or compiled or has activations, or dt is not a
-            multiple of its timestep.
     """
 
     def __init__(self, mjcf: str | Path, *, dt: Seconds | None = None, data: Transitions | None = None) -> None:
@@ -57,11 +53,7 @@ class MuJoCo:
         return float(self._model.opt.timestep) * self.substeps
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
-
-        Raises:
-            ShapeError: if the number of states or inputs differs from the model's.
-        """
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         model, nq = self._model, self._model.nq
         if (x.shape[-1], u.shape[-1]) != (nq + model.nv, model.nu):
             raise ShapeError(

@@ -27,10 +27,6 @@ class FeedforwardReLU:
         biases: one vector for each layer.
         scaling: the scaling of the state-input pair and of the increment.
         data: the transitions that the model was learned from, if any.
-
-    Raises:
-        ShapeError: if the shapes of the layers do not match each other or the scaling.
-        InputError: if a value is not finite.
     """
 
     def __init__(
@@ -63,9 +59,6 @@ class FeedforwardReLU:
             regressor: the fitted regressor, with ReLU units.
             scaling: the scaling of the state-input pair and of the increment.
             data: the transitions that the regressor was fitted on, if known.
-
-        Raises:
-            InputError: if the units of the network are not ReLU.
         """
         if regressor.activation != "relu" or regressor.out_activation_ != "identity":
             raise InputError(f"the network must have ReLU units, got {regressor.activation!r}.")
@@ -90,9 +83,6 @@ class FeedforwardReLU:
             seed: seed of the initial weights.
             restarts: number of networks to train; the one with the smallest loss on the data is returned.
             iterations: largest number of iterations of one training.
-
-        Raises:
-            InputError: if scikit-learn is not installed, or the data are not finite.
         """
         scaling = IncrementScaling.of(data)
         seeds = np.random.SeedSequence(seed).generate_state(restarts)

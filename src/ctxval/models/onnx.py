@@ -30,9 +30,6 @@ class Onnx:
         source: the file, or its bytes.
         increments: whether the network returns ``x_next - x`` instead of ``x_next``.
         data: the transitions that the network was learned from, if they are known.
-
-    Raises:
-        InputError: if onnxruntime is not installed, or the file is not a network with one or two inputs.
     """
 
     def __init__(
@@ -47,11 +44,7 @@ class Onnx:
             )
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
-
-        Raises:
-            ShapeError: if the numbers of states or inputs differ from the network's.
-        """
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         output = self.network(*self._arguments(x, u))
         if output.shape[-1] != x.shape[-1]:
             raise ShapeError(

@@ -26,9 +26,6 @@ class Parametric:
         vectorized: True if ``step`` takes whole batches ``(..., n)`` and ``(..., m)``.
         dt: length of a step in seconds, if it is known.
         data: the transitions that the parameters were learned from, if any.
-
-    Raises:
-        InputError: if there is no parameter, or a value is not finite.
     """
 
     def __init__(

@@ -46,9 +46,6 @@ def write_model(path: str | Path, model: Model, note: dict[str, Any] | None = No
         path: the file.
         model: a ``Linear``, ``FeedforwardReLU``, ``GaussianProcessModel`` or ``Corrected``, perhaps ``Refined``.
         note: plain values that are kept in the file, for :func:`read_note`.
-
-    Raises:
-        InputError: if the model is another one, or the file cannot be written.
     """
     inner = model.model if isinstance(model, Refined) else model
     about, arrays = _contents(inner)
@@ -110,9 +107,6 @@ def read_model(source: str | Path) -> SavedModel:
 
     Args:
         source: the file.
-
-    Raises:
-        InputError: if the file is not a model, or is damaged.
     """
     return read_refined(source, None)
 
@@ -123,9 +117,6 @@ def read_refined(source: str | Path, before: Model | None) -> SavedModel:
     Args:
         source: the file.
         before: the model that was refined; None if it is not known.
-
-    Raises:
-        InputError: if the file is not a model, is damaged, or has a correction alone of a model that is not known.
     """
     try:
         arrays = Archive(read_bytes(source))

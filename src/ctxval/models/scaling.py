@@ -28,11 +28,7 @@ class IncrementScaling:
 
     @classmethod
     def of(cls, data: Transitions) -> IncrementScaling:
-        """Return the scaling that gives recorded transitions zero mean and unit variance.
-
-        Raises:
-            InputError: if there are no data, or they are not finite.
-        """
+        """Return the scaling that gives recorded transitions zero mean and unit variance."""
         if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
             raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
         pairs, increments = np.concatenate([data.x, data.u], axis=1), data.x_next - data.x

@@ -35,9 +35,6 @@ class ScikitLearn:
         regressor: the fitted regressor, whose ``predict`` maps features ``(N, n + m)`` to ``(N, n)``.
         increments: whether the regressor predicts ``x_next - x`` instead of ``x_next``.
         data: the transitions that the regressor was fitted on, if any.
-
-    Raises:
-        InputError: if the value is not a regressor, or is not fitted.
     """
 
     def __init__(self, regressor: Any, *, increments: bool = True, data: Transitions | None = None) -> None:
@@ -52,11 +49,7 @@ class ScikitLearn:
 
     @classmethod
     def fit(cls, regressor: Any, data: Transitions, *, increments: bool = True) -> ScikitLearn:
-        """Fit a regressor on recorded transitions. The regressor itself is fitted, not a copy.
-
-        Raises:
-            InputError: if there are no data, they are not finite, or the value is not a regressor.
-        """
+        """Fit a regressor on recorded transitions. The regressor itself is fitted, not a copy."""
         if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
             raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
         if not callable(getattr(regressor, "fit", None)):
@@ -67,11 +60,7 @@ class ScikitLearn:
         return cls(regressor, increments=increments, data=data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
-
-        Raises:
-            ShapeError: if the regressor was fitted on other numbers of states and inputs.
-        """
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         self._require_features(x, u)
         n = x.shape[-1]
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
@@ -81,11 +70,7 @@ class ScikitLearn:
         return x + output if self.increments else output
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return A ``(..., n, n)`` and B ``(..., n, m)``, without batch axes if the model is linear.
-
-        Raises:
-            ShapeError: if the regressor was fitted on other numbers of states and inputs.
-        """
+        """Return A ``(..., n, n)`` and B ``(..., n, m)``, without batch axes if the model is linear."""
         self._require_features(x, u)
         formula = self._formula()
         if formula is None:

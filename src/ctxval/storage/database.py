@@ -26,10 +26,6 @@ class Database:
     Attributes:
         path: the absolute path of the file; None if the tables are in memory.
         name: the name of the store in messages.
-
-    Raises:
-        StoreAccessError: if the file cannot be opened or written.
-        ForeignStoreError: if the file is not a store, or a store of another version.
     """
 
     def __init__(self, path: str | Path | None = None) -> None:

@@ -252,7 +252,6 @@ class Store:
             changes: the number of changes that the campaign knows; None skips the check.
 
         Raises:
-            InputError: if the trial is no longer open.
             StoreMismatchError: if the store has another number of changes.
         """
         with self._database.transaction():
@@ -265,10 +264,9 @@ class Store:
                 raise self._not_open(trial.number)
 
     def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
-        """Store the result of an open trial.
+        """Store the result of an open trial; of two results for one trial, the first is stored.
 
         Raises:
-            InputError: if the trial is not open; of two results for one trial, the first is stored.
             StoreMismatchError: if the store has another number of changes than ``changes``.
         """
         with self._database.transaction():

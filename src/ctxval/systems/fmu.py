@@ -48,10 +48,6 @@ class FMU:
         parameters: values of other variables, set before the initialisation.
         step: the communication step size in seconds, of which a task's dt must be a whole multiple; by default it is
             the task's dt.
-
-    Raises:
-        InputError: if FMPy is not installed, or the file is not an FMU that can be used.
-        UnknownNameError: if the FMU has no variable of a given name.
     """
 
     def __init__(
@@ -113,8 +109,6 @@ class FMU:
         """Run the closed loop from the task's initial state over its horizon.
 
         Raises:
-            InputError: if the task's dt is not a multiple of the step, or the initial state cannot be set.
-            ShapeError: if the number of states or inputs differs from the number of names.
             ExecutionError: if the FMU refuses to start, or crashes when it starts.
         """
         require_one(task)

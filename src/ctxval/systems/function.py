@@ -24,9 +24,6 @@ class Function:
         execute: function that runs the closed loop. It returns a trajectory, or the states ``(H + 1, n)`` and the
             inputs ``(H, m)``. If it raises an exception, the execution has failed for that reason.
         batched: whether the function takes a batch of tasks, and returns ``(..., H + 1, n)`` and ``(..., H, m)``.
-
-    Raises:
-        InputError: if ``execute`` is not a function.
     """
 
     def __init__(self, execute: Callable[[Controller, Task], Any], *, batched: bool = False) -> None:

@@ -47,9 +47,6 @@ class Gymnasium:
         seed: seed of every reset, so that executions are repeatable; None takes another one each time.
         ignore_termination: continue although the environment reports the end of the episode.
         options: further arguments for ``gymnasium.make`` or for the function, such as ``max_episode_steps=-1``.
-
-    Raises:
-        InputError: if gymnasium is not installed, or the environment cannot be made or used.
     """
 
     def __init__(
@@ -94,12 +91,7 @@ class Gymnasium:
         return state
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run the closed loop from the task's initial state over its horizon.
-
-        Raises:
-            InputError: if the task's dt is not the environment's, or its initial state cannot be set.
-            ShapeError: if the number of states or inputs differs from the environment's.
-        """
+        """Run the closed loop from the task's initial state over its horizon."""
         require_one(task)
         require_time_step(task, self.dt, "that of the environment")
         environment = self._idle.pop() if self._idle else self._made()

@@ -21,9 +21,6 @@ class Manual:
     Attributes:
         states, inputs: names of the components with their units, for files.
         dt: length of a step, seconds.
-
-    Raises:
-        InputError: if there is no state, or a name or a unit is not a text.
     """
 
     manual = True

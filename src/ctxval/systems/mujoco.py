@@ -41,10 +41,6 @@ class MuJoCo:
         sites: names of sites whose positions are part of the state, such as an end effector.
         axes: world coordinates of the sites that are part of the state, letters of ``"xyz"``.
         threads: number of threads for a batch (MuJoCo 4 or later); the results do not depend on it.
-
-    Raises:
-        InputError: if MuJoCo is not installed, the model cannot be read or compiled, or a value cannot be used.
-        UnknownNameError: if the model has no site of a given name.
     """
 
     batched = True
@@ -80,9 +76,6 @@ class MuJoCo:
         Args:
             qpos: the configurations, shape ``(..., nq)``.
             qvel: the velocities, shape ``(..., nv)``; zero by default.
-
-        Raises:
-            InputError: if a value is not a finite number, or has the wrong shape.
         """
         positions = require_shape("qpos", as_finite("qpos", qpos), (self._model.nq,))
         velocities = np.zeros(self._model.nv) if qvel is None else as_finite("qvel", qvel)
@@ -95,13 +88,7 @@ class MuJoCo:
         return self._observed(simulations).reshape(*batch, -1)
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run the closed loop from the task's initial state over its horizon.
-
-        Raises:
-            InputError: if the task's dt is not that of a control step, or the positions of sites in its initial state
-                do not belong to its qpos.
-            ShapeError: if the number of states or inputs differs from the model's.
-        """
+        """Run the closed loop from the task's initial state over its horizon."""
         if not np.isclose(task.dt, self.dt, rtol=1e-9, atol=0):
             raise InputError(
                 f"the task's dt must be the model's timestep times substeps, "

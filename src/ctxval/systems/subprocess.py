@@ -56,9 +56,6 @@ class Subprocess:
         keep: a folder in which the folders of all executions are kept, to examine failures.
         folder: folder in which the files that the command names are searched first; by default, and if they are not
             there, the current folder is used.
-
-    Raises:
-        InputError: if the program does not exist.
     """
 
     def __init__(
@@ -97,7 +94,6 @@ class Subprocess:
         """Run the command on one task.
 
         Raises:
-            InputError: if the controller cannot be written to a file.
             ExecutionError: if the command fails, takes too long, or writes no trajectory of this task.
         """
         require_one(task)
