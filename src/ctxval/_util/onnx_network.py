@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
 from ctxval._util.files import read_bytes
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, ModelError, ShapeError
 
 _TYPES: dict[str, type[np.float32] | type[np.float64]] = {"tensor(float)": np.float32, "tensor(double)": np.float64}
@@ -22,7 +22,7 @@ Width = int | None
 """Number of values in one row; None if the file leaves it open."""
 
 
-class OnnxNetwork:
+class OnnxNetwork(ShortRepr):
     """A network that maps rows of numbers to rows of numbers, on one thread of the processor.
 
     Its inputs and its output have one row for each task, shapes ``(N, k)``. If the file fixes N to 1, or the shapes are
@@ -90,9 +90,6 @@ class OnnxNetwork:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return OnnxNetwork, (self._source,)
-
-    def __repr__(self) -> str:
-        return call(self, inputs=dict(zip(self.names, self.widths, strict=True)), outputs=self.width)
 
 
 def _contents(path: Path) -> list[bytes]:

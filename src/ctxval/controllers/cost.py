@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_weight
-from ctxval._util.representation import Shown, call, weight
+from ctxval._util.representation import ShortRepr
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
 
 
-class QuadraticCost:
+class QuadraticCost(ShortRepr):
     """The cost ``1/2 sum_t (x_t - r_t)' Q (x_t - r_t) + u_t' R u_t``, with ``Q_final`` instead of Q at the horizon.
 
     Args:
@@ -40,11 +40,3 @@ class QuadraticCost:
         final = deviations[-1]
         cost = ((running @ self.Q) * running).sum(axis=(0, -1)) + ((inputs @ self.R) * inputs).sum(axis=(0, -1))
         return np.asarray(0.5 * (cost + ((final @ self.Q_final) * final).sum(axis=-1)))
-
-    def weights(self) -> dict[str, Shown]:
-        """Return the weights by name, as they are shown; ``Q_final`` only if it is not Q."""
-        names = ("Q", "R") if self.Q_final is self.Q else ("Q", "R", "Q_final")
-        return {name: weight(getattr(self, name)) for name in names}
-
-    def __repr__(self) -> str:
-        return call(self, **self.weights())

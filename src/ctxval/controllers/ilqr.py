@@ -10,7 +10,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
 from ctxval._util.checked import PositiveFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval.controllers.backward_pass import Expansion, Policy, minimise
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike, fed_back
@@ -38,7 +38,7 @@ Below it the relative error of the states is below 1e-10.
 
 
 @dataclass(frozen=True, eq=False)
-class ILQRSolution:
+class ILQRSolution(ShortRepr):
     """The solution of iLQR for one task or a batch.
 
     Attributes:
@@ -53,11 +53,10 @@ class ILQRSolution:
     cost: Array
     iterations: Array
     converged: Array
-    __repr__ = record
 
 
 @part()
-class ILQR:
+class ILQR(ShortRepr):
     """Finite-horizon iterative LQR on any model, for a whole batch of tasks at once.
 
     It minimises a quadratic cost on the deviation from the task's reference. On a linear model without limits it
@@ -119,11 +118,6 @@ class ILQR:
                 descent.advance(rows)
             descent.undamp(np.flatnonzero(~descent.converged))
         return descent.solution(task.batch_shape)
-
-    def __repr__(self) -> str:
-        return call(
-            self, **self.cost.weights(), iterations=self.iterations, tolerance=self.tolerance, limits=self.limits
-        )
 
 
 class _Descent:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.controllers.riccati import LinearGains, linear_gains
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
@@ -18,7 +18,7 @@ from ctxval.errors import DesignError, InputError
 
 
 @part()
-class LQR:
+class LQR(ShortRepr):
     """The linear-quadratic regulator that tracks the task's reference over its horizon.
 
     A nonlinear model is linearised once, at the task's initial state and zero input.
@@ -61,12 +61,9 @@ class LQR:
         """Return what identifies this synthesizer in a store."""
         return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
 
-    def __repr__(self) -> str:
-        return call(self, **self.cost.weights(), limits=self.limits)
-
 
 @part()
-class StationaryLQR:
+class StationaryLQR(ShortRepr):
     """The infinite-horizon linear-quadratic regulator, with one gain from the algebraic Riccati equation.
 
     The feedback ``u = u_g + K (x - r_t)`` follows the task's reference. The input u_g holds the task's goal as well as
@@ -109,9 +106,6 @@ class StationaryLQR:
     def describe(self) -> dict[str, Any]:
         """Return what identifies this synthesizer in a store."""
         return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
-
-    def __repr__(self) -> str:
-        return call(self, **self.cost.weights(), limits=self.limits)
 
 
 def _require_inputs(cost: QuadraticCost, B: Array) -> None:

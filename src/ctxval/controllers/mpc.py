@@ -11,7 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
 from ctxval._util.checked import PositiveFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import Limits, LimitsLike
 from ctxval.core.model import Model, linearize
@@ -25,7 +25,7 @@ _STRICT = 1e-6  # quadratic share of the cost of a violation, which keeps the pr
 
 
 @part()
-class MPC:
+class MPC(ShortRepr):
     """Receding-horizon control that plans with limits, by sequential quadratic programming in CasADi.
 
     At every step it minimises the quadratic cost of the model's prediction over the next steps, relative to the task's
@@ -78,13 +78,9 @@ class MPC:
             raise ShapeError(f"MPC designs for one task at a time, got a batch of shape {task.batch_shape}.")
         return RecedingHorizon(self, task, model)
 
-    def __repr__(self) -> str:
-        bounds = {"limits": self.limits, "state_limits": self.state_limits, "violation_cost": self.violation_cost}
-        return call(self, **self.cost.weights(), steps=self.steps, iterations=self.iterations, **bounds)
-
 
 @dataclass(frozen=True, eq=False)
-class RecedingHorizon:
+class RecedingHorizon(ShortRepr):
     """The controller of :class:`MPC` for one task."""
 
     settings: MPC
@@ -111,8 +107,6 @@ class RecedingHorizon:
         problem = _Problem(self.settings, self.model, as_floats("the state", x), self.task.reference[rows])
         with np.errstate(all="ignore"):
             return problem.solve(t)
-
-    __repr__ = record
 
 
 class _Problem:

@@ -12,7 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
 from ctxval._util.registry import part
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Limits, LimitsLike, describe_limits, given_limits
 from ctxval.core.model import Model
 from ctxval.core.task import Task
@@ -22,7 +22,7 @@ Observe = Callable[[int, Array, Task], Array]
 
 
 @part(files=("source",), functions={"observe": "(t, x, task) -> observations"})
-class OnnxPolicy:
+class OnnxPolicy(ShortRepr):
     """A synthesizer that uses the same trained network for every task; the model is not used.
 
     The network takes one row of observations for each task and returns the inputs as its first output, such as the
@@ -66,12 +66,9 @@ class OnnxPolicy:
         fields = {name: getattr(self, name) for name in ("network", "observe", "scale")}
         return {**fields, "limits": describe_limits(self.limits)}
 
-    def __repr__(self) -> str:
-        return call(self, self.network, observe=self.observe, scale=self.scale, limits=self.limits)
-
 
 @dataclass(frozen=True, eq=False)
-class BoundOnnxPolicy:
+class BoundOnnxPolicy(ShortRepr):
     """The controller of :class:`OnnxPolicy` for one task or a batch."""
 
     settings: OnnxPolicy
@@ -87,5 +84,3 @@ class BoundOnnxPolicy:
     def __getitem__(self, index: int) -> BoundOnnxPolicy:
         """Return the controller of one task of the batch."""
         return BoundOnnxPolicy(self.settings, self.task[index])
-
-    __repr__ = record

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
 from ctxval._util.registry import part
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
@@ -63,7 +63,7 @@ _SPELLINGS = (
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Limits:
+class Limits(ShortRepr):
     """Limits of the inputs, ``low <= u <= high``.
 
     Attributes:
@@ -116,8 +116,6 @@ class Limits:
     def clip(self, u: Array) -> Array:
         """Return inputs ``(..., m)`` clipped to the limits; NaN stays NaN."""
         return np.asarray(np.clip(u, self.low, self.high))
-
-    __repr__ = record
 
 
 LimitsLike = float | Limits | Mapping[str, ArrayLike] | ArrayLike
@@ -185,7 +183,7 @@ def fed_back(K: Array, deviations: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class AffineFeedback:
+class AffineFeedback(ShortRepr):
     """Time-varying affine feedback ``u = v_t + K_t (x - x_t)``, clipped to its limits if it has any.
 
     Attributes:
@@ -217,12 +215,9 @@ class AffineFeedback:
         converged = None if self.converged is None else np.asarray(self.converged[index])
         return AffineFeedback(gains, self.inputs[index], self.states[index], self.limits, converged)
 
-    def __repr__(self) -> str:
-        return call(self, gains=self.gains, inputs=self.inputs, limits=self.limits)
-
 
 @part(functions={"policy": "(t, x, task) -> u"})
-class Policy:
+class Policy(ShortRepr):
     """A synthesizer that uses the same policy ``policy(t, x, task) -> u`` for every task.
 
     Args:
@@ -251,12 +246,9 @@ class Policy:
         """Return what identifies this synthesizer in a store."""
         return {"policy": self.policy, **({} if self.limits is None else {"limits": describe_limits(self.limits)})}
 
-    def __repr__(self) -> str:
-        return call(self, self.policy, vectorized=self.batched, limits=self.limits)
-
 
 @dataclass(frozen=True, eq=False)
-class _BoundPolicy:
+class _BoundPolicy(ShortRepr):
     """A policy for one task or a batch; unlike a lambda it can be pickled for another process."""
 
     policy: Callable[[int, Array, Task], Array]
@@ -270,5 +262,3 @@ class _BoundPolicy:
     def __getitem__(self, index: int) -> _BoundPolicy:
         """Return the controller of one task of the batch."""
         return _BoundPolicy(self.policy, self.task[index], self.limits)
-
-    __repr__ = record

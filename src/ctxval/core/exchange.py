@@ -17,7 +17,7 @@ import numpy as np
 from ctxval._util.arrays import Array, as_finite, as_floats
 from ctxval._util.files import read_bytes, read_json, written_whole
 from ctxval._util.npz import Archive
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import AffineFeedback, Limits
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
@@ -38,7 +38,7 @@ _UNREADABLE = (
 
 
 @dataclass(frozen=True, eq=False)
-class ControllerFile:
+class ControllerFile(ShortRepr):
     """A controller that was read from a file.
 
     Attributes:
@@ -51,7 +51,6 @@ class ControllerFile:
     dt: float
     states: dict[str, str]
     inputs: dict[str, str]
-    __repr__ = record
 
 
 def write_controller(

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from ctxval._util.checked import checked
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import parted, shortened
 from ctxval.errors import InputError
 
 
 @checked
 @dataclass(frozen=True)
-class Labels:
+class Labels(ShortRepr):
     """Names and units, which change nothing that is computed.
 
     Attributes:
@@ -49,8 +49,6 @@ class Labels:
     def require_readable(self, system: object) -> None:
         """Refuse a system whose own names make a recording unreadable, if these labels do not replace them."""
         require_names(self.states or names_of(system, "states"), self.inputs or names_of(system, "inputs"))
-
-    __repr__ = record
 
 
 def require_names(states: Iterable[str], inputs: Iterable[str]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, ModelError
 
 Step = Callable[[Array, Array], Array]
@@ -37,7 +37,7 @@ class Model(Protocol):
 
 
 @part(functions={"step": "(x, u) -> x_next"})
-class Function:
+class Function(ShortRepr):
     """A plain function ``(x, u) -> x_next`` as a model.
 
     Args:
@@ -58,9 +58,6 @@ class Function:
         inputs = rows_of(np.broadcast_to(u, (*batch, u.shape[-1])))
         rows = [np.asarray(self.function(xi, ui), dtype=np.float64) for xi, ui in zip(states, inputs, strict=True)]
         return np.stack(rows).reshape(*batch, -1)
-
-    def __repr__(self) -> str:
-        return call(self, self.function, vectorized=self.vectorized)
 
 
 def as_model(model: Model | Step) -> Model:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Mask
-from ctxval._util.representation import call, lines, shown
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
@@ -17,7 +17,7 @@ from ctxval.errors import InputError, ShapeError
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(ShortRepr):
     """Everything that is known about a task before S is executed; one task or a batch.
 
     Attributes:
@@ -37,13 +37,9 @@ class Plan:
         controller: Any = self.controller
         return Plan(parameters, self.task[index], controller[index], self.model_trajectory[index])
 
-    def __repr__(self) -> str:
-        fields = ("parameters", "task", "controller", "model_trajectory")
-        return lines(type(self).__name__, *(f"{name}: {shown(getattr(self, name))}" for name in fields))
-
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class Outcome(ShortRepr):
     """A plan after the execution of S.
 
     Attributes:
@@ -55,15 +51,6 @@ class Outcome:
     plan: Plan
     system_trajectory: Trajectory
     distance: float
-
-    def __repr__(self) -> str:
-        known = {
-            "parameters": self.plan.parameters,
-            "task": self.plan.task,
-            "model_trajectory": self.plan.model_trajectory,
-            "system_trajectory": self.system_trajectory,
-        }
-        return lines(call(self, distance=self.distance), *(f"{name}: {shown(part)}" for name, part in known.items()))
 
 
 @dataclass(frozen=True)
@@ -80,14 +67,7 @@ class Measurement:
 
 
 def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> None:
-    """Check that a complete trajectory belongs to the task of a plan.
-
-    Args:
-        plan: the plan of the task.
-        trajectory: the trajectory.
-        start_tolerance: the largest difference between the first state and the initial state of the task, as a fraction
-            of the range of each state in the trajectory of the model, or of its initial value if that is larger.
-    """
+    """Check that a complete trajectory belongs to the task of a plan; see :class:`Validation` for the tolerance."""
     expected = plan.model_trajectory
     require_times(trajectory, plan.task.times)
     if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:

@@ -11,7 +11,7 @@ import scipy
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats
 from ctxval._util.describe import describe
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import shortened
 from ctxval.errors import InputError
 
@@ -43,7 +43,7 @@ class Continuous(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Normal:
+class Normal(ShortRepr):
     """The normal distribution of a task parameter; a task space truncates it to the parameter's bounds.
 
     Args:
@@ -87,8 +87,6 @@ class Normal:
         """Return what identifies the distribution in a store."""
         mean, deviation = self._floats
         return {"mean": mean.tolist(), "deviation": deviation.tolist()}
-
-    __repr__ = record
 
 
 class TaskDistribution(Protocol):

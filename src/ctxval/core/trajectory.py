@@ -13,7 +13,7 @@ from ctxval._util.arrays import Array, Mask, as_floats, held_means, rows_of
 from ctxval._util.columns import FAR, unit_advice
 from ctxval._util.files import MOST_BYTES, read_bytes
 from ctxval._util.npz import Archive
-from ctxval._util.representation import Shown, call, counted, number
+from ctxval._util.representation import ShortRepr, Shown, call, counted, number
 from ctxval.core.csv_columns import read_columns, write_columns
 from ctxval.errors import InputError, ShapeError
 
@@ -21,7 +21,7 @@ COMPLETE = "complete"
 
 
 @dataclass(frozen=True, eq=False)
-class Transitions:
+class Transitions(ShortRepr):
     """Recorded steps of a system: in state x, the input u led to x_next.
 
     Attributes:
@@ -65,9 +65,6 @@ class Transitions:
             np.concatenate([part.x_next for part in parts]),
             steps[0] if steps else None,
         )
-
-    def __repr__(self) -> str:
-        return call(self, len(self), x=self.x, u=self.u, x_next=self.x_next)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call, counted, line, lines, record, table
+from ctxval._util.representation import ShortRepr, call, counted, line, lines, table
 from ctxval.core.space import Point
 
 Origin = Literal["iid", "initial", "acquisition", "covering", "manual"]
@@ -112,7 +112,7 @@ def designs_sentence(trials: Sequence[Trial]) -> str | None:
 
 
 @dataclass(frozen=True)
-class Change:
+class Change(ShortRepr):
     """A later change of a store.
 
     Attributes:
@@ -126,4 +126,3 @@ class Change:
     why: str
     content: dict[str, Any]
     at: str = ""
-    __repr__ = record

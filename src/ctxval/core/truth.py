@@ -21,7 +21,7 @@ from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, che
 from ctxval._util.describe import describe, without_numbers
 from ctxval._util.files import written_whole
 from ctxval._util.progress import stage
-from ctxval._util.representation import call, line, lines
+from ctxval._util.representation import ShortRepr
 from ctxval.core.space import AxisPoints, Parameters
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
@@ -34,7 +34,7 @@ _FINER = 9
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class Truth(ShortRepr):
     """The largest distance over the task space that a method found.
 
     Attributes:
@@ -46,11 +46,6 @@ class Truth:
     distance: float
     parameters: Parameters
     method: str
-
-    def __repr__(self) -> str:
-        return lines(
-            call(self, distance=self.distance), f"parameters: {self.parameters}", f"method: {line(self.method)}"
-        )
 
 
 @checked

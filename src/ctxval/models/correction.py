@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.kernel_maps import KernelSum, matern
 from ctxval.models.scaling import standardised_pairs
@@ -18,7 +18,7 @@ _CACHED = 40_000
 
 
 @dataclass(frozen=True, eq=False)
-class Correction:
+class Correction(ShortRepr):
     """The correction ``r(x, u)``: a weighted sum of Matern 5/2 covariances with centres, and a linear function.
 
     A pair is standardised, ``z = ((x, u) - shift) / scale``. Outside the box of the recorded pairs, the correction
@@ -121,6 +121,3 @@ class Correction:
     def arrays(self) -> dict[str, Array]:
         """Return all arrays by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def __repr__(self) -> str:
-        return call(self, states=self.states, centres=len(self.centres))

@@ -9,7 +9,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
 from ctxval._util.registry import part
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import ShapeError
 from ctxval.gp.cholesky import factorise
@@ -27,7 +27,7 @@ _LENGTH_SCALE = (0.1, 100.0)
 
 
 @dataclass(frozen=True, eq=False)
-class SquaredExponential:
+class SquaredExponential(ShortRepr):
     """``k(z, z') = v exp(-1/2 sum_j ((z_j - z'_j) / l_j)^2)``: rigid-body dynamics are smooth.
 
     Attributes:
@@ -47,11 +47,9 @@ class SquaredExponential:
         np.minimum(exponent, 0.0, out=exponent)  # rounding may leave a point at a distance from itself
         return np.asarray(self.variance * np.exp(exponent, out=exponent))
 
-    __repr__ = record
-
 
 @part()
-class GaussianProcessModel:
+class GaussianProcessModel(ShortRepr):
     """The posterior mean of Gaussian processes, one for each state's increment, that share a covariance.
 
     Sharing it lets one Cholesky factor and one matrix of covariances serve all states.
@@ -117,7 +115,7 @@ class GaussianProcessModel:
         scaling: IncrementScaling,
         data: Transitions | None = None,
     ) -> GaussianProcessModel:
-        """Return the model of standardised pairs ``(M, n + m)`` and increments ``(M, n)`` with these hyperparameters."""
+        """Return the model of standardised pairs ``(M, n + m)`` and increments ``(M, n)``, whose covariance is known."""
         return cls(covariance, Z, factorise(covariance(Z, Z), noise).solve(Y), scaling, data)
 
     def step(self, x: Array, u: Array) -> Array:
@@ -141,12 +139,6 @@ class GaussianProcessModel:
         """Return ``k(rows, centres) @ columns``."""
         blocks = [rows[i : i + _BLOCK] for i in range(0, max(1, len(rows)), _BLOCK)]
         return np.concatenate([self.covariance(block, self.centres) @ columns for block in blocks])
-
-    def __repr__(self) -> str:
-        states = self.weights.shape[1]
-        sizes = {"states": states, "inputs": self.centres.shape[1] - states, "points": len(self.centres)}
-        learned = None if self.data is None else len(self.data)
-        return call(self, self.covariance, **sizes, transitions=learned)
 
 
 def _most_likely(Z: Array, Y: Array, iterations: int) -> tuple[SquaredExponential, float]:

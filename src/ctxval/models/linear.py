@@ -6,7 +6,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
@@ -15,7 +15,7 @@ _LARGEST_CONDITION = 1e8
 
 
 @part()
-class Linear:
+class Linear(ShortRepr):
     """The model ``x_next = A x + B u + c``.
 
     Args:
@@ -78,10 +78,6 @@ class Linear:
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A and B, which are the same for all states and inputs."""
         return self.A, self.B
-
-    def __repr__(self) -> str:
-        learned = None if self.data is None else len(self.data)
-        return call(self, states=len(self.A), inputs=self.B.shape[1], transitions=learned)
 
 
 def _require_identifiable(regressors: Array, n: int, m: int) -> None:

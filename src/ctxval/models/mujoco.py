@@ -12,7 +12,7 @@ from ctxval._util.checked import Seconds
 from ctxval._util.extras import require_extra
 from ctxval._util.mjcf import compile_mjcf, is_mjcf_text
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
@@ -24,7 +24,7 @@ _WHOLE = 1e-6
 
 
 @part(files=("mjcf",))
-class MuJoCo:
+class MuJoCo(ShortRepr):
     """An MJCF model as the model M. The state is ``(qpos, qvel)``, and the input is MuJoCo's ``ctrl``.
 
     A step is a function of state and input alone: it starts without activations and without a warm start of the
@@ -79,10 +79,6 @@ class MuJoCo:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ = {**state, "_mujoco": require_extra("mujoco", "mujoco", "models of MuJoCo")}
-
-    def __repr__(self) -> str:
-        sizes = {name: int(getattr(self._model, name)) for name in ("nq", "nv", "nu")}
-        return call(self, **sizes, dt=self.dt, transitions=None if self.data is None else len(self.data))
 
 
 def identified_in(path: Path) -> Path:

@@ -11,13 +11,13 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.scaling import IncrementScaling
 
 
-class FeedforwardReLU:
+class FeedforwardReLU(ShortRepr):
     """A network with ReLU layers and a linear last layer that predicts the increment of the state.
 
     Layer i maps z to ``z @ weights[i] + biases[i]``, in the standardised units of the scaling.
@@ -105,11 +105,6 @@ class FeedforwardReLU:
             gradient = (gradient @ weight) * (before > 0)[..., None, :]
             z = np.maximum(before, 0.0)
         return self.scaling.jacobian(np.swapaxes(gradient @ self.weights[-1], -1, -2))
-
-    def __repr__(self) -> str:
-        states, hidden = len(self.scaling.shift_out), tuple(bias.size for bias in self.biases[:-1])
-        sizes = {"states": states, "inputs": len(self.scaling.shift_in) - states, "hidden": hidden}
-        return call(self, **sizes, transitions=None if self.data is None else len(self.data))
 
 
 def _trained(data: Transitions, scaling: IncrementScaling, hidden: tuple[int, ...], seed: int, iterations: int) -> Any:

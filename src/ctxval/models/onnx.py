@@ -10,14 +10,14 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import central_differences
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
 
 @part(files=("source",))
-class Onnx:
+class Onnx(ShortRepr):
     """A network from an ONNX file as a model; any toolbox may have written the file.
 
     The network takes the state and the input as two inputs in this order, or as one input with the state first. It
@@ -64,9 +64,6 @@ class Onnx:
         if len(self.network.widths) == 2:
             return x, u
         return (np.concatenate(_paired(x, u), axis=-1),)
-
-    def __repr__(self) -> str:
-        return call(self, self.network, increments=self.increments)
 
 
 def _paired(x: Array, u: Array) -> tuple[Array, Array]:

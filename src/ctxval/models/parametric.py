@@ -8,7 +8,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, as_finite
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Function
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
@@ -17,7 +17,7 @@ ParametricStep = Callable[[Array, Array, Array], Array]
 
 
 @part(functions={"step": "(x, u, theta) -> x_next"})
-class Parametric:
+class Parametric(ShortRepr):
     """A function ``(x, u, theta) -> x_next`` with the values of its parameters theta as a model.
 
     Args:
@@ -50,6 +50,3 @@ class Parametric:
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         return self._step.step(x, u)
-
-    def __repr__(self) -> str:
-        return call(self, self.function, theta=self.theta, transitions=None if self.data is None else len(self.data))

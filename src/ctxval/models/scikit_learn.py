@@ -9,7 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.registry import part
-from ctxval._util.representation import call, name_of
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import central_differences
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
@@ -23,7 +23,7 @@ _AGREEMENT = 1e-4
 
 
 @part()
-class ScikitLearn:
+class ScikitLearn(ShortRepr):
     """A fitted scikit-learn regressor as a model: a pipeline, a forest, ridge regression, a Gaussian process.
 
     Its features are the state, then the input. Networks, Gaussian processes, kernel ridge regression, linear models,
@@ -109,11 +109,6 @@ class ScikitLearn:
     def _formula(self) -> SmoothMap | None:
         # It is read again each time, because a regressor may be fitted again.
         return smooth_map(self.regressor) if self._known else None
-
-    def __repr__(self) -> str:
-        learned = None if self.data is None else len(self.data)
-        regressor = name_of(type(self.regressor))
-        return call(self, regressor, features=self.features, increments=self.increments, transitions=learned)
 
 
 def _require_states(outputs: Array, n: int) -> None:

@@ -19,7 +19,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.checked import Seconds
 from ctxval._util.files import require_regular_file
 from ctxval._util.registry import part
-from ctxval._util.representation import call, options
+from ctxval._util.representation import ShortRepr
 from ctxval._util.temporary import TemporaryFolder
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
@@ -32,7 +32,7 @@ _PROGRAM = Path(__file__).with_name("fmu_process.py")
 
 
 @part(runs_code=True, files=("path",))
-class FMU:
+class FMU(ShortRepr):
     """An FMU for co-simulation, FMI 2 or 3, as the true system.
 
     Every execution has its own instance: parameters and the initial state are set as start values, inputs are held
@@ -153,9 +153,6 @@ class FMU:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._open()
-
-    def __repr__(self) -> str:
-        return call(self, self.path.name, **{key: value for key, value in options(self).items() if key != "path"})
 
 
 class _CrashError(ExecutionError):

@@ -12,7 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array, as_floats
 from ctxval._util.checked import NonNegativeInt, Seconds
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -24,7 +24,7 @@ StateSetter = Callable[[Any, Array], None]
 
 
 @part(runs_code=True, functions={"get_state": "environment -> x", "set_state": "(environment, x)"})
-class Gymnasium:
+class Gymnasium(ShortRepr):
     """A gymnasium environment with continuous actions as the true system.
 
     An execution resets the environment with its seed, sets the task's initial state and runs the closed loop. MuJoCo
@@ -153,9 +153,6 @@ class Gymnasium:
     def __getstate__(self) -> dict[str, Any]:
         # Environments cannot be pickled; another process makes its own.
         return {**vars(self), "_idle": []}
-
-    def __repr__(self) -> str:
-        return call(self, self.environment, **self.options, inputs=self.inputs, dt=self.dt, seed=self.seed)
 
 
 def _is_relative_file(value: object) -> bool:

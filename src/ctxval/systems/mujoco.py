@@ -12,7 +12,7 @@ from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require
 from ctxval._util.checked import PositiveInt
 from ctxval._util.mjcf import compile_mjcf
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
@@ -24,7 +24,7 @@ _SAME_POSITION = 1e-6
 
 
 @part(files=("mjcf",))
-class MuJoCo:
+class MuJoCo(ShortRepr):
     """An MJCF model as the true system, with feedback, for whole batches of closed loops at once.
 
     The state is ``(qpos, qvel)``, followed by the selected coordinates of each selected site. An execution starts from
@@ -129,10 +129,6 @@ class MuJoCo:
         sites, axes = self._coordinates
         positions = simulations.site_positions[:, sites, axes]
         return np.concatenate([simulations.qpos, simulations.qvel, positions.reshape(len(positions), -1)], axis=1)
-
-    def __repr__(self) -> str:
-        sizes = {name: int(getattr(self._model, name)) for name in ("nq", "nv", "nu")}
-        return call(self, **sizes, dt=self.dt, substeps=self.substeps, sites=self.sites or None, threads=self.threads)
 
 
 class _Execution:

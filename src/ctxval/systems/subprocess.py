@@ -17,7 +17,7 @@ import numpy as np
 
 from ctxval._util.checked import TimeLimit
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval._util.temporary import temporary_folder
 from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
@@ -36,7 +36,7 @@ _TAIL = 4096
 
 
 @part(runs_code=True, folder="folder")
-class Subprocess:
+class Subprocess(ShortRepr):
     """A command that executes one task, as the true system.
 
     Every execution has a new folder with ``task.json`` and the controller as ``controller.json`` and
@@ -114,10 +114,6 @@ class Subprocess:
             return
         with temporary_folder() as folder:
             yield folder
-
-    def __repr__(self) -> str:
-        names = {"states": self.states, "inputs": self.inputs}
-        return call(self, shlex.join(self.command), timeout=self.timeout, **names, keep=self.keep)
 
 
 def _located(command: Sequence[str], folder: Path) -> list[str]:
