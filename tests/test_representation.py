@@ -468,7 +468,7 @@ def test_a_dataclass_shows_its_fields_one_below_the_other_if_they_are_too_long_f
 
     assert repr(Report("a")) == "Report(name='a')"
     assert repr(Report("a", np.eye(2))) == "Report(name='a', values=diag(1, 1))"
-    long = Report("a" * 500, np.full((50, 3), 1 / 3), "b" * 500)
+    long = Report("a" * 500, "c" * 500, "b" * 500)
     assert [line.split(":")[0] for line in repr(long).splitlines()] == ["Report", "  name", "  values", "  note"]
     require_readable(repr(long))
 

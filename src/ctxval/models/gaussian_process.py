@@ -115,7 +115,7 @@ class GaussianProcessModel(ShortRepr):
         scaling: IncrementScaling,
         data: Transitions | None = None,
     ) -> GaussianProcessModel:
-        """Return the model of standardised pairs ``(M, n + m)`` and increments ``(M, n)``, whose covariance is known."""
+        """Return the model of standardised pairs ``(M, n + m)`` and increments ``(M, n)`` with a known covariance."""
         return cls(covariance, Z, factorise(covariance(Z, Z), noise).solve(Y), scaling, data)
 
     def step(self, x: Array, u: Array) -> Array:
