@@ -1,7 +1,7 @@
 """File locks that are released when their process ends, however it ends.
 
 The lock is exclusive, whatever path the file is opened by, and a forked process does not inherit it. ``filelock`` does
-not serve here: it truncates the file that it locks, and on Linux that file may be a database in use.
+not serve here: it closes the file at each release, which releases this process's own locks of a database in use.
 """
 
 from __future__ import annotations
