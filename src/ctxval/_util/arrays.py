@@ -23,9 +23,6 @@ Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
 ArrayLike = npt.ArrayLike
 
-_LISTED = 100
-"""Largest number of values that an error message lists."""
-
 _SHOWN = reprlib.Repr()
 _SHOWN.maxlist = _SHOWN.maxtuple = 20
 _SHOWN.maxstring = _SHOWN.maxother = 200
@@ -57,7 +54,7 @@ def as_finite(name: str, value: ArrayLike) -> Array:
     array = as_floats(name, value)
     finite = np.isfinite(array)
     if not finite.all():
-        if array.size <= _LISTED:
+        if array.size <= 100:
             raise InputError(f"{name} must be finite, got {array.tolist()}.")
         place = tuple(np.argwhere(~finite)[0].tolist())
         raise InputError(f"{name} must be finite, got {array[place]} at {list(place)}.")
@@ -102,9 +99,7 @@ def vector_norm(vectors: Array, order: float) -> Array:
     return np.asarray(np.sqrt((magnitudes**2).sum(axis=-1)))
 
 
-@functools.cache
-def _thread_pools() -> ThreadpoolController:
-    return ThreadpoolController()
+_thread_pools = functools.cache(ThreadpoolController)
 
 
 def single_threaded() -> AbstractContextManager[Any]:

@@ -93,7 +93,10 @@ class Archive:
                     raise InputError(f"its array {name} has an unknown format")
                 # The third version differs from the second in names of fields only.
                 read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                self._headers[name] = (*read(file), file.tell())
+                header = (*read(file), file.tell())
+            if header[2].kind not in "fiubUS":
+                raise InputError(f"its array {name} holds neither real numbers nor text")
+            self._headers[name] = header
         return self._headers[name]
 
     def _content(self, name: str, size: int) -> bytearray:

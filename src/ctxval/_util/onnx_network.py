@@ -15,9 +15,6 @@ from ctxval.errors import InputError, ModelError, ShapeError
 
 _TYPES: dict[str, type[np.float32] | type[np.float64]] = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 
-_MOST_BYTES = 2**34
-"""Largest size of a network's weights in bytes; it refuses endless files, not large networks."""
-
 Width = int | None
 """Number of values in one row; None if the file leaves it open."""
 
@@ -96,7 +93,8 @@ def _contents(path: Path) -> list[bytes]:
     """Return the bytes of the file, and of the file of weights that PyTorch may write beside it."""
     weights = path.with_name(f"{path.name}.data")
     try:
-        return [read_bytes(file, most=_MOST_BYTES) for file in (path, weights) if file == path or file.exists()]
+        # The largest size refuses endless files, not large networks.
+        return [read_bytes(file, most=2**34) for file in (path, weights) if file == path or file.exists()]
     except InputError as error:
         raise InputError(f"the ONNX file {path} cannot be read: {error}.") from error
 

@@ -152,7 +152,7 @@ def array(values: Array) -> Shown:
         return Shown(f"[{', '.join(map(shown, values.tolist()))}]")
     if values.ndim == 2 and 0 < len(values) <= _ITEMS and values.dtype.kind in "iuf":
         diagonal = np.diagonal(values)
-        if values.shape[0] == values.shape[1] and np.array_equal(values, np.diag(diagonal)):
+        if diagonal.any() and values.shape[0] == values.shape[1] and np.array_equal(values, np.diag(diagonal)):
             return Shown(f"diag({', '.join(map(number, diagonal.tolist()))})")
     return Shown(f"{values.shape}{_range(values)}")
 

@@ -13,7 +13,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.core.controller import Limits, LimitsLike, describe_limits, given_limits
+from ctxval.core.controller import Limits, LimitsLike
 from ctxval.core.model import Model
 from ctxval.core.task import Task
 from ctxval.errors import InputError
@@ -51,7 +51,7 @@ class OnnxPolicy(ShortRepr):
         self.network = OnnxNetwork(source)
         self.observe = observe
         self.scale = scale
-        self.limits = given_limits(limits)
+        self.limits = None if limits is None else Limits.of(limits)
         if len(self.network.widths) != 1:
             raise InputError(
                 f"a policy must have one input, the observations, but the network has {', '.join(self.network.names)}."
@@ -63,8 +63,7 @@ class OnnxPolicy(ShortRepr):
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this synthesizer in a store."""
-        fields = {name: getattr(self, name) for name in ("network", "observe", "scale")}
-        return {**fields, "limits": describe_limits(self.limits)}
+        return {name: getattr(self, name) for name in ("network", "observe", "scale", "limits")}
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,19 +41,14 @@ class Synthesizer(Protocol):
 
 
 def converged_of(controller: object, batch_shape: tuple[int, ...] = ()) -> Mask | None:
-    """Return whether the design of a controller converged, shape ``batch_shape``; None if the controller does not tell.
-
-    Args:
-        controller: a controller of one task or of a batch, with or without the attribute ``converged``.
-        batch_shape: the shape of the batch of tasks; ``()`` for one task.
-    """
-    told = getattr(controller, "converged", None)
-    if told is None:
+    """Return whether the design of a controller converged, of the shape of its batch; None if it does not tell."""
+    given = getattr(controller, "converged", None)
+    if given is None:
         return None
-    found = np.asarray(told)
-    if found.dtype != np.bool_ or found.shape not in ((), batch_shape):
-        raise ShapeError(f"converged of a controller must be booleans of shape {batch_shape}, got {told!r}.")
-    return np.broadcast_to(found, batch_shape)
+    converged = np.asarray(given)
+    if converged.dtype != np.bool_ or converged.shape not in ((), batch_shape):
+        raise ShapeError(f"converged of a controller must be booleans of shape {batch_shape}, got {given!r}.")
+    return np.broadcast_to(converged, batch_shape)
 
 
 _SPELLINGS = (
@@ -100,14 +95,14 @@ class Limits(ShortRepr):
                 high, numbers or ``(m,)``; or rows ``[low, high]``, one for each input, shape ``(m, 2)``.
             inputs: the number of inputs m, to which single numbers are expanded; None leaves them as they are.
         """
-        found = limits if isinstance(limits, Limits) else _read_limits(limits)
+        box = limits if isinstance(limits, Limits) else _read_limits(limits)
         if inputs is None:
-            return found
-        if any(bound.shape not in ((), (inputs,)) for bound in (found.low, found.high)):
+            return box
+        if any(bound.shape not in ((), (inputs,)) for bound in (box.low, box.high)):
             raise ShapeError(
-                f"limits must be numbers or have shape ({inputs},), got {found.low.shape} and {found.high.shape}."
+                f"limits must be numbers or have shape ({inputs},), got {box.low.shape} and {box.high.shape}."
             )
-        return cls(*(np.array(np.broadcast_to(bound, (inputs,))) for bound in (found.low, found.high)))
+        return cls(*(np.array(np.broadcast_to(bound, (inputs,))) for bound in (box.low, box.high)))
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies these limits in a store."""
@@ -147,33 +142,13 @@ def _flat(listed: list[float]) -> InputError:
     """Return the error that limits are a flat list, with the forms in which the user can write them instead."""
     ways = []
     if len(listed) == 2 and listed[0] < listed[1]:
-        ways.append(f"{_table(*listed)} for {listed[0]:g} to {listed[1]:g} of every input")
+        low, high = listed
+        ways.append(f"{{ low = {low}, high = {high} }} for {low:g} to {high:g} of every input")
     if all(high > 0 for high in listed):
         ways.append(f"{[[-high, high] for high in listed]} for one row [low, high] for each input")
     if len(ways) == 2:
         return InputError(f"limits {listed} can be read in two ways: write {ways[0]}, or {ways[1]}.")
     return InputError(f"limits must not be a flat list, got {listed}: {'write ' + ways[0] if ways else _SPELLINGS}.")
-
-
-def _table(low: Any, high: Any) -> str:
-    return f"{{ low = {low}, high = {high} }}"
-
-
-def given_limits(limits: LimitsLike | None) -> float | Limits | None:
-    """Check limits while the number of inputs is not known yet; return them, with a single number as a number."""
-    if limits is None:
-        return None
-    found = Limits.of(limits)
-    # Stores of version 0.1.0 describe a single number as a number.
-    given_a_number = not isinstance(limits, Limits | Mapping) and np.ndim(limits) == 0
-    return float(found.high) if given_a_number else found
-
-
-def describe_limits(limits: float | Limits | None) -> Any:
-    """Return what identifies the limits of a policy in a store, in the form of version 0.1.0 if it is unambiguous."""
-    if not isinstance(limits, Limits) or not (limits.low.ndim or limits.high.ndim):
-        return limits
-    return [limits.low.tolist(), limits.high.tolist()]
 
 
 def fed_back(K: Array, deviations: Array) -> Array:
@@ -236,7 +211,7 @@ class Policy(ShortRepr):
     ) -> None:
         self.policy = policy
         self.batched = vectorized
-        self.limits = given_limits(limits)
+        self.limits = None if limits is None else Limits.of(limits)
 
     def design(self, task: Task, model: Model) -> Controller:
         """Return the policy bound to the task; the model is not used."""
@@ -244,7 +219,7 @@ class Policy(ShortRepr):
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this synthesizer in a store."""
-        return {"policy": self.policy, **({} if self.limits is None else {"limits": describe_limits(self.limits)})}
+        return {"policy": self.policy, **({} if self.limits is None else {"limits": self.limits})}
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +228,7 @@ class _BoundPolicy(ShortRepr):
 
     policy: Callable[[int, Array, Task], Array]
     task: Task
-    limits: float | Limits | None
+    limits: Limits | None
 
     def __call__(self, t: int, x: Array) -> Array:
         u = np.asarray(self.policy(t, x, self.task), dtype=np.float64)

@@ -31,11 +31,6 @@ Content = TypeVar("Content")
 Names = Mapping[str, str]
 """The names of states or inputs, and their units."""
 
-_UNREADABLE = (
-    *(ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, MemoryError, RecursionError),
-)
-"""Exceptions that content of unexpected types raises."""
-
 
 @dataclass(frozen=True, eq=False)
 class ControllerFile(ShortRepr):
@@ -130,14 +125,21 @@ def _write(path: Path, about: dict[str, Any], arrays: Mapping[str, Array]) -> No
         if path.suffix == ".npz":
             np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
         else:
-            content = about | {name: _listed(array) for name, array in arrays.items()}
+            content = about | {name: array.tolist() for name, array in arrays.items()}
+            for name in {"low", "high"} & set(arrays):  # of which JSON cannot hold infinite ones
+                content[name] = [limit if np.isfinite(limit) else None for limit in content[name]]
             lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in content.items())
             file.write(f"{{\n{lines}\n}}\n".encode())
 
 
 def _read(path: Path, expected: str, build: Callable[[Mapping[str, Any]], Content]) -> Content:
     try:
-        content = _npz_content(path) if path.suffix == ".npz" else read_json(path)
+        if path.suffix == ".npz":
+            arrays = Archive(read_bytes(path))
+            numbers = {name: arrays.numbers(name) for name in arrays.names if name != "about"}
+            content = {**json.loads(arrays.text("about")), **numbers}
+        else:
+            content = read_json(path)
         if not isinstance(content, Mapping):
             raise InputError("it must be a JSON object.")
         if content["format"] != expected:
@@ -145,15 +147,9 @@ def _read(path: Path, expected: str, build: Callable[[Mapping[str, Any]], Conten
         if content["version"] != VERSION:
             raise InputError(f"this version of ctxval reads version {VERSION}, got {str(content['version'])[:40]}.")
         return build(content)
-    except _UNREADABLE as error:
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, RecursionError) as error:
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {str(error)[:100]}"
         raise InputError(f"{path} cannot be read as a {expected}: {reason.removesuffix('.')}.") from error
-
-
-def _npz_content(path: Path) -> Any:
-    arrays = Archive(read_bytes(path))
-    about = json.loads(arrays.text("about"))
-    return {**about, **{name: arrays.numbers(name) for name in arrays.names if name != "about"}}
 
 
 def _controller(content: Mapping[str, Any]) -> ControllerFile:
@@ -184,11 +180,6 @@ def _task(content: Mapping[str, Any]) -> Task:
         dt=content["dt"],
         reference=content["reference"],
     )
-
-
-def _listed(array: Array) -> Any:
-    """Return an array as lists for JSON, with null for infinite limits."""
-    return [value if np.isfinite(value) else None for value in array.tolist()] if array.ndim == 1 else array.tolist()
 
 
 def _bound(values: Any, infinite: float) -> Array:

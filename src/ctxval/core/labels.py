@@ -75,10 +75,10 @@ def labels_of(named: Mapping[str, str]) -> tuple[str, ...]:
 
 def names_of(system: object, kind: str) -> dict[str, str]:
     """Return the names and units of the ``"states"`` or ``"inputs"`` of a system; empty if it names none."""
-    own = getattr(system, kind, None)
-    if isinstance(own, Mapping):
-        return {str(name): str(unit) for name, unit in own.items()}
-    return dict.fromkeys(map(str, own), "") if isinstance(own, list | tuple) else {}
+    names = getattr(system, kind, None)
+    if isinstance(names, Mapping):
+        return {str(name): str(unit) for name, unit in names.items()}
+    return dict.fromkeys(map(str, names), "") if isinstance(names, list | tuple) else {}
 
 
 def _named(labels: tuple[str, ...], own: dict[str, str], letter: str, count: int) -> dict[str, str]:

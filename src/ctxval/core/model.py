@@ -14,14 +14,7 @@ from ctxval.errors import InputError, ModelError
 
 Step = Callable[[Array, Array], Array]
 
-_PROBED = 3
-"""Number of points at which the precision of a model is found out."""
-_FINE, _COARSE = 2.0**-27, 2.0**-17
-"""A change that single precision hardly resolves, and one that it does, as shares of a state or of 1."""
-
-_BLOCK = 4096
-"""Number of points at which a model is evaluated in one call for differences: larger arrays do not fit into the cache.
-"""
+_BLOCK = 4096  # points at which a model is evaluated in one call for differences, so that they fit into the cache
 
 
 @runtime_checkable
@@ -66,13 +59,7 @@ def as_model(model: Model | Step) -> Model:
 
 
 def require_time_step(model: object, dt: float, whose: str) -> None:
-    """Refuse a model that states, or was learned from, steps of another length.
-
-    Args:
-        model: the model; its attribute ``dt``, or that of its ``data``, is the length of a step in seconds.
-        dt: the length that it is used with, seconds.
-        whose: what has this length, for the message.
-    """
+    """Refuse a model whose own ``dt``, or that of its ``data``, is not the step of what it is used with."""
     own = getattr(model, "dt", None) or getattr(getattr(model, "data", None), "dt", None)
     if isinstance(own, int | float) and not np.isclose(own, dt, rtol=1e-3, atol=0):
         raise InputError(
@@ -128,13 +115,14 @@ def _precision(step: Step, z: Array, n: int) -> float:
     A change that is a thousand times as large shows how much the model should change. The answer of most points counts,
     because a few may be next to a kink. What a model converts to double precision afterwards does not matter.
     """
-    some = z[:: max(1, len(z) // _PROBED)][:_PROBED]
-    size = np.maximum(1.0, np.abs(some))
-    moved = np.concatenate([some, some + _FINE * size, some - _COARSE * size, some + _COARSE * size])
+    some = z[:: max(1, len(z) // 3)][:3]
+    # A change that single precision hardly resolves, and one that it does.
+    size, little, much = np.maximum(1.0, np.abs(some)), 2.0**-27, 2.0**-17
+    moved = np.concatenate([some, some + little * size, some - much * size, some + much * size])
     still, fine, down, up = np.asarray(step(moved[:, :n], moved[:, n:])).reshape(4, -1, n)
     with np.errstate(all="ignore"):  # a model that is not finite is refused later
-        expected = (up - down) * (0.5 * _FINE / _COARSE)
-        margin = 1e-3 * np.abs(expected) + 1e-5 * _FINE * np.abs(still).max(initial=0.0)
+        expected = (up - down) * (0.5 * little / much)
+        margin = 1e-3 * np.abs(expected) + 1e-5 * little * np.abs(still).max(initial=0.0)
         lost = np.abs(fine - still - expected) > margin
     single = lost.any(axis=1).sum() > len(some) / 2
     return float(np.finfo(np.float32 if single else np.float64).eps)

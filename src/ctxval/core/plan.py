@@ -91,12 +91,8 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
 def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
     """Return whether the controller of a plan gives the recorded inputs at the recorded states.
 
-    The execution is then also one of this controller: a deterministic system cannot tell the two apart.
-
-    Args:
-        plan: the plan of one task.
-        trajectory: an execution of this task, perhaps with another controller.
-        tolerance: the largest difference, as a share of the largest magnitude of each input.
+    The execution is then also one of this controller: a deterministic system cannot tell the two apart. The tolerance
+    is a share of the largest magnitude of each input.
     """
     states, inputs = trajectory.states, trajectory.inputs
     if plan.model_trajectory.states.shape != states.shape or plan.model_trajectory.inputs.shape != inputs.shape:

@@ -42,10 +42,7 @@ class Parameters:
         return self[name]
 
     def __getitem__(self, name: str) -> Any:
-        columns = self._space.columns(name)
-        if isinstance(columns, int):
-            return self.points[..., columns]
-        return self.points[..., columns]
+        return self.points[..., self._space.columns(name)]
 
     def __repr__(self) -> str:
         if self.points.ndim == 1:
@@ -111,8 +108,8 @@ class TaskSpace:
     @property
     def labels(self) -> tuple[str, ...]:
         """An axis label for each scalar parameter: its name and its unit."""
-        units = self._scalar_units()
-        return tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, units, strict=True))
+        units = zip(self.names, self._scalar_units(), strict=True)
+        return tuple(f"{name} [{unit}]" if unit else name for name, unit in units)
 
     def _scalar_units(self) -> list[str]:
         return [shortened(self._units[name]) for name, at in self._columns.items() for _ in np.atleast_1d(self.low[at])]
@@ -127,8 +124,8 @@ class TaskSpace:
 
         A distribution of tasks is part of it only if there is one.
         """
-        set_one = {} if self._distribution is None else {DISTRIBUTION: self._distribution.describe()}
-        return set_one | {
+        distribution = {} if self._distribution is None else {DISTRIBUTION: self._distribution.describe()}
+        return distribution | {
             name: [float(low), float(high), *([unit] if unit else [])]
             for name, low, high, unit in zip(self.names, self.low, self.high, self._scalar_units(), strict=True)
         }
@@ -248,9 +245,9 @@ class TaskSpace:
         return np.clip(self.to_unit(self._distribution.draw(n, rng)), 0.0, 1.0)
 
     def _with(self, distribution: TaskDistribution) -> TaskSpace:
-        found = copy.copy(self)
-        found._distribution = distribution
-        return found
+        space = copy.copy(self)
+        space._distribution = distribution
+        return space
 
     # Sets of points
 

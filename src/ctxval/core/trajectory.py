@@ -54,8 +54,8 @@ class Transitions(ShortRepr):
         """Return several sets of transitions as one set."""
         sizes = sorted({(part.x.shape[1], part.u.shape[1]) for part in parts})
         if len(sizes) > 1:
-            said = " and ".join(f"{n} states and {m} inputs" for n, m in sizes)
-            raise ShapeError(f"recorded steps must have the same numbers of states and inputs, got {said}.")
+            different = " and ".join(f"{n} states and {m} inputs" for n, m in sizes)
+            raise ShapeError(f"recorded steps must have the same numbers of states and inputs, got {different}.")
         steps = [part.dt for part in parts if part.dt is not None]
         if steps and not np.allclose(steps, steps[0], rtol=1e-3, atol=0):
             raise InputError(f"recorded steps must have one length, got {min(steps):g} s and {max(steps):g} s.")
@@ -72,9 +72,9 @@ class Trajectory:
     """The times, states and inputs of a closed loop, for one task or a batch of tasks.
 
     Attributes:
-        times: the times of the states, shape ``(H + 1,)``, seconds.
-        states: the states, shape ``(..., H + 1, n)``.
-        inputs: the inputs, shape ``(..., H, m)``.
+        times: seconds, shape ``(H + 1,)``.
+        states: shape ``(..., H + 1, n)``.
+        inputs: shape ``(..., H, m)``.
         ended: ``"complete"``, or the reason why the trajectory ended before its horizon.
     """
 
@@ -115,8 +115,8 @@ class Trajectory:
 
     def __getitem__(self, index: int) -> Trajectory:
         """Return one trajectory of the batch; the batch's ``ended`` applies to trajectories that are not finite."""
-        one = Trajectory(self.times, self.states[index], self.inputs[index])
-        return one if self.ended == COMPLETE or one.finite.all() else replace(one, ended=self.ended)
+        single = Trajectory(self.times, self.states[index], self.inputs[index])
+        return single if self.ended == COMPLETE or single.finite.all() else replace(single, ended=self.ended)
 
     def transitions(self) -> Transitions:
         """Return all steps of all tasks of the batch as one set of transitions."""
@@ -149,11 +149,12 @@ class Trajectory:
         try:
             arrays = Archive(source if isinstance(source, bytes) else read_bytes(source, most), most)
             ended = arrays.text("ended") if "ended" in arrays else COMPLETE
-            shapes = [arrays.shape(part) for part in _ARRAYS]
+            names = ("times", "states", "inputs")
+            shapes = [arrays.shape(name) for name in names]
             _require_fitting(*shapes)
             if shape is not None and ended == COMPLETE and shapes[1] != shape:
                 raise ShapeError(f"the trajectory must have states of shape {shape}, got {shapes[1]}.")
-            times, states, inputs = (arrays.numbers(part) for part in _ARRAYS)
+            times, states, inputs = (arrays.numbers(name) for name in names)
             return Trajectory(times, states, inputs, ended)
         except ShapeError:
             raise
@@ -207,19 +208,19 @@ class Trajectory:
         Args:
             times: seconds after the first time of the recording, from 0, shape ``(H + 1,)``.
         """
-        own, wanted = self.times - self.times[0], as_floats("times", times)
-        if self.batch_shape or not (np.diff(own) > 0).all():
+        recorded, wanted = self.times - self.times[0], as_floats("times", times)
+        if self.batch_shape or not (np.diff(recorded) > 0).all():
             raise InputError("only a single trajectory with increasing times can be resampled.")
-        dt, period = float(wanted[1] - wanted[0]), float(np.median(np.diff(own)))
+        dt, period = float(wanted[1] - wanted[0]), float(np.median(np.diff(recorded)))
         if period > FAR * dt:
             raise InputError(f"the recording has steps of {period:g} s instead of {dt:g} s{_advice(period, dt)}.")
-        if not own[-1] >= wanted[-1] - _TIMES * dt:
+        if not recorded[-1] >= wanted[-1] - _TIMES * dt:
             raise InputError(
-                f"the recording ends after {own[-1]:g} s, and {wanted[-1]:g} s are needed{_advice(period, dt)}."
+                f"the recording ends after {recorded[-1]:g} s, and {wanted[-1]:g} s are needed{_advice(period, dt)}."
             )
-        states = np.stack([np.interp(wanted, own, column) for column in self.states.T], axis=-1)
+        states = np.stack([np.interp(wanted, recorded, column) for column in self.states.T], axis=-1)
         # A sample that belongs to a time may have been recorded just after it.
-        inputs = held_means(own[:-1], self.inputs, wanted, 1e-6 * dt)
+        inputs = held_means(recorded[:-1], self.inputs, wanted, 1e-6 * dt)
         return Trajectory(wanted, states, inputs, self.ended)
 
     def __repr__(self) -> str:
@@ -233,29 +234,26 @@ _TIMES = 0.01
 
 def require_times(trajectory: Trajectory, times: Array) -> None:
     """Check that a trajectory has these times ``(H + 1,)``, counted from its first time."""
-    dt, own = times[1] - times[0], trajectory.times - trajectory.times[0]
-    period = float(np.median(np.diff(own)))
+    dt, recorded = times[1] - times[0], trajectory.times - trajectory.times[0]
+    period = float(np.median(np.diff(recorded)))
     advice = _advice(period, dt) or "; --resample interpolates a recording to these times"
-    if len(own) != len(times):
+    if len(recorded) != len(times):
         raise InputError(
-            f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, got {len(own)} with "
-            f"steps of {period:g} s{advice}."
+            f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, "
+            f"got {len(recorded)} with steps of {period:g} s{advice}."
         )
-    misses = np.abs(own - times)
+    misses = np.abs(recorded - times)
     if not (misses <= _TIMES * dt).all():
         k = int(np.argmax(~(misses <= _TIMES * dt)))
         raise InputError(
             f"the trajectory must have steps of {dt:g} s: time {k} must be {times[k]:g} s after the first, "
-            f"got {own[k]:g} s. The largest difference is {np.max(misses):.3g} s{advice}."
+            f"got {recorded[k]:g} s. The largest difference is {np.max(misses):.3g} s{advice}."
         )
 
 
 def _advice(period: float, dt: float) -> str:
     advice = unit_advice(period, dt)
     return f"; {advice}" if advice else ""
-
-
-_ARRAYS = ("times", "states", "inputs")
 
 
 def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tuple[int, ...]) -> None:

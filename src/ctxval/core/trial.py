@@ -93,14 +93,15 @@ class Trial:
 def designs_sentence(trials: Sequence[Trial]) -> str | None:
     """Return which controllers of executed tasks did not converge or jump; None if nothing of the kind is recorded."""
     executed = [trial for trial in trials if trial.executed]
-    told = [trial.note[CONVERGED] for trial in executed if trial.note is not None and CONVERGED in trial.note]
+    designs = [trial.note[CONVERGED] for trial in executed if trial.note is not None and CONVERGED in trial.note]
     worst = max(executed, key=lambda trial: -1.0 if trial.distance is None else trial.distance, default=None)
     among = worst is not None and (worst.note or {}).get(CONVERGED) is False
     parts = []
-    if told.count(False):
+    if designs.count(False):
         which = ", among them the worst one" if among else ""
         parts.append(
-            f"the design of the controller did not converge at {told.count(False)} of {len(told)} executed tasks{which}"
+            f"the design of the controller did not converge at {designs.count(False)} of {len(designs)} executed "
+            f"tasks{which}"
         )
     rejected = sum(count for trial in trials if isinstance(count := (trial.note or {}).get(UNSTEADY), int))
     if rejected:

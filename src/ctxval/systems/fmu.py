@@ -112,7 +112,10 @@ class FMU(ShortRepr):
             ExecutionError: if the FMU refuses to start, or crashes when it starts.
         """
         require_one(task)
-        substeps = self._substeps(task)
+        ratio = 1.0 if self.step is None else task.dt / self.step
+        if ratio < 0.5 or not np.isclose(ratio, round(ratio), rtol=1e-9, atol=0):
+            raise InputError(f"the task's dt must be a whole multiple of the step {self.step:g} s, got {task.dt:g} s.")
+        substeps = round(ratio)
         with self._process() as process:
             state = process.ask("begin", task.initial_state.tolist(), task.dt / substeps, substeps)
             require_started(task, np.array(state))
@@ -121,12 +124,6 @@ class FMU(ShortRepr):
             with contextlib.suppress(_CrashError):  # the execution is over
                 process.ask("free")
             return trajectory
-
-    def _substeps(self, task: Task) -> int:
-        ratio = 1.0 if self.step is None else task.dt / self.step
-        if ratio < 0.5 or not np.isclose(ratio, round(ratio), rtol=1e-9, atol=0):
-            raise InputError(f"the task's dt must be a whole multiple of the step {self.step:g} s, got {task.dt:g} s.")
-        return round(ratio)
 
     @contextlib.contextmanager
     def _process(self) -> Iterator[_Process]:
@@ -160,11 +157,7 @@ class _CrashError(ExecutionError):
 
 
 class _Process:
-    """The process that runs an FMU; see :mod:`ctxval.systems.fmu_process`.
-
-    Attributes:
-        sound: whether the process can be used again.
-    """
+    """The process that runs an FMU (:mod:`ctxval.systems.fmu_process`); if it is sound, it can be used again."""
 
     def __init__(self, setup: Mapping[str, Any]) -> None:
         path = os.pathsep.join(entry for entry in sys.path if entry)

@@ -62,18 +62,29 @@ class Gymnasium(ShortRepr):
     ) -> None:
         self.environment = environment
         self.options = options
-        # Environments may be made again after the current folder has changed.
-        self._files = {name: os.path.abspath(value) for name, value in options.items() if _is_relative_file(value)}
+        # Environments may be made again after the current folder has changed; other names stand for gymnasium's models.
+        self._files = {
+            name: os.path.abspath(value)
+            for name, value in options.items()
+            if isinstance(value, str) and value.startswith(("./", "../")) and os.path.exists(value)
+        }
         self.get_state, self.set_state = get_state, set_state
         self.seed = seed
         self.ignore_termination = ignore_termination
         first = self._made()
         self._idle = [first]  # each execution takes its own, so that threads do not share one
-        self.inputs = _action_size(first)
+        space = first.action_space
+        if not np.issubdtype(space.dtype or object, np.floating) or not space.shape:
+            raise InputError(f"the environment must have continuous actions, a Box, got {space}.")
+        self.inputs = int(np.prod(space.shape))
         self.dt = _time_step(first, dt)
-        if (get_state is None or set_state is None) and not _is_mujoco(first.unwrapped):
+        bare = first.unwrapped
+        is_mujoco = (
+            hasattr(bare, "set_state") and hasattr(bare, "model") and hasattr(getattr(bare, "data", None), "qpos")
+        )
+        if (get_state is None or set_state is None) and not is_mujoco:
             raise InputError(
-                f"{first.unwrapped} has no MuJoCo state; give the functions get_state(environment) -> x and "
+                f"{bare} has no MuJoCo state; give the functions get_state(environment) -> x and "
                 "set_state(environment, x)."
             )
 
@@ -130,7 +141,12 @@ class Gymnasium(ShortRepr):
         if self.set_state is not None:
             self.set_state(bare, x)
         else:
-            _set_mujoco_state(bare, x)
+            nq, nv = len(bare.data.qpos), len(bare.data.qvel)
+            if len(x) < nq + nv:
+                raise ShapeError(
+                    f"the task must have at least {nq + nv} states, {nq} qpos and {nv} qvel, got {len(x)}."
+                )
+            bare.set_state(x[:nq], x[nq : nq + nv])
         require_started(task, self._read(bare))
 
     def _read(self, bare: Any) -> Array:
@@ -153,29 +169,6 @@ class Gymnasium(ShortRepr):
     def __getstate__(self) -> dict[str, Any]:
         # Environments cannot be pickled; another process makes its own.
         return {**vars(self), "_idle": []}
-
-
-def _is_relative_file(value: object) -> bool:
-    """Return whether an option is the relative path of a file; other names stand for models of gymnasium itself."""
-    return isinstance(value, str) and value.startswith(("./", "../")) and os.path.exists(value)
-
-
-def _is_mujoco(bare: Any) -> bool:
-    return all(hasattr(bare, name) for name in ("set_state", "data", "model")) and hasattr(bare.data, "qpos")
-
-
-def _set_mujoco_state(bare: Any, x: Array) -> None:
-    nq, nv = len(bare.data.qpos), len(bare.data.qvel)
-    if len(x) < nq + nv:
-        raise ShapeError(f"the task must have at least {nq + nv} states, {nq} qpos and {nv} qvel, got {len(x)}.")
-    bare.set_state(x[:nq], x[nq : nq + nv])
-
-
-def _action_size(environment: Any) -> int:
-    space = environment.action_space
-    if not np.issubdtype(space.dtype or object, np.floating) or not space.shape:
-        raise InputError(f"the environment must have continuous actions, a Box, got {space}.")
-    return int(np.prod(space.shape))
 
 
 def _time_step(environment: Any, given: float | None) -> float:

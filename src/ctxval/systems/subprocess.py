@@ -28,12 +28,6 @@ from ctxval.errors import CtxvalError, ExecutionError, InputError
 from ctxval.systems.episode import require_one
 from ctxval.systems.supervised import run_supervised
 
-_TIMES = 0.01
-"""Largest difference between the times of a trajectory and those of its task, in steps."""
-
-_TAIL = 4096
-"""Number of bytes at the end of stderr that are searched for its last line."""
-
 
 @part(runs_code=True, folder="folder")
 class Subprocess(ShortRepr):
@@ -145,7 +139,7 @@ def signal_name(number: int) -> str:
 
 def _last_line(file: IO[bytes]) -> str:
     """Return the last line of an open file; it is not opened again, because its name may now stand for another file."""
-    file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
+    file.seek(max(0, file.seek(0, os.SEEK_END) - 4096))
     lines = [line.strip() for line in file.read().decode("utf-8", "replace").splitlines() if line.strip()]
     return lines[-1][:300] if lines else ""
 
@@ -173,7 +167,7 @@ def _of_task(trajectory: Trajectory, task: Task) -> Trajectory:
             f"got {trajectory.states.shape}"
         )
     misses = np.abs(trajectory.times - trajectory.times[0] - task.times)
-    if not (misses <= _TIMES * task.dt).all():
+    if not (misses <= 0.01 * task.dt).all():
         worst = int(np.argmax(np.where(np.isnan(misses), np.inf, misses)))
         raise ExecutionError(
             f"the command's trajectory must have steps of {task.dt:g} s: time {worst} must be {task.times[worst]:g} s "
