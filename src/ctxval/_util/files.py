@@ -33,9 +33,15 @@ _KINDS = {
     stat.S_IFDIR: "it is a folder",
     stat.S_IFIFO: "it is a FIFO and not a regular file",
     stat.S_IFSOCK: "it is a socket and not a regular file",
+    stat.S_IFLNK: "it is a link and not a regular file",
     stat.S_IFCHR: "it is a device and not a regular file",
     stat.S_IFBLK: "it is a device and not a regular file",
 }
+
+
+def why_not_regular(mode: int) -> str:
+    """Return what a file of a mode is; empty if it is a regular file."""
+    return "" if stat.S_ISREG(mode) else _KINDS.get(stat.S_IFMT(mode), "it is not a file")
 
 
 def open_regular(path: str | Path, most: int = MOST_BYTES) -> BinaryIO:
@@ -47,7 +53,7 @@ def open_regular(path: str | Path, most: int = MOST_BYTES) -> BinaryIO:
         reason = _KINDS[stat.S_IFDIR] if folder else str(getattr(error, "strerror", None) or error)
         raise InputError(reason) from error
     status = os.fstat(descriptor)
-    reason = _KINDS.get(stat.S_IFMT(status.st_mode), "")
+    reason = why_not_regular(status.st_mode)
     if not reason and status.st_size > most:
         reason = f"it has {status.st_size} bytes, and at most {most} are read"
     if reason:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
+from ctxval._util.extras import require_extra
 from ctxval._util.files import read_bytes
 from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, ModelError, ShapeError
@@ -100,10 +101,7 @@ def _contents(path: Path) -> list[bytes]:
 
 
 def _session(source: bytes | str) -> Any:
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise InputError('onnxruntime is not installed: pip install "ctxval[onnx]".') from error
+    onnxruntime = require_extra("onnxruntime", "onnx", "ONNX networks")
     options = onnxruntime.SessionOptions()
     # Small networks are slower on many threads, and their last bits depend on the number of threads.
     options.intra_op_num_threads = options.inter_op_num_threads = 1

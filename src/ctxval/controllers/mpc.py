@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
 from ctxval._util.checked import PositiveFloat, PositiveInt
+from ctxval._util.extras import require_extra
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import Limits, LimitsLike
 from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task
-from ctxval.errors import DesignError, InputError, ShapeError
+from ctxval.errors import DesignError, ShapeError
 
 _SETTLED = 1e-9  # relative change of the cost at which the iteration stops
 _STEP_LENGTHS = 0.5 ** np.arange(10)
@@ -69,7 +69,7 @@ class MPC(ShortRepr):
         self.limits = Limits.of(np.inf if limits is None else limits, m)
         self.state_limits = Limits.of(np.inf if state_limits is None else state_limits, n)
         self.violation_cost = violation_cost
-        _casadi()
+        require_extra("casadi", "mpc", "MPC controllers")
 
     def design(self, task: Task, model: Model) -> RecedingHorizon:
         """Return the controller, which solves an optimal control problem at every step."""
@@ -88,11 +88,7 @@ class RecedingHorizon(ShortRepr):
     model: Model
 
     def __call__(self, t: int, x: Array) -> Array:
-        """Return the input ``(m,)`` at step t.
-
-        Raises:
-            DesignError: if no inputs keep the prediction within the state limits, or the prediction is not finite.
-        """
+        """Return the input ``(m,)`` at step t."""
         first: Array = self.plan(t, x)[1][0]
         return first
 
@@ -162,12 +158,12 @@ class _Problem:
         gap_high = (self.settings.state_limits.high - X[1:])[:, self.limited].ravel()
         soft = self.settings.violation_cost
         if soft is None or not len(rows):
-            found = _quadratic_program(hessian, slope, rows, (low.ravel(), high.ravel()), (gap_low, gap_high))
+            solution = _quadratic_program(hessian, slope, rows, (low.ravel(), high.ravel()), (gap_low, gap_high))
         else:
-            found = _softened(hessian, slope, rows, (low.ravel(), high.ravel()), (gap_low, gap_high), soft, steps)
-        if found is None:
+            solution = _softened(hessian, slope, rows, (low.ravel(), high.ravel()), (gap_low, gap_high), soft, steps)
+        if solution is None:
             return None
-        change, largest = found
+        change, largest = solution
         self.weight = max(self.weight, _EXACT * largest) if soft is None else soft
         return change[: steps * m].reshape(steps, m)
 
@@ -233,7 +229,7 @@ def _quadratic_program(
 
     Returns z and the largest multiplier of a row, or None if there is no solution.
     """
-    casadi = _casadi()
+    casadi = require_extra("casadi", "mpc", "MPC controllers")
     dense = casadi.Sparsity.dense
     sizes = {"h": dense(*hessian.shape), "a": dense(len(rows), len(slope))}
     # DAQP is an active-set method, exact up to rounding, and prints nothing.
@@ -243,11 +239,3 @@ def _quadratic_program(
         return None
     multipliers = np.abs(np.array(solution["lam_a"]).ravel())
     return np.array(solution["x"], dtype=np.float64).ravel(), float(multipliers.max(initial=0.0))
-
-
-def _casadi() -> Any:
-    try:
-        import casadi
-    except ImportError as error:
-        raise InputError('CasADi is not installed: pip install "ctxval[mpc]".') from error
-    return casadi

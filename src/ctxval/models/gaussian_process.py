@@ -16,14 +16,7 @@ from ctxval.gp.cholesky import factorise
 from ctxval.gp.regression import log_likelihood_of_outputs, most_likely
 from ctxval.models.scaling import IncrementScaling
 
-_BLOCK = 2048
-"""Points in one matrix of covariances: enough to be fast, few enough for the cache."""
-_VARIANCE = (1e-2, 1e4)
-"""Bounds of the variance, for standardised increments."""
-_NOISE = (1e-6, 1.0)
-"""Bounds of the noise variance, for standardised increments."""
-_LENGTH_SCALE = (0.1, 100.0)
-"""Bounds of the length-scales, for standardised inputs."""
+_BLOCK = 2048  # points in one matrix of covariances: enough to be fast, few enough for the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +95,13 @@ class GaussianProcessModel(ShortRepr):
         rows = np.random.default_rng(seed).permutation(len(data))[:points]
         Z, Y = scaling.inputs(data.x, data.u)[rows], scaling.targets(data)[rows]
         with single_threaded():
-            covariance, noise = _most_likely(Z, Y, iterations)
+            # Bounds of the variance, the noise variance and the length-scales, of standardised pairs and increments.
+            boxes = [(1e-2, 1e4), (1e-6, 1.0), *[(0.1, 100.0)] * Z.shape[1]]
+            bounds = [(float(np.log(low)), float(np.log(high))) for low, high in boxes]
+            start = np.log([1.0, 1e-3, *[3.0] * Z.shape[1]])
+            theta = most_likely(lambda t: log_likelihood(t, Z, Y), start[None], bounds, iterations=iterations)
+            variance, noise, *length_scales = np.exp(theta).tolist()
+            covariance = SquaredExponential(variance, np.array(length_scales))
             return cls.conditioned(covariance, noise, Z, Y, scaling, data)
 
     @classmethod
@@ -139,17 +138,6 @@ class GaussianProcessModel(ShortRepr):
         """Return ``k(rows, centres) @ columns``."""
         blocks = [rows[i : i + _BLOCK] for i in range(0, max(1, len(rows)), _BLOCK)]
         return np.concatenate([self.covariance(block, self.centres) @ columns for block in blocks])
-
-
-def _most_likely(Z: Array, Y: Array, iterations: int) -> tuple[SquaredExponential, float]:
-    """Return the covariance and the noise that make standardised outputs ``(M, n)`` most likely."""
-    boxes = [_VARIANCE, _NOISE, *[_LENGTH_SCALE] * Z.shape[1]]
-    bounds = [(float(np.log(low)), float(np.log(high))) for low, high in boxes]
-    start = np.log([1.0, 1e-3, *[3.0] * Z.shape[1]])
-
-    found = most_likely(lambda theta: log_likelihood(theta, Z, Y), start[None], bounds, iterations=iterations)
-    variance, noise, *length_scales = np.exp(found).tolist()
-    return SquaredExponential(variance, np.array(length_scales)), noise
 
 
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:

@@ -10,8 +10,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
-_LARGEST_CONDITION = 1e8
-"""Largest condition number, half of the digits of a double; beyond it rounding and noise determine the weights."""
+_LARGEST_CONDITION = 1e8  # half of the digits of a double; beyond it rounding and noise determine the weights
 
 
 @part()

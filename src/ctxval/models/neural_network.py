@@ -11,6 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
+from ctxval._util.extras import require_extra
 from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
@@ -109,12 +110,7 @@ class FeedforwardReLU(ShortRepr):
 
 def _trained(data: Transitions, scaling: IncrementScaling, hidden: tuple[int, ...], seed: int, iterations: int) -> Any:
     """Return a fitted MLPRegressor."""
-    try:
-        from sklearn.exceptions import ConvergenceWarning
-        from sklearn.neural_network import MLPRegressor
-    except ImportError as error:
-        raise InputError('scikit-learn is not installed: pip install "ctxval[cases]".') from error
-    regressor = MLPRegressor(
+    regressor = require_extra("sklearn.neural_network", "cases", "learned networks").MLPRegressor(
         hidden_layer_sizes=hidden,
         solver="lbfgs",
         alpha=1e-6,  # almost no penalty, because so few weights do not overfit thousands of transitions
@@ -123,5 +119,6 @@ def _trained(data: Transitions, scaling: IncrementScaling, hidden: tuple[int, ..
         random_state=seed,
     )
     with single_threaded(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # stopping at the limit of iterations is intended
+        ignored = require_extra("sklearn.exceptions", "cases", "learned networks").ConvergenceWarning
+        warnings.simplefilter("ignore", ignored)  # stopping at the limit of iterations is intended
         return regressor.fit(scaling.inputs(data.x, data.u), scaling.targets(data))

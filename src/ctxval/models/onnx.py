@@ -45,7 +45,8 @@ class Onnx(ShortRepr):
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
-        output = self.network(*self._arguments(x, u))
+        pair = (x, u) if len(self.network.widths) == 2 else (np.concatenate(_paired(x, u), axis=-1),)
+        output = self.network(*pair)
         if output.shape[-1] != x.shape[-1]:
             raise ShapeError(
                 f"the network must return as many states as it takes, {x.shape[-1]}, got {output.shape[-1]}."
@@ -59,11 +60,6 @@ class Onnx(ShortRepr):
     def describe(self) -> dict[str, Any]:
         """Return what identifies this model in a store."""
         return {**self.network.describe(), "increments": self.increments}
-
-    def _arguments(self, x: Array, u: Array) -> tuple[Array, ...]:
-        if len(self.network.widths) == 2:
-            return x, u
-        return (np.concatenate(_paired(x, u), axis=-1),)
 
 
 def _paired(x: Array, u: Array) -> tuple[Array, Array]:

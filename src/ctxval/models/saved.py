@@ -27,10 +27,7 @@ from ctxval.models.scaling import IncrementScaling
 _FORMAT = "ctxval model"
 _SCALING = ("shift_in", "scale_in", "shift_out", "scale_out")
 _DATA = ("x", "u", "x_next")
-_MOST_LAYERS = 100
-
-_CORRECTED = "corrected_"
-"""Before the names of the arrays of the model that a correction belongs to."""
+_CORRECTED = "corrected_"  # before the names of the arrays of the model that a correction belongs to
 
 SavedModel = Linear | FeedforwardReLU | GaussianProcessModel | Corrected
 """The models that can be written to a file."""
@@ -124,8 +121,8 @@ def read_refined(source: str | Path, before: Model | None) -> SavedModel:
         data = stored_transitions(arrays)
         if about["kind"] != "Corrected":
             return _plain_model(arrays, about["kind"], data)
-        own = about.get("corrects")
-        corrected = before if own is None else _plain_model(_Prefixed(arrays), own, None)
+        kind = about.get("corrects")
+        corrected = before if kind is None else _plain_model(_Prefixed(arrays), kind, None)
         if corrected is None:
             raise InputError("it has a correction alone, without the model that is corrected: use read_refined")
         linearised = about.get("linearised")
@@ -164,7 +161,7 @@ def _plain_model(arrays: Archive | _Prefixed, kind: str, data: Transitions | Non
     scaling = IncrementScaling(*(arrays.numbers(name) for name in _SCALING))
     if kind == "FeedforwardReLU":
         count = sum(name.startswith("weights_") for name in arrays.names)
-        layers = range(min(count, _MOST_LAYERS))
+        layers = range(min(count, 100))
         weights, biases = ([arrays.numbers(f"{name}_{i}") for i in layers] for name in ("weights", "biases"))
         return FeedforwardReLU(weights, biases, scaling, data)
     covariance = SquaredExponential(float(arrays.numbers("variance")), arrays.numbers("length_scales"))
@@ -209,5 +206,5 @@ def _arrays(model: Model) -> dict[str, Any]:
     if isinstance(model, FeedforwardReLU):
         layers = {f"weights_{i}": weight for i, weight in enumerate(model.weights)}
         return scaling | layers | {f"biases_{i}": bias for i, bias in enumerate(model.biases)}
-    found = {"variance": model.covariance.variance, "length_scales": model.covariance.length_scales}
-    return scaling | found | {"centres": model.centres, "weights": model.weights}
+    covariance = {"variance": model.covariance.variance, "length_scales": model.covariance.length_scales}
+    return scaling | covariance | {"centres": model.centres, "weights": model.weights}

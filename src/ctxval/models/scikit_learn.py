@@ -14,12 +14,9 @@ from ctxval.core.model import central_differences
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.regressors import smooth_map
-from ctxval.models.smooth_maps import SmoothMap, jacobian
+from ctxval.models.smooth_maps import SmoothMap
 
-_BLOCK = 1024
-"""Number of rows in one call of a formula: enough to be fast, few enough for the cache."""
-_AGREEMENT = 1e-4
-"""Largest relative difference of a formula from what the regressor predicts."""
+_BLOCK = 1024  # rows in one call of a formula: enough to be fast, few enough for the cache
 
 
 @part()
@@ -79,7 +76,7 @@ class ScikitLearn(ShortRepr):
         rows = _pairs(x, u)
         if formula.constant:
             rows, batch = np.zeros((1, self.features)), ()
-        whole = np.concatenate([jacobian(formula, block) for block in _blocks(rows)])
+        whole = np.concatenate([formula.jacobian(block) for block in _blocks(rows)])
         _require_states(whole, n)
         whole = whole.reshape(*batch, *whole.shape[1:])
         A, B = whole[..., :n], whole[..., n:]
@@ -96,15 +93,13 @@ class ScikitLearn(ShortRepr):
         The formula gives what ``predict`` gives, without its checks, which take longer than the formula on few rows.
         """
         finite: Mask = np.asarray(np.isfinite(rows).all(axis=-1, keepdims=True))
-        if finite.all():
-            return self._predicted_finite(rows)
-        return np.where(finite, self._predicted_finite(np.where(finite, rows, 0.0)), np.nan)
-
-    def _predicted_finite(self, rows: Array) -> Array:
+        complete = rows if finite.all() else np.where(finite, rows, 0.0)
         formula = self._formula()
         if formula is None:
-            return _as_columns(self.regressor.predict(rows))
-        return np.concatenate([formula.value(block) for block in _blocks(rows)])
+            outputs = _as_columns(self.regressor.predict(complete))
+        else:
+            outputs = np.concatenate([formula.value(block) for block in _blocks(complete)])
+        return outputs if finite.all() else np.where(finite, outputs, np.nan)
 
     def _formula(self) -> SmoothMap | None:
         # It is read again each time, because a regressor may be fitted again.
@@ -144,6 +139,6 @@ def _predicts_the_same(regressor: Any, formula: SmoothMap | None, features: int)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of feature names
         predicted = _as_columns(regressor.predict(rows))
-    found = formula.value(rows)
+    values = formula.value(rows)
     scale = float(np.abs(predicted).max())
-    return found.shape == predicted.shape and np.allclose(found, predicted, rtol=_AGREEMENT, atol=_AGREEMENT * scale)
+    return values.shape == predicted.shape and np.allclose(values, predicted, rtol=1e-4, atol=1e-4 * scale)

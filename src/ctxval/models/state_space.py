@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, as_finite
+from ctxval._util.arrays import as_finite
 from ctxval._util.checked import Seconds
 from ctxval._util.registry import part
 from ctxval.errors import InputError, ShapeError
@@ -31,19 +31,13 @@ def state_space(system: Any, dt: Seconds) -> Linear:
     if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
         raise ShapeError(f"a state-space model needs A (n, n) and B (n, m), got {A.shape} and {B.shape}.")
     own = getattr(system, "dt", None)
-    if own is True:
-        return Linear(A, B)
     if not own:
-        return Linear(*_held(A, B, dt))
-    if not np.isclose(own, dt, rtol=1e-9, atol=0):
+        from scipy.linalg import expm
+
+        # For an input that is held over dt: the exponential of [[A, B], [0, 0]] dt.
+        n, m = B.shape
+        whole = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
+        return Linear(whole[:n, :n], whole[:n, n:])
+    if own is not True and not np.isclose(own, dt, rtol=1e-9, atol=0):
         raise InputError(f"dt must be that of the discrete system, {own:g} s, got {dt:g} s.")
     return Linear(A, B)
-
-
-def _held(A: Array, B: Array, dt: Seconds) -> tuple[Array, Array]:
-    """Discretise ``dx/dt = A x + B u`` for an input held over dt: the exponential of [[A, B], [0, 0]] dt."""
-    from scipy.linalg import expm
-
-    n, m = B.shape
-    whole = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
-    return whole[:n, :n], whole[:n, n:]

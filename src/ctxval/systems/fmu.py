@@ -17,6 +17,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import Seconds
+from ctxval._util.extras import require_extra
 from ctxval._util.files import require_regular_file
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
@@ -223,10 +224,7 @@ def _clean(idle: dict[int, list[_Process]], unpacked: TemporaryFolder, owner: in
 
 def _unpacked(path: Path) -> tuple[Any, TemporaryFolder]:
     """Return the model description and a new folder with the FMU's content."""
-    try:
-        import fmpy
-    except ImportError as error:
-        raise InputError('FMPy is not installed: pip install "ctxval[fmu]".') from error
+    fmpy = require_extra("fmpy", "fmu", "FMUs")
     try:
         require_regular_file(path)
         description = fmpy.read_model_description(str(path))

@@ -11,6 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, as_floats
 from ctxval._util.checked import NonNegativeInt, Seconds
+from ctxval._util.extras import require_extra
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
@@ -122,10 +123,7 @@ class Gymnasium(ShortRepr):
             self._idle.pop().close()
 
     def _made(self) -> Any:
-        try:
-            import gymnasium
-        except ImportError as error:
-            raise InputError('gymnasium is not installed: pip install "ctxval[mujoco]".') from error
+        gymnasium = require_extra("gymnasium", "mujoco", "environments")
         if not isinstance(self.environment, str):
             return self.environment(**{**self.options, **self._files})
         try:
