@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from ctxval._util.checked import Probability, checked
 from ctxval._util.registry import Registry
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.sample import Sample
@@ -82,7 +82,7 @@ KINDS = KindRegistry()
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(ShortRepr):
     """Options of the built-in kinds in one record, for :func:`certify`; each kind uses those that are its own.
 
     Attributes:
@@ -97,7 +97,6 @@ class Options:
     discard: int | None = None
     resolution: float = RESOLUTION
     remarks: tuple[str, ...] = ()
-    __repr__ = record
 
 
 @checked
