@@ -319,7 +319,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "models.ScikitLearn": scikit_learn,
     "models.SquaredExponential": lambda: models.SquaredExponential(2.0, np.arange(1.0, 9.0)),
     "controllers.AffineFeedback": lambda: controllers.LQR([1, 1], [1], limits=2.0).design(TASK, LINEAR),
-    "controllers.BoundOnnxPolicy": lambda: controllers.OnnxPolicy(network()).design(TASK, LINEAR),
+    "controllers.BoundPolicy": lambda: controllers.OnnxPolicy(network()).design(TASK, LINEAR),
     "controllers.ControllerFile": lambda: controllers.ControllerFile(
         controllers.LQR([1, 1], [1]).design(TASK, LINEAR), 0.02, {"x0": "m", "x1": "m/s"}, {"u0": "N"}
     ),
@@ -508,7 +508,7 @@ EXACT = {
     "states=(25, 2) all 0, limits=Limits(low=[-2], high=[2]))",
     "controllers.LQR": "LQR(cost=QuadraticCost(Q=diag(1, 0.1), R=diag(0.01), Q_final=diag(1, 0.1)), "
     "limits=Limits(low=[-1], high=[2]))",
-    "controllers.Policy": "Policy(policy=policy, batched=True, limits=2)",
+    "controllers.Policy": "Policy(policy=policy, batched=True, limits=Limits(low=-2, high=2))",
     "certificates.Certificate": "Certificate('audit', upper_bound=0.3001, confidence=0.95, volume=0.01, trials=300)\n"
     "  99 % of the tasks have at most 0.30004.\n"
     "  assumptions: 2",

@@ -287,11 +287,10 @@ def _covers(node: ast.expr, place: tuple[int | None, int | None, int | None, int
 class _WithoutImports(ast.NodeTransformer):
     """Removes imports and the texts that stand alone as statements, which document what is beside them."""
 
-    def visit_Import(self, node: ast.Import) -> None:
+    def visit_Import(self, node: ast.AST) -> None:
         """Remove an import."""
 
-    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
-        """Remove an import."""
+    visit_ImportFrom = visit_Import  # noqa: N815
 
     def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
         """Remove a docstring."""

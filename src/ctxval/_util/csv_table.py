@@ -30,11 +30,9 @@ class CsvTable:
     """The cells of a CSV file.
 
     Attributes:
-        path: the file.
         names: the names of the columns; a column without a name has an empty one.
 
     Args:
-        path: the file.
         most: largest size of the file in bytes.
     """
 

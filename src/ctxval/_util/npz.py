@@ -31,7 +31,6 @@ class Archive:
     The message of every error is only the reason; the caller puts the name of the file before it.
 
     Args:
-        content: the bytes of the file.
         most: largest total size in bytes of the arrays that are read, with each number as a float64.
     """
 

@@ -26,9 +26,6 @@ class OnnxNetwork(ShortRepr):
     Its inputs and its output have one row for each task, shapes ``(N, k)``. If the file fixes N to 1, or the shapes are
     ``(k,)``, the network is called row by row. An ONNX file holds no code.
 
-    Args:
-        source: the file, or its bytes.
-
     Attributes:
         widths: the number of values in a row of each input; None if the file leaves it open.
         width: the number of values in a row of the output; None if the file leaves it open.

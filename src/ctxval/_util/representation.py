@@ -99,11 +99,6 @@ class ShortRepr:
         return lines(line(type(self).__name__, _VALUE), *(f"{name}: {shown(value)}" for name, value in fields.items()))
 
 
-def record(owner: Any) -> str:
-    """Return what :class:`ShortRepr` shows of an object."""
-    return ShortRepr.__repr__(owner)
-
-
 def options(owner: object) -> dict[str, Any]:
     """Return the arguments of the constructor that an object keeps under their own names."""
     kept = getattr(owner, "__dict__", {})

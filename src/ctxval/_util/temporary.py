@@ -12,11 +12,7 @@ from ctxval._util.locks import FileLock
 
 
 class TemporaryFolder:
-    """A new temporary folder, which only this process removes.
-
-    Attributes:
-        path: the path of the folder.
-    """
+    """A new temporary folder, which only this process removes."""
 
     def __init__(self) -> None:
         for owned in Path(tempfile.gettempdir()).glob("ctxval-*/lock"):

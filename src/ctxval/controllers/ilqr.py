@@ -56,8 +56,7 @@ class ILQR(ShortRepr):
         Q_final: weight of the last state; Q by default.
         iterations: largest number of steps for one task.
         tolerance: the iteration stops if the next step would lower the cost by less than this fraction of it.
-        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
-            rows ``[low, high]``, one for each input.
+        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
     batched = True

@@ -30,8 +30,7 @@ class LQR(ShortRepr):
         Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
         R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
         Q_final: weight of the last state; Q by default.
-        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
-            rows ``[low, high]``, one for each input.
+        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
     batched = True
@@ -75,8 +74,7 @@ class StationaryLQR(ShortRepr):
     Args:
         Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
         R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
-        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
-            rows ``[low, high]``, one for each input.
+        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
     batched = True

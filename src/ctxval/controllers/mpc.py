@@ -42,8 +42,7 @@ class MPC(ShortRepr):
         R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
         Q_final: weight of the last predicted state; Q by default.
         steps: number of predicted steps.
-        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
-            rows ``[low, high]``, one for each input.
+        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
         state_limits: limits of the states, in the same forms; infinite for states without limits.
         violation_cost: cost of exceeding the state limits by 1, for each predicted step; None makes them hard.
         iterations: largest number of quadratic programs for one input.

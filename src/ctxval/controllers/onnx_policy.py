@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.core.controller import Limits, LimitsLike
+from ctxval.core.controller import BoundPolicy, Limits, LimitsLike
 from ctxval.core.model import Model
 from ctxval.core.task import Task
 from ctxval.errors import InputError
@@ -34,8 +33,7 @@ class OnnxPolicy(ShortRepr):
             the task; by default the observations are the states.
         scale: factor of the network's outputs, a number or ``(m,)``: with a scale of 5 a policy in ``[-1, 1]`` drives
             a motor of 5 N m.
-        limits: limits to which the inputs are clipped: one number h for -h to h, ``Limits(low=, high=)``, a mapping of
-            low and high, or rows ``[low, high]``, one for each input.
+        limits: limits to which inputs are clipped, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
     batched = True
@@ -57,29 +55,15 @@ class OnnxPolicy(ShortRepr):
                 f"a policy must have one input, the observations, but the network has {', '.join(self.network.names)}."
             )
 
-    def design(self, task: Task, model: Model) -> BoundOnnxPolicy:
+    def inputs(self, t: int, x: Array, task: Task) -> Array:
+        """Return the inputs ``(..., m)`` at step t before they are clipped."""
+        observations: Any = x if self.observe is None else self.observe(t, x, task)
+        return self.network(np.asarray(observations, dtype=np.float64)) * self.scale
+
+    def design(self, task: Task, model: Model) -> BoundPolicy:
         """Return the policy bound to the task."""
-        return BoundOnnxPolicy(self, task)
+        return BoundPolicy(self.inputs, task, self.limits)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this synthesizer in a store."""
         return {name: getattr(self, name) for name in ("network", "observe", "scale", "limits")}
-
-
-@dataclass(frozen=True, eq=False)
-class BoundOnnxPolicy(ShortRepr):
-    """The controller of :class:`OnnxPolicy` for one task or a batch."""
-
-    settings: OnnxPolicy
-    task: Task
-
-    def __call__(self, t: int, x: Array) -> Array:
-        """Return the inputs ``(..., m)`` at step t."""
-        observe, limits = self.settings.observe, self.settings.limits
-        observations: Any = x if observe is None else observe(t, x, self.task)
-        u = self.settings.network(np.asarray(observations, dtype=np.float64)) * self.settings.scale
-        return u if limits is None else Limits.of(limits, u.shape[-1]).clip(u)
-
-    def __getitem__(self, index: int) -> BoundOnnxPolicy:
-        """Return the controller of one task of the batch."""
-        return BoundOnnxPolicy(self.settings, self.task[index])

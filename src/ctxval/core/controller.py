@@ -198,8 +198,7 @@ class Policy(ShortRepr):
     Args:
         policy: function of the step's index, the states ``(..., n)`` and the task; returns the inputs ``(..., m)``.
         vectorized: False if the policy takes only one state ``(n,)`` at a time.
-        limits: limits to which the inputs are clipped: one number h for -h to h, ``Limits(low=, high=)``, a mapping of
-            low and high, or rows ``[low, high]``, one for each input.
+        limits: limits to which inputs are clipped, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
     def __init__(
@@ -215,7 +214,7 @@ class Policy(ShortRepr):
 
     def design(self, task: Task, model: Model) -> Controller:
         """Return the policy bound to the task; the model is not used."""
-        return _BoundPolicy(self.policy, task, self.limits)
+        return BoundPolicy(self.policy, task, self.limits)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this synthesizer in a store."""
@@ -223,17 +222,18 @@ class Policy(ShortRepr):
 
 
 @dataclass(frozen=True, eq=False)
-class _BoundPolicy(ShortRepr):
-    """A policy for one task or a batch; unlike a lambda it can be pickled for another process."""
+class BoundPolicy(ShortRepr):
+    """The controller of a policy for one task or a batch; unlike a lambda it can be pickled for another process."""
 
     policy: Callable[[int, Array, Task], Array]
     task: Task
     limits: Limits | None
 
     def __call__(self, t: int, x: Array) -> Array:
+        """Return the inputs ``(..., m)`` at step t, within the limits."""
         u = np.asarray(self.policy(t, x, self.task), dtype=np.float64)
         return u if self.limits is None else Limits.of(self.limits, u.shape[-1]).clip(u)
 
-    def __getitem__(self, index: int) -> _BoundPolicy:
+    def __getitem__(self, index: int) -> BoundPolicy:
         """Return the controller of one task of the batch."""
-        return _BoundPolicy(self.policy, self.task[index], self.limits)
+        return BoundPolicy(self.policy, self.task[index], self.limits)

@@ -37,8 +37,6 @@ class ControllerFile(ShortRepr):
     """A controller that was read from a file.
 
     Attributes:
-        controller: the feedback for one task.
-        dt: length of a step, seconds.
         states, inputs: the names of the states and inputs with their units, in the order of the components.
     """
 
@@ -56,7 +54,6 @@ def write_controller(
     Args:
         path: the file; its suffix, ``.json`` or ``.npz``, determines the format.
         controller: affine feedback, as LQR and iLQR design it.
-        dt: length of a step, seconds.
         states, inputs: names and units of the components; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
     """
     if not isinstance(controller, AffineFeedback):
@@ -97,8 +94,6 @@ def write_task(path: str | Path, task: Task, *, states: Names | None = None) -> 
     """Write one task as JSON: its initial state, reference, horizon and time step.
 
     Args:
-        path: the file; it ends in ``.json``.
-        task: one task.
         states: names and units of the states; ``x0, x1, ...`` by default.
     """
     if task.batch_shape:

@@ -25,7 +25,6 @@ class Experiment:
 
     Attributes:
         name: a short name for files and displays.
-        validation: the map p -> d(p).
         budget: the default number of executions of S.
         threshold: the default threshold tau; without a threshold there is no verdict.
         truth: a function that finds d*, for simulated systems; None if there is none.

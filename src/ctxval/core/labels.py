@@ -32,10 +32,6 @@ class Labels(ShortRepr):
         """Return the names of n states and m inputs with their units.
 
         They are these labels, else the names that the system itself has, else ``x0, x1, ...`` and ``u0, u1, ...``.
-
-        Args:
-            system: the system, whose attributes ``states`` and ``inputs`` may be names, or names with units.
-            states, inputs: the numbers of states and of inputs.
         """
         return (
             _named(self.states, names_of(system, "states"), "x", states),

@@ -94,8 +94,6 @@ def central_differences(step: Step, x: Array, u: Array, precision: float | None 
     wherever a model uses ``abs``, ``maximum`` or a branch.
 
     Args:
-        step: the model's step, which takes batches.
-        x, u: states and inputs.
         precision: the relative rounding of the model's numbers; None to find it out.
     """
     n, width, batch = x.shape[-1], x.shape[-1] + u.shape[-1], x.shape[:-1]

@@ -18,13 +18,9 @@ from ctxval.errors import InputError, ShapeError
 
 @dataclass(frozen=True, eq=False)
 class Plan(ShortRepr):
-    """Everything that is known about a task before S is executed; one task or a batch.
+    """What is known of a task g_p before S is executed: its controller pi(x; g_p, M) and the closed loop on M.
 
-    Attributes:
-        parameters: p.
-        task: the task g_p.
-        controller: pi(x; g_p, M).
-        model_trajectory: the closed loop on the model.
+    It may also be a batch of tasks.
     """
 
     parameters: Parameters
@@ -40,13 +36,7 @@ class Plan(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Outcome(ShortRepr):
-    """A plan after the execution of S.
-
-    Attributes:
-        plan: the plan of the task.
-        system_trajectory: the closed loop on the system.
-        distance: d(p).
-    """
+    """A plan after the execution of S."""
 
     plan: Plan
     system_trajectory: Trajectory

@@ -17,11 +17,6 @@ def rollout(step: Step, controller: Controller, task: Task) -> Trajectory:
     """Run a controller in closed loop with ``x_next = step(x, u)`` over the task's horizon.
 
     A loop that diverges continues with NaN and infinity; it does not stop the other loops of its batch.
-
-    Args:
-        step: ``x_next = step(x, u)``.
-        controller: ``u = controller(t, x)``.
-        task: one task, or a batch.
     """
     with np.errstate(all="ignore"):
         x = np.array(task.initial_state)

@@ -44,14 +44,10 @@ class Flips:
 
 
 def flips(points: Array, inputs: Sequence[Array]) -> Flips | None:
-    """Return how much the controllers of neighbouring tasks differ; None if no tasks are neighbours.
+    """Return how much the inputs on M, ``(H, m)``, of neighbouring tasks ``(N, d)`` differ; None if there are none.
 
     A pair flips if the inputs differ at some time by more than half of their range, and as signals by more than half of
     the sum of their norms. Two controllers that only leave a limit at another time are alike.
-
-    Args:
-        points: tasks, points of the unit cube ``(N, d)``.
-        inputs: the inputs on M of each task, shape ``(H, m)``.
     """
     near = scipy.spatial.KDTree(points / np.sqrt(points.shape[1])).query_pairs(NEAR)
     pairs = [(i, j) for i, j in sorted(near) if inputs[i].shape == inputs[j].shape and inputs[i].size]
@@ -89,7 +85,6 @@ def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> Satu
 
     Args:
         inputs: the inputs of each task, shape ``(H, m)``.
-        synthesizer: the synthesizer.
     """
     signals = [signal for signal in inputs if signal.size]
     if not signals:

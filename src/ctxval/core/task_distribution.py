@@ -98,9 +98,7 @@ class ByParameter:
     """Independent task parameters: some with a distribution that is truncated to its bounds, all others uniform.
 
     Attributes:
-        low, high: the bounds of the task space, shape ``(d,)``.
         columns: the columns of each parameter that has a distribution.
-        distributions: the distribution of each of these parameters.
     """
 
     low: Array
@@ -164,7 +162,6 @@ class BySampler:
     """Tasks that a function draws.
 
     Attributes:
-        low, high: the bounds of the task space, shape ``(d,)``.
         sampler: ``(rng, n)`` -> n independent tasks, rows ``(n, d)`` in the units of the task space.
     """
 

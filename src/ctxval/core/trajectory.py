@@ -169,7 +169,6 @@ class Trajectory:
         """Write one trajectory as CSV. The last row has no inputs.
 
         Args:
-            path: the file.
             states, inputs: names of the columns of states and inputs; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
                 The column of the times is ``t``.
         """
@@ -192,7 +191,6 @@ class Trajectory:
         in the last row. Columns are separated by commas, or by semicolons or tabs, with which decimal commas are read.
 
         Args:
-            path: the file.
             states, inputs: names of the columns, with or without units. If the file has none of the names, the
                 numbered columns ``x0, x1, ...`` and ``u0, u1, ...`` are read.
             most_rows: largest number of rows below the header; a file with more rows is refused. None allows any

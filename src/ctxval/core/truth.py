@@ -35,13 +35,7 @@ _PROBES = 16
 
 @dataclass(frozen=True, eq=False)
 class Truth(ShortRepr):
-    """The largest distance over the task space that a method found.
-
-    Attributes:
-        distance: the largest distance d*.
-        parameters: the parameters of a task that has this distance.
-        method: a description of the method that found it.
-    """
+    """The largest distance over the task space that a method found."""
 
     distance: float
     parameters: Parameters
@@ -53,8 +47,6 @@ def grid_truth(validation: Validation, per_axis: AxisPoints = 2001, refinements:
     """Return the maximum on a dense grid, refined around its best points. S is executed for each grid point.
 
     Args:
-        validation: the map p -> d(p).
-        per_axis: number of grid points on each axis.
         refinements: number of refinements, each with a finer grid around the best points.
     """
     count = per_axis**validation.space.dimension + 8 * refinements * _FINER**validation.space.dimension
@@ -102,10 +94,7 @@ def search_truth(
     when the two best repeats agree. S is executed some hundred thousand times, in batches.
 
     Args:
-        validation: the map p -> d(p).
-        seed: seed of the random numbers.
         agreement: relative difference of the two best repeats at which the search ends.
-        repeats: largest number of repeats.
         population: number of points in a generation, for each dimension.
         generations: largest number of generations in one repeat.
         climbs: number of climbs from random starts in one repeat; each starts at the best of sixteen random points.
@@ -208,10 +197,8 @@ def cached_truth(
     some others give the stored distances again.
 
     Args:
-        validation: the map p -> d(p).
         compute: a function that finds the truth; its settings, such as those of
             ``functools.partial(search_truth, seed=1)``, are part of the hash.
-        folder: the folder of the files; it is created if it does not exist.
     """
     # The signature adds the default values, which the description of a function leaves out.
     method = [describe(compute), str(inspect.signature(compute))]

@@ -176,8 +176,6 @@ class Validation:
         """Check that a trajectory is a complete and finite execution of a plan; return it.
 
         Args:
-            plan: the plan of the task.
-            trajectory: the result of the system, or a recording.
             start_tolerance: replaces the start tolerance of this validation.
 
         Raises:
@@ -197,11 +195,6 @@ class Validation:
         """Check that a trajectory is an execution of a plan, as :meth:`require` does, and measure its distance.
 
         This is the single check for all executions: those of a system, those of workers, and recordings of users.
-
-        Args:
-            plan: the plan of the task.
-            trajectory: the result of the system, or a recording.
-            start_tolerance: replaces the start tolerance of this validation.
 
         Raises:
             ExecutionError: if it is not a complete and finite execution.

@@ -20,8 +20,6 @@ class Corrected(ShortRepr):
     """The model ``M'(x, u) = M(x, u) + r(x, u)`` of a model M and a correction r.
 
     Args:
-        model: the model M.
-        correction: the correction r.
         linearised: ``"corrected"`` for the Jacobian of M', or ``"model"`` for that of M. With the second one, a
             synthesizer that linearises once, such as LQR, designs nearly the controllers that it designed on M: the
             Jacobian of M' at one point may say less of the tasks than a linear model that was fitted to all of them.
@@ -62,7 +60,6 @@ class Refined(ShortRepr):
     small at them. What learns from executions therefore takes the residual of the model before.
 
     Args:
-        model: the refined model.
         data: all transitions that are known, those of the executions of earlier models included.
         before: the model that was refined; of a model that was refined before, the first one.
     """

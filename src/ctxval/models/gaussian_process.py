@@ -24,7 +24,6 @@ class SquaredExponential(ShortRepr):
     """``k(z, z') = v exp(-1/2 sum_j ((z_j - z'_j) / l_j)^2)``: rigid-body dynamics are smooth.
 
     Attributes:
-        variance: v.
         length_scales: l, shape ``(k,)``.
     """
 
@@ -86,9 +85,7 @@ class GaussianProcessModel(ShortRepr):
         """Condition on recorded transitions, with the most likely hyperparameters (eq. 5.8, summed over the states).
 
         Args:
-            data: the transitions.
             points: how many of them, drawn at random, it is conditioned on; the effort grows with their cube.
-            seed: of the draw.
             iterations: of the search for the hyperparameters, at most.
         """
         scaling = IncrementScaling.of(data)

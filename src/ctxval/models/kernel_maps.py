@@ -42,7 +42,6 @@ class KernelSum(SmoothMap):
     """The map ``sum_i k(z, x_i) w_i``.
 
     Attributes:
-        kernel: k.
         centres: the x_i, shape ``(M, k)``.
         weights: the w_i, shape ``(M, o)``.
     """

@@ -43,12 +43,7 @@ class Linear(ShortRepr):
 
     @classmethod
     def fit(cls, data: Transitions, *, intercept: bool = True) -> Linear:
-        """Fit A, B and c by least squares on recorded transitions.
-
-        Args:
-            data: the recorded transitions.
-            intercept: whether c is fitted; otherwise it is zero.
-        """
+        """Fit A, B and c by least squares on recorded transitions; without an intercept, c is zero."""
         n, m = data.x.shape[1], data.u.shape[1]
         if not all(np.isfinite(array).all() for array in (data.x, data.u, data.x_next)):
             raise InputError("a linear model needs finite transitions, got NaN or infinity.")

@@ -54,13 +54,7 @@ class FeedforwardReLU(ShortRepr):
     def from_sklearn(
         cls, regressor: Any, scaling: IncrementScaling, data: Transitions | None = None
     ) -> FeedforwardReLU:
-        """Return the network of a fitted ``sklearn.neural_network.MLPRegressor`` as a model that does not need sklearn.
-
-        Args:
-            regressor: the fitted regressor, with ReLU units.
-            scaling: the scaling of the state-input pair and of the increment.
-            data: the transitions that the regressor was fitted on, if known.
-        """
+        """Return a fitted ``sklearn.neural_network.MLPRegressor`` as a model that does not need scikit-learn."""
         if regressor.activation != "relu" or regressor.out_activation_ != "identity":
             raise InputError(f"the network must have ReLU units, got {regressor.activation!r}.")
         return cls(regressor.coefs_, regressor.intercepts_, scaling, data)
@@ -79,11 +73,8 @@ class FeedforwardReLU(ShortRepr):
         """Train networks on recorded transitions with scikit-learn's MLPRegressor and L-BFGS; return the best one.
 
         Args:
-            data: the recorded transitions.
             hidden: number of units in each hidden layer.
-            seed: seed of the initial weights.
             restarts: number of networks to train; the one with the smallest loss on the data is returned.
-            iterations: largest number of iterations of one training.
         """
         scaling = IncrementScaling.of(data)
         seeds = np.random.SeedSequence(seed).generate_state(restarts)

@@ -23,7 +23,6 @@ def state_space(system: Any, dt: Seconds) -> Linear:
     Args:
         system: the system, with A, B and its own dt: 0 or None for a continuous system, True for a discrete system
             with any time step.
-        dt: length of a step of the tasks, seconds.
     """
     if not all(hasattr(system, name) for name in ("A", "B")):
         raise InputError(f"a state-space model must have A and B, got {system!r}.")

@@ -176,14 +176,8 @@ class Store:
     ) -> bool:
         """Store trials with new distances, and the description of the new distance, in one transaction.
 
-        Args:
-            trials: the trials with their new distances.
-            description: the description of the experiment with the new distance.
-            change: the entry for the history, with the previous distances.
-            seen: the :meth:`signature` of the store when the trials were read.
-
-        Returns:
-            False if the store has changed since then, so that nothing is stored; True otherwise.
+        Returns False, and stores nothing, if the :meth:`signature` of the store is not the one that was seen when the
+        trials were read. The change, for the history, has the previous distances.
         """
         with self._database.transaction():
             if self.signature() != seen:
@@ -239,14 +233,10 @@ class Store:
         )
 
     def begin_attempt(self, trial: Trial, *, changes: int | None = None) -> None:
-        """Record one more attempt to execute a trial, before the execution starts.
-
-        Args:
-            trial: the trial, with this attempt counted.
-            changes: the number of changes that the campaign knows; None skips the check.
+        """Record one more attempt, which the trial counts, before the execution starts.
 
         Raises:
-            StoreMismatchError: if the store has another number of changes.
+            StoreMismatchError: if the store has another number of changes than ``changes``; None skips the check.
         """
         with self._database.transaction():
             self._require_unchanged(changes)

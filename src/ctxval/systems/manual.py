@@ -20,7 +20,6 @@ class Manual(ShortRepr):
 
     Attributes:
         states, inputs: names of the components with their units, for files.
-        dt: length of a step, seconds.
     """
 
     manual = True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -99,7 +99,7 @@ class MuJoCo(ShortRepr):
         ended = execution.failure or trajectory.ended
         return Trajectory(trajectory.times, trajectory.states, trajectory.inputs, ended)
 
-    def _started(self, task: Task) -> _Simulations:
+    def _started(self, task: Task) -> _Batch | _Loop:
         """Return one simulation for each task, in its initial state."""
         nq, nv, sites = self._model.nq, self._model.nv, self._coordinates[0].size * self._coordinates[1].size
         states = task.initial_state.reshape(-1, task.initial_state.shape[-1])
@@ -114,7 +114,7 @@ class MuJoCo(ShortRepr):
             self._require_located(states, simulations)
         return simulations
 
-    def _require_located(self, states: Array, simulations: _Simulations) -> None:
+    def _require_located(self, states: Array, simulations: _Batch | _Loop) -> None:
         simulations.locate()
         given, actual = (array[:, self._model.nq + self._model.nv :] for array in (states, self._observed(simulations)))
         misses = np.abs(given - actual).max(axis=1)
@@ -125,7 +125,7 @@ class MuJoCo(ShortRepr):
                 f"got {given[worst].tolist()}; state(qpos, qvel) returns the whole state."
             )
 
-    def _observed(self, simulations: _Simulations) -> Array:
+    def _observed(self, simulations: _Batch | _Loop) -> Array:
         sites, axes = self._coordinates
         positions = simulations.site_positions[:, sites, axes]
         return np.concatenate([simulations.qpos, simulations.qvel, positions.reshape(len(positions), -1)], axis=1)
@@ -134,7 +134,7 @@ class MuJoCo(ShortRepr):
 class _Execution:
     """The simulations of a batch of tasks as a step function; it keeps their state between steps."""
 
-    def __init__(self, system: MuJoCo, simulations: _Simulations) -> None:
+    def __init__(self, system: MuJoCo, simulations: _Batch | _Loop) -> None:
         self.system, self.simulations = system, simulations
         self.healthy: Mask = np.ones(len(simulations.qpos), dtype=bool)
         self.steps = 0
@@ -166,26 +166,11 @@ class _Execution:
             self.healthy &= ~failed
 
 
-class _Simulations(Protocol):
-    """Simulations of one model, one in each row: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``."""
-
-    qpos: Array
-    qvel: Array
-    ctrl: Array
-    site_positions: Array  # (N, nsite, 3)
-
-    @property
-    def warnings(self) -> Rows:
-        """The number of MuJoCo's warnings, by simulation and kind of warning."""
-
-    def locate(self) -> None:
-        """Compute the sites' positions."""
-
-    def advance(self, substeps: int, rows: Mask, *, locate: bool) -> None:
-        """Step the simulations in these rows, and compute their sites' positions if wanted."""
+# Simulations of one model, one in each row: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``, and the positions of
+# sites ``(N, nsite, 3)``, which are computed if they are wanted. Warnings are counted by simulation and by kind.
 
 
-def _simulations(model: Any, count: int, threads: int) -> _Simulations:
+def _simulations(model: Any, count: int, threads: int) -> _Batch | _Loop:
     try:
         return _Batch(model, count, threads)
     except ImportError:
