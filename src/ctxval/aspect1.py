@@ -35,13 +35,11 @@ from ctxval.searches import Search, by_name
 
 __all__ = ["Aspect1Report", "SimulatedTask", "check", "completion"]
 
-TASKS = 100
-"""Number of simulated tasks, unless another one is given."""
+TASKS = 100  # number of simulated tasks, unless another one is given
 SEARCH = "bayesian-optimisation"
 """The search, unless another one is given. Learned dynamics could not teach it anything, because M is known."""
 
-_NEIGHBOURS = 20
-"""Number of tasks beside which another one is planned: the worst ones and spread ones, half of each."""
+_NEIGHBOURS = 20  # number of tasks beside which another one is planned: the worst ones and spread ones, half of each
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,16 +109,10 @@ def single_threaded() -> AbstractContextManager[Any]:
 
 
 def held_means(times: Array, values: Array, edges: Array, slack: float) -> Array:
-    """Return the mean of values that hold until the next one, in each interval between two edges.
+    """Return the means ``(K, m)`` of values ``(N, m)`` that hold until the next one, between edges ``(K + 1,)``.
 
-    Args:
-        times: when each value begins, increasing, shape ``(N,)``; the first value also holds before.
-        values: shape ``(N, m)``.
-        edges: increasing, shape ``(K + 1,)``.
-        slack: a time so close to an edge is that of the edge.
-
-    Returns:
-        The means, shape ``(K, m)``.
+    The times ``(N,)`` at which values begin increase, and the first value also holds before. A time within the slack of
+    an edge is that of the edge.
     """
     first = np.maximum(np.searchsorted(times, edges[:-1] + slack, side="right") - 1, 0)
     last = np.maximum(np.searchsorted(times, edges[1:] - slack) - 1, first)

@@ -30,8 +30,7 @@ def climb(
     Args:
         starts: shape ``(..., d)``, which is the shape of the points that the function is asked about.
         scale: the size of the sum, to which the tolerances of L-BFGS-B refer.
-        iterations: the most of L-BFGS-B; its default if None.
-        evaluations: the most calls of the function; the default of L-BFGS-B if None.
+        iterations, evaluations: the most of L-BFGS-B; its defaults if None.
     """
 
     def negative(flat: Array) -> tuple[float, Array]:

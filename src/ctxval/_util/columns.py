@@ -19,8 +19,7 @@ TIMES = ("t", "time", "times", "timestamp")
 EPISODES = tuple(f"{name}{ending}" for name in ("episode", "run", "trial") for ending in ("", "_index", "_id"))
 """Names of columns that number the recordings in one table."""
 
-FAR = 3.0
-"""Largest ratio between the median time of two samples and a time step to which they are interpolated."""
+FAR = 3.0  # largest ratio between the median time of two samples and a time step to which they are interpolated
 
 
 def require_distinct(source: str, names: Sequence[str]) -> None:

@@ -22,8 +22,7 @@ from ctxval._util.files import MOST_BYTES, open_regular
 from ctxval._util.texts import unguarded
 from ctxval.errors import InputError
 
-MOST_ROW = 2**20
-"""Largest number of characters in a row."""
+MOST_ROW = 2**20  # largest number of characters in a row
 
 
 class CsvTable:

@@ -20,11 +20,9 @@ from typing import IO, Any, BinaryIO
 
 from ctxval.errors import InputError
 
-MOST_BYTES = 256 * 2**20
-"""Largest size of a file in bytes, enough for 33 million numbers of a trajectory."""
+MOST_BYTES = 256 * 2**20  # largest size of a file in bytes, enough for 33 million numbers of a trajectory
 
-MOST_JSON = 16 * 2**20
-"""Largest size of a JSON file in bytes; reading it takes twenty times as much memory."""
+MOST_JSON = 16 * 2**20  # largest size of a JSON file in bytes; reading it takes twenty times as much memory
 
 MADE_BY = "Made by ctxval"
 """What every file contains that an option of a command names, so that the next run may replace it."""

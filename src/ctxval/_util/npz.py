@@ -17,10 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ctxval._util.files import MOST_BYTES
 from ctxval.errors import InputError
-
-MOST_BYTES = 256 * 2**20
-"""Largest total size in bytes of the arrays that are read from one file, with each number as a float64."""
 
 _MOST_ARRAYS = 1000
 

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.progress import Progress as Bars
 
-_DELAY = 0.4
-"""Seconds before a stage is shown; most end sooner."""
+_DELAY = 0.4  # seconds before a stage is shown; most end sooner
 
 
 @contextmanager

@@ -88,9 +88,6 @@ class Registry(Mapping[str, Any], Generic[Made]):
         package: the package that exports the parts; the group of the entry points has the same name.
         method: the method that each part has; None if parts are plain functions.
         modules: built-in parts that are imported when they are asked for: name -> ``module:attr``.
-
-    Attributes:
-        aliases: older names of built-in parts, each with the present name.
     """
 
     def __init__(

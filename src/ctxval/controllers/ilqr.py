@@ -51,9 +51,7 @@ class ILQR(ShortRepr):
     limit get no feedback, and roll-outs are clipped. The controller clips its inputs on the model and on the system.
 
     Args:
-        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
-        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
-        Q_final: weight of the last state; Q by default.
+        Q, R, Q_final: weights of the state, the input and the last state (Q by default), as diagonals or as matrices.
         iterations: largest number of steps for one task.
         tolerance: the iteration stops if the next step would lower the cost by less than this fraction of it.
         limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.

@@ -27,9 +27,7 @@ class LQR(ShortRepr):
     are optimal as long as no limit is reached. iLQR and MPC take limits into account in the design.
 
     Args:
-        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
-        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
-        Q_final: weight of the last state; Q by default.
+        Q, R, Q_final: weights of the state, the input and the last state (Q by default), as diagonals or as matrices.
         limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
@@ -72,8 +70,7 @@ class StationaryLQR(ShortRepr):
     Limits only clip the inputs, as for :class:`LQR`.
 
     Args:
-        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
-        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
+        Q, R: weights of the state and the input, as diagonals or as matrices.
         limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 

@@ -38,9 +38,7 @@ class MPC(ShortRepr):
     ``violation_cost`` makes the state limits soft, so that there is always a solution.
 
     Args:
-        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
-        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
-        Q_final: weight of the last predicted state; Q by default.
+        Q, R, Q_final: weights of the state, the input and the last state (Q by default), as diagonals or as matrices.
         steps: number of predicted steps.
         limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
         state_limits: limits of the states, in the same forms; infinite for states without limits.
@@ -155,11 +153,11 @@ class _Problem:
         rows = G[:, self.limited].reshape(-1, steps * m)
         gap_low = (self.settings.state_limits.low - X[1:])[:, self.limited].ravel()
         gap_high = (self.settings.state_limits.high - X[1:])[:, self.limited].ravel()
-        soft = self.settings.violation_cost
+        box, gaps, soft = (low.ravel(), high.ravel()), (gap_low, gap_high), self.settings.violation_cost
         if soft is None or not len(rows):
-            solution = _quadratic_program(hessian, slope, rows, (low.ravel(), high.ravel()), (gap_low, gap_high))
+            solution = _quadratic_program(hessian, slope, rows, box, gaps)
         else:
-            solution = _softened(hessian, slope, rows, (low.ravel(), high.ravel()), (gap_low, gap_high), soft, steps)
+            solution = _softened(hessian, slope, rows, box, gaps, soft, steps)
         if solution is None:
             return None
         change, largest = solution

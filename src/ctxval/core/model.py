@@ -46,11 +46,16 @@ class Function(ShortRepr):
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         if self.vectorized or x.ndim == 1:
             return np.asarray(self.function(x, u), dtype=np.float64)
-        batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        states = rows_of(np.broadcast_to(x, (*batch, x.shape[-1])))
-        inputs = rows_of(np.broadcast_to(u, (*batch, u.shape[-1])))
-        rows = [np.asarray(self.function(xi, ui), dtype=np.float64) for xi, ui in zip(states, inputs, strict=True)]
-        return np.stack(rows).reshape(*batch, -1)
+        states, inputs = paired(x, u)
+        pairs = zip(rows_of(states), rows_of(inputs), strict=True)
+        rows = [np.asarray(self.function(xi, ui), dtype=np.float64) for xi, ui in pairs]
+        return np.stack(rows).reshape(*states.shape[:-1], -1)
+
+
+def paired(x: Array, u: Array) -> tuple[Array, Array]:
+    """Return states ``(..., n)`` and inputs ``(..., m)`` with the same batch axes."""
+    batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+    return np.broadcast_to(x, (*batch, x.shape[-1])), np.broadcast_to(u, (*batch, u.shape[-1]))
 
 
 def as_model(model: Model | Step) -> Model:
@@ -86,15 +91,12 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
 def central_differences(step: Step, x: Array, u: Array, precision: float | None = None) -> tuple[Array, Array]:
     """Return A ``(..., n, n)`` and B ``(..., n, m)`` at states ``(..., n)`` and inputs ``(..., m)`` by differences.
 
-    The steps suit the precision of the model: 6e-6 in double precision, and 5e-3 in single precision, in which smaller
-    steps would be lost in its rounding.
+    The steps suit the precision of the model, which is found out if it is not given: 6e-6 in double precision, and 5e-3
+    in single precision, in whose rounding smaller steps would be lost.
 
     All differences are taken in one batch, in blocks that fit into the processor's cache. Complex steps would halve the
     evaluations, but NumPy's complex functions take two to three times as long, and the result is silently wrong
     wherever a model uses ``abs``, ``maximum`` or a branch.
-
-    Args:
-        precision: the relative rounding of the model's numbers; None to find it out.
     """
     n, width, batch = x.shape[-1], x.shape[-1] + u.shape[-1], x.shape[:-1]
     z = np.concatenate([x, u], axis=-1).reshape(-1, width)

@@ -20,11 +20,9 @@ from ctxval.errors import InputError
 if TYPE_CHECKING:
     from ctxval.core.validation import Validation
 
-LONGEST = 1_000_000
-"""Default of the largest horizon that is planned."""
+LONGEST = 1_000_000  # default of the largest horizon that is planned
 
-_LONG = 100_000
-"""Horizon from which on the cost of a plan is stated before the first one."""
+_LONG = 100_000  # horizon from which on the cost of a plan is stated before the first one
 _stated: WeakSet[Validation] = WeakSet()
 
 

@@ -16,14 +16,11 @@ from ctxval.core.controller import Limits, Synthesizer
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 
-NEAR = 0.1
-"""Two tasks are neighbours if they are nearer than this, in diagonals of the task space."""
+NEAR = 0.1  # two tasks are neighbours if they are nearer than this, in diagonals of the task space
 
-MISSED = 0.1
-"""M misses its goal if it ends farther away than this, as a share of the range of a state."""
+MISSED = 0.1  # M misses its goal if it ends farther away than this, as a share of the range of a state
 
-SATURATED = 0.01
-"""Least share of steps at a limit that is worth a note."""
+SATURATED = 0.01  # least share of steps at a limit that is worth a note
 
 
 @dataclass(frozen=True)

@@ -169,8 +169,7 @@ class Trajectory:
         """Write one trajectory as CSV. The last row has no inputs.
 
         Args:
-            states, inputs: names of the columns of states and inputs; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
-                The column of the times is ``t``.
+            states, inputs: names of the columns; ``x0, x1, ...`` and ``u0, u1, ...`` by default. That of times is ``t``.
         """
         if self.batch_shape:
             raise ShapeError(f"a CSV file must hold one trajectory, got a batch of shape {self.batch_shape}.")
@@ -199,12 +198,9 @@ class Trajectory:
         return Trajectory(*read_columns(path, states, inputs, most_rows))
 
     def resampled(self, times: Array) -> Trajectory:
-        """Return one recorded trajectory at other times: states interpolated linearly, inputs averaged over the steps.
+        """Return one recorded trajectory at other times ``(H + 1,)``, in seconds after its first time, from 0.
 
-        An input holds until the next sample.
-
-        Args:
-            times: seconds after the first time of the recording, from 0, shape ``(H + 1,)``.
+        States are interpolated linearly. Inputs, which hold until the next sample, are averaged over the steps.
         """
         recorded, wanted = self.times - self.times[0], as_floats("times", times)
         if self.batch_shape or not (np.diff(recorded) > 0).all():
@@ -226,8 +222,7 @@ class Trajectory:
         return call(self, length, self.ended, states=self.states, inputs=self.inputs)
 
 
-_TIMES = 0.01
-"""Largest difference between the times of a recording and those of its task, in steps."""
+_TIMES = 0.01  # largest difference between the times of a recording and those of its task, in steps
 
 
 def require_times(trajectory: Trajectory, times: Array) -> None:

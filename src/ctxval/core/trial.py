@@ -75,19 +75,9 @@ class Trial:
         return lines(head, *(f"{name}: {line(text)}" for name, text in texts.items() if text is not None))
 
     def _repr_html_(self) -> str:
-        return table(
-            f"Trial {self.number}",
-            [
-                ("origin", self.origin),
-                ("state", self.state),
-                ("distance", self.distance),
-                ("failure", self.failure),
-                ("seconds", self.seconds),
-                ("attempts", self.attempts),
-                ("because", self.because),
-                *self.parameters.items(),
-            ],
-        )
+        names = ("origin", "state", "distance", "failure", "seconds", "attempts", "because")
+        known = ((name, getattr(self, name)) for name in names)
+        return table(f"Trial {self.number}", [*known, *self.parameters.items()])
 
 
 def designs_sentence(trials: Sequence[Trial]) -> str | None:

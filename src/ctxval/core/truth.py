@@ -26,11 +26,9 @@ from ctxval.core.space import AxisPoints, Parameters
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 
-_FINER = 9
-"""Number of points on each axis of a refined grid around one point."""
+_FINER = 9  # number of points on each axis of a refined grid around one point
 
-_PROBES = 16
-"""Number of tasks whose distances show that a stored truth belongs to a system."""
+_PROBES = 16  # number of tasks whose distances show that a stored truth belongs to a system
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,8 +37,7 @@ from ctxval.errors import (
     ShapeError,
 )
 
-START = 0.05
-"""Default start tolerance, as a fraction of the range of each state in the trajectory of the model."""
+START = 0.05  # default start tolerance, as a fraction of the range of each state in the trajectory of the model
 
 _CHUNK = 4096  # tasks in one batched call: enough for speed, few enough for the memory
 _PLANNED = 256  # tasks that are planned in one call if S executes one at a time: more would hardly be faster

@@ -140,10 +140,7 @@ class GaussianProcessModel(ShortRepr):
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
     """Return ``sum_o log p(Y[:, o] | Z, theta)`` up to a constant, and its gradient (eqs. 5.8 and 5.9).
 
-    Args:
-        theta: logarithms of (variance, noise, length-scales).
-        Z: pairs ``(M, k)``.
-        Y: outputs ``(M, n)`` that share the covariance.
+    The pairs Z are ``(M, k)``, the outputs Y ``(M, n)``; theta has the logarithms of (variance, noise, length-scales).
     """
     variance, noise, *length_scales = np.exp(theta)
     covariance = SquaredExponential(float(variance), np.array(length_scales))

@@ -13,6 +13,7 @@ from ctxval._util.extras import require_extra
 from ctxval._util.mjcf import compile_mjcf, is_mjcf_text
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
+from ctxval.core.model import paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
@@ -58,8 +59,7 @@ class MuJoCo(ShortRepr):
                 f"got {x.shape[-1]} states and {u.shape[-1]} inputs."
             )
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        states = rows_of(np.broadcast_to(x, (*batch, x.shape[-1])))
-        inputs = rows_of(np.broadcast_to(u, (*batch, u.shape[-1])))
+        states, inputs = map(rows_of, paired(x, u))
         reached = np.full(states.shape, np.nan)
         data = self._mujoco.MjData(model)
         for k in np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1)).tolist():

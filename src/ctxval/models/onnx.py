@@ -11,7 +11,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.core.model import central_differences
+from ctxval.core.model import central_differences, paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
@@ -45,7 +45,7 @@ class Onnx(ShortRepr):
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
-        pair = (x, u) if len(self.network.widths) == 2 else (np.concatenate(_paired(x, u), axis=-1),)
+        pair = (x, u) if len(self.network.widths) == 2 else (np.concatenate(paired(x, u), axis=-1),)
         output = self.network(*pair)
         if output.shape[-1] != x.shape[-1]:
             raise ShapeError(
@@ -55,13 +55,8 @@ class Onnx(ShortRepr):
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A ``(..., n, n)`` and B ``(..., n, m)`` by central differences that suit the network's precision."""
-        return central_differences(self.step, *_paired(x, u), self.network.precision)
+        return central_differences(self.step, *paired(x, u), self.network.precision)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this model in a store."""
         return {**self.network.describe(), "increments": self.increments}
-
-
-def _paired(x: Array, u: Array) -> tuple[Array, Array]:
-    batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-    return np.broadcast_to(x, (*batch, x.shape[-1])), np.broadcast_to(u, (*batch, u.shape[-1]))

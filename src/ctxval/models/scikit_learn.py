@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array, Mask, rows_of
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.core.model import central_differences
+from ctxval.core.model import central_differences, paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.regressors import smooth_map
@@ -113,10 +113,7 @@ def _require_states(outputs: Array, n: int) -> None:
 
 def _pairs(x: Array, u: Array) -> Array:
     """Return states and inputs side by side, shape ``(N, n + m)``."""
-    n = x.shape[-1]
-    pairs = np.empty((*np.broadcast_shapes(x.shape[:-1], u.shape[:-1]), n + u.shape[-1]))
-    pairs[..., :n], pairs[..., n:] = x, u
-    return pairs.reshape(-1, pairs.shape[-1])
+    return rows_of(np.concatenate(paired(x, u), axis=-1))
 
 
 def _blocks(rows: Array) -> list[Array]:

@@ -14,7 +14,7 @@ from ctxval._util.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
 from ctxval._util.progress import advance, stage
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
 from ctxval.storage import schema
-from ctxval.storage.disks import make_folder, on_network, warn_of_network
+from ctxval.storage.disks import make_folder, network, warn_of_network
 
 
 class Database:
@@ -89,7 +89,7 @@ class Database:
         until = time.monotonic() + wait
         try:
             real = path.resolve()
-            itself = LOCKS_FILE_ITSELF and not on_network(real)
+            itself = LOCKS_FILE_ITSELF and not network(real)
             lock = self._lock = self._lock or FileLock(real if itself else real.with_name(f"{real.name}.lock"))
             with suppress(LockedError):
                 lock.acquire()

@@ -108,8 +108,7 @@ def _refuse_constant(name: str) -> NoReturn:
     raise InputError(f"{name} is not a number of JSON.")
 
 
-MOST_CHARACTERS = 2**24
-"""Largest number of characters of a key, and of the JSON text of a value."""
+MOST_CHARACTERS = 2**24  # largest number of characters of a key, and of the JSON text of a value
 
 
 def pair_of(key: str, value: Any) -> tuple[str, str]:

@@ -19,11 +19,9 @@ from typing import Any
 from ctxval._util.files import why_not_regular
 from ctxval.errors import ForeignStoreError, StoreAccessError
 
-APPLICATION = 0x63747876
-"""SQLite's application_id of a store, the letters "ctxv"; it marks a file as a store of ctxval."""
+APPLICATION = 0x63747876  # SQLite's application_id of a store, the letters "ctxv"; it marks a file as a store of ctxval
 
-VERSION = 8
-"""SQLite's user_version of a store; it changes with :data:`TABLES`."""
+VERSION = 8  # SQLite's user_version of a store; it changes with :data:`TABLES`
 
 TABLES = """
 CREATE TABLE trials (
@@ -61,8 +59,7 @@ CREATE TABLE computed (key TEXT PRIMARY KEY, digest TEXT NOT NULL, value TEXT NO
 
 _EVERY = 10_000  # instructions of SQLite between two checks of their number
 
-STEPS = 100_000_000
-"""Largest number of SQLite instructions of one statement; reading a trial takes about twenty."""
+STEPS = 100_000_000  # largest number of SQLite instructions of one statement; reading a trial takes about twenty
 
 _OBJECTS = 100  # tables and indexes that are examined; a store has far fewer
 

@@ -11,8 +11,7 @@ from ctxval.storage.rows import checksum_of, read_trajectory
 
 Side = Literal["model", "system"]
 
-MEMORY = 512 * 2**20
-"""Largest number of bytes of the trajectories that are kept in memory."""
+MEMORY = 512 * 2**20  # largest number of bytes of the trajectories that are kept in memory
 
 
 class StoredTrajectories:
@@ -21,10 +20,6 @@ class StoredTrajectories:
     The system's trajectories are read again for each choice of a task, so they are kept in memory after the first
     time. A stored trajectory does not change. If another connection has written to the file nevertheless, the
     checksums in the file show which ones are read again.
-
-    Args:
-        database: the file of the store.
-        memory: largest number of bytes of the trajectories in memory; further ones are read each time.
     """
 
     def __init__(self, database: Database, memory: int = MEMORY) -> None:

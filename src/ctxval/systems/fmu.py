@@ -42,8 +42,7 @@ class FMU(ShortRepr):
 
     Args:
         path: the ``.fmu`` file.
-        states: names of the variables that make up the state; they are real numbers.
-        inputs: names of the input variables; they are real numbers.
+        states, inputs: names of the variables that make up the state, and of the inputs; all are real numbers.
         start: the variable whose start value sets a state, by the name of the state; by default the state's own
             variable.
         parameters: values of other variables, set before the initialisation.

@@ -71,12 +71,7 @@ class MuJoCo(ShortRepr):
         return {"mjcf": self._digest, "substeps": self.substeps, "sites": self.sites, "axes": self.axes}
 
     def state(self, qpos: ArrayLike, qvel: ArrayLike | None = None) -> Array:
-        """Return the complete states for configurations and velocities.
-
-        Args:
-            qpos: the configurations, shape ``(..., nq)``.
-            qvel: the velocities, shape ``(..., nv)``; zero by default.
-        """
+        """Return the complete states for configurations ``(..., nq)`` and velocities ``(..., nv)``, zero by default."""
         positions = require_shape("qpos", as_finite("qpos", qpos), (self._model.nq,))
         velocities = np.zeros(self._model.nv) if qvel is None else as_finite("qvel", qvel)
         require_shape("qvel", velocities, (self._model.nv,))

@@ -20,8 +20,7 @@ from ctxval.errors import ExecutionError
 
 _PROGRAM = Path(__file__).absolute().with_name("supervisor.py")
 
-_GRACE_PERIOD = 10.0
-"""Seconds that a supervisor has to end its command before it is killed itself."""
+_GRACE_PERIOD = 10.0  # seconds that a supervisor has to end its command before it is killed itself
 
 
 def run_supervised(
