@@ -169,7 +169,7 @@ class Trajectory:
         """Write one trajectory as CSV. The last row has no inputs.
 
         Args:
-            states, inputs: names of the columns; ``x0, x1, ...`` and ``u0, u1, ...`` by default. That of times is ``t``.
+            states, inputs: names of the columns; ``x0, x1, ...`` and ``u0, u1, ...`` by default. Times are ``t``.
         """
         if self.batch_shape:
             raise ShapeError(f"a CSV file must hold one trajectory, got a batch of shape {self.batch_shape}.")
