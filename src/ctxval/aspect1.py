@@ -35,15 +35,11 @@ from ctxval.searches import Search, by_name
 
 __all__ = ["Aspect1Report", "SimulatedTask", "check", "completion"]
 
-TASKS = 100
-"""Number of simulated tasks, unless another one is given."""
+TASKS = 100  # number of simulated tasks, unless another one is given
 SEARCH = "bayesian-optimisation"
 """The search, unless another one is given. Learned dynamics could not teach it anything, because M is known."""
 
-_NEIGHBOURS = 20
-"""Number of tasks beside which another one is planned: the worst ones and spread ones, half of each."""
-_BESIDE = 0.03
-"""Distance of such a neighbour, in diagonals of the task space."""
+_NEIGHBOURS = 20  # number of tasks beside which another one is planned: the worst ones and spread ones, half of each
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +101,13 @@ class Aspect1Report:
     @property
     def failed(self) -> tuple[SimulatedTask, ...]:
         """The tasks without an error."""
-        return tuple(one for one in self.simulated if one.error is None)
+        return tuple(task for task in self.simulated if task.error is None)
 
     @property
     def exceeding(self) -> int:
         """The number of simulated tasks that M does not complete: those above the threshold, and those that failed."""
         limit = np.inf if self.threshold is None else self.threshold
-        return sum(one.error is None or one.error > limit for one in self.simulated)
+        return sum(task.error is None or task.error > limit for task in self.simulated)
 
     @property
     def completes(self) -> bool | None:
@@ -129,7 +125,7 @@ class Aspect1Report:
             "worst": asdict(self.worst),
             "exceeding": self.exceeding if self.threshold is not None or self.failed else None,
             "completes": self.completes,
-            "failed": [asdict(one) for one in self.failed],
+            "failed": [asdict(task) for task in self.failed],
             "verdict": None if self.verdict is None else self.verdict.answer,
             "bound": None if self.verdict is None else self.verdict.bound,
             "share_at_most": self.share,
@@ -162,10 +158,6 @@ def check(
         tasks: number of simulated tasks.
         search: chooses the tasks; Bayesian optimisation by default.
         seed: seed of the search.
-
-    Raises:
-        InputError: if the tasks have neither a goal nor a reference and no distance is given.
-        DistanceError: if the distance fails.
     """
     measured = completion(validation) if distance is None else distance
     on_model = validation.on_model(measured, units=None if distance is None else "")
@@ -185,29 +177,26 @@ def completion(validation: Validation) -> Distance:
     :class:`ctxval.distances.GoalError`, and for tasks with a changing reference
     :class:`ctxval.distances.TrackingError`. If the distance compares all states, those are left out that the
     synthesizer does not bring to a goal.
-
-    Raises:
-        InputError: if the tasks have neither a goal nor a reference.
     """
-    space, own = validation.space, validation.distance
+    space, distance = validation.space, validation.distance
     task = validation.task(space.parameters(0.5 * (space.low + space.high)))
     if not isinstance(task, Task) or not task.has_goal:
         raise InputError(
             "the tasks have neither a goal nor a reference, so the model has nothing to complete: give a goal, or a "
             "distance that measures how far a trajectory is from completing its task."
         )
-    if isinstance(own, GoalError | TrackingError):
-        return own
+    if isinstance(distance, GoalError | TrackingError):
+        return distance
     shared: dict[str, Any] = {"norm": 2}
-    if isinstance(own, StateNorm):
-        shared = {name: getattr(own, name) for name in ("norm", "components", "weights", "scales", "angles")}
+    if isinstance(distance, StateNorm):
+        shared = {name: getattr(distance, name) for name in ("norm", "components", "weights", "scales", "angles")}
     n = task.initial_state.shape[-1]
     aimed = aimed_states(validation, n)
     if shared.get("components") is None and shared.get("weights") is None and shared.get("scales") is None:
         shared["components"] = tuple(aimed.tolist()) if 0 < len(aimed) < n else None
     if (task.reference == task.goal[..., None, :]).all():
         return GoalError(**shared)
-    return TrackingError(**shared, over="mean" if isinstance(own, MeanDeviation) else "maximum")
+    return TrackingError(**shared, over="mean" if isinstance(distance, MeanDeviation) else "maximum")
 
 
 def _simulate(campaign: Campaign, tasks: int) -> None:
@@ -225,19 +214,14 @@ def _simulate(campaign: Campaign, tasks: int) -> None:
             )
 
 
-def _share(campaign: Campaign, threshold: float | None) -> float | None:
-    """Return the upper bound of Clopper and Pearson (1934) for the share of tasks that M does not complete."""
-    if threshold is None:
-        return None
-    drawn = [trial for trial in campaign.trials if trial.origin == "iid"]
-    missed = sum(trial.distance is None or trial.distance > threshold for trial in drawn)
-    return volume_bound(len(drawn), missed, 1 - CONFIDENCE) if missed < len(drawn) else 1.0
-
-
 def _report(
     campaign: Campaign, distance: Distance, threshold: float | None, verdict: Verdict | None, seed: int
 ) -> Aspect1Report:
-    validation = campaign.validation
+    validation, share = campaign.validation, None
+    if threshold is not None:  # the upper bound of Clopper and Pearson (1934)
+        drawn = [trial for trial in campaign.trials if trial.origin == "iid"]
+        missed = sum(trial.distance is None or trial.distance > threshold for trial in drawn)
+        share = volume_bound(len(drawn), missed, 1 - CONFIDENCE) if missed < len(drawn) else 1.0
     ordered = sorted(campaign.trials, key=lambda trial: -np.inf if trial.distance is None else -trial.distance)
     simulated = tuple(
         SimulatedTask(trial.parameters, trial.distance, text_of(trial.failure or "")) for trial in ordered
@@ -247,23 +231,23 @@ def _report(
     plans = _planned(validation, points, bool(getattr(validation.synthesizer, "batched", False)))
     inputs = [plan.model_trajectory.inputs for plan in plans.values()]
     kept = list(plans)
-    found = flips(points[kept], inputs) if len(kept) > 1 else None
+    flipped = flips(points[kept], inputs) if len(kept) > 1 else None
     where = [validation.space.describe_point(validation.space.from_unit(points[row])) for row in kept]
-    told = [converged_of(plan.controller) for plan in plans.values()]
+    converged = [converged_of(plan.controller) for plan in plans.values()]
     return Aspect1Report(
         distance=distance,
         units=validation.labels.units,
         threshold=threshold,
         simulated=simulated,
         verdict=verdict,
-        share=_share(campaign, threshold),
+        share=share,
         distribution=campaign.provenance.distribution,
-        flips=found,
-        flipped=None if found is None else (where[found.example[0]], where[found.example[1]]),
+        flips=flipped,
+        flipped=None if flipped is None else (where[flipped.example[0]], where[flipped.example[1]]),
         saturation=saturation(inputs, validation.synthesizer),
         inputs=tuple(validation.names(0, inputs[0].shape[-1])[1]) if inputs else (),
-        not_converged=tuple(one for one, ok in zip(where, told, strict=True) if ok is not None and not ok),
-        designs=sum(ok is not None for ok in told),
+        not_converged=tuple(task for task, ok in zip(where, converged, strict=True) if ok is not None and not ok),
+        designs=sum(ok is not None for ok in converged),
     )
 
 
@@ -275,8 +259,8 @@ def _with_neighbours(points: Array, rng: np.random.Generator) -> Array:
     chosen = np.concatenate([points[:half], points[:: max(1, len(points) // half)][:half]])
     directions = rng.normal(size=chosen.shape)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    # A step that would leave the cube goes the other way.
-    step = _BESIDE * np.sqrt(points.shape[1]) * directions
+    # 0.03 diagonals of the task space; a step that would leave the cube goes the other way.
+    step = 0.03 * np.sqrt(points.shape[1]) * directions
     beside = np.where((chosen + step < 0) | (chosen + step > 1), chosen - step, chosen + step)
     return np.concatenate([beside.clip(0, 1), chosen, points])
 
@@ -289,10 +273,8 @@ def _planned(validation: Validation, points: Array, batched: bool) -> dict[int, 
         return dict(zip(rows, validation.plans(space.from_unit(points[rows])), strict=True)) if rows else {}
     except CtxvalError:
         pass
-    found = dict[int, Plan]()
+    plans = dict[int, Plan]()
     for row in rows:
-        try:
-            found[row] = validation.plan(space.from_unit(points[row]))
-        except (DesignError, ModelError):
-            continue
-    return found
+        with contextlib.suppress(DesignError, ModelError):
+            plans[row] = validation.plan(space.from_unit(points[row]))
+    return plans

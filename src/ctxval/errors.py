@@ -17,6 +17,9 @@
     │   └── StoreMismatchError              the store was made by another experiment
     ├── CampaignError                       the campaign cannot continue
     └── ConformanceError (also AssertionError)  a part breaks the contract of its protocol
+
+Every public constructor and function raises an InputError for an argument or a file that cannot be used. Docstrings
+name the other exceptions.
 """
 
 from __future__ import annotations

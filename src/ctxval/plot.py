@@ -16,7 +16,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MADE_BY, written_whole
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
@@ -61,12 +61,11 @@ class Results(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class Curve(ShortRepr):
     """A known distance over a one-dimensional task space: points ``(N,)`` in its units and values ``(N,)``."""
 
     points: Array
     values: Array
-    __repr__ = record
 
 
 def overview(

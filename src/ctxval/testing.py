@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, Synthesizer, converged_of
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model, linearize
@@ -183,7 +183,7 @@ def _trial_run(search: Search, dimension: int, seed: int, budget: int) -> tuple[
 Fault = Literal["raise", "nan", "short", "wrong shape"]
 
 
-class FaultyRig:
+class FaultyRig(ShortRepr):
     """A system that runs another one and fails at chosen executions, for tests of how a campaign handles failures.
 
     Args:
@@ -214,9 +214,6 @@ class FaultyRig:
         if fault == "wrong shape":
             return Trajectory(whole.times, whole.states[:, :1], whole.inputs)
         return whole
-
-    def __repr__(self) -> str:
-        return call(self, self.system, faults=self.faults, delay=self.delay)
 
 
 class _WithoutJacobian:

@@ -81,7 +81,8 @@ def test_a_text_that_could_not_be_written_is_made_one_that_can() -> None:
 )
 def test_headers_as_other_programs_write_them_are_read(header: str) -> None:
     data = np.array([1.5, -2.5]).tobytes()
-    for version in (b"\x01\x00", b"\x02\x00", b"\x03\x00"):
+    newer = [] if "L" in header else [b"\x03\x00"]  # Python 2 wrote no headers of the third version
+    for version in (b"\x01\x00", b"\x02\x00", *newer):
         assert Archive(zipped(a=npy(header, data, version))).numbers("a").tolist() == [1.5, -2.5]
 
 

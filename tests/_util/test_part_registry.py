@@ -58,7 +58,7 @@ def test_what_a_package_exports_is_found_by_name(package: Any) -> None:
         found = getattr(package, name)
         is_part = isinstance(found, type) and any(callable(vars(b).get(package.REGISTRY.method)) for b in found.__mro__)
         is_protocol = getattr(found, "_is_protocol", False)
-        if is_part and not is_protocol and name not in NOT_BY_NAME | {"AffineFeedback", "BoundOnnxPolicy"}:
+        if is_part and not is_protocol and name not in NOT_BY_NAME | {"AffineFeedback", "BoundPolicy"}:
             assert found in known, f"{name} has the method of a {package.REGISTRY.kind} but is not declared by @part"
 
 

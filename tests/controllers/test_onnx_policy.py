@@ -77,12 +77,11 @@ def test_it_can_be_described_and_sent_to_another_process() -> None:
     assert first_difference(describe(synthesizer), describe(OnnxPolicy(policy(), observe=deviation))) is not None
 
 
-def test_it_is_described_as_in_stores_of_version_0_1_0() -> None:
+def test_it_is_described_by_its_settings() -> None:
     synthesizer = OnnxPolicy(policy(), observe=deviation, limits=1.0)
     assert list(describe(synthesizer)) == ["type", "network", "observe", "scale", "limits"]
-    assert describe(synthesizer)["limits"] == 1.0
+    assert describe(synthesizer)["limits"] == {"type": "Limits", "low": -1.0, "high": 1.0}
     assert describe(OnnxPolicy(policy()))["limits"] is None
-    assert describe(OnnxPolicy(policy(), limits=[[0, 8]]))["limits"] == [[0.0], [8.0]]
 
 
 def test_other_networks_and_observations_are_refused() -> None:

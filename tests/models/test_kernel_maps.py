@@ -8,7 +8,6 @@ from sklearn.gaussian_process import kernels as sklearn_kernels
 
 from ctxval.models import kernel_maps
 from ctxval.models.kernel_maps import Kernel, KernelSum
-from ctxval.models.smooth_maps import jacobian
 
 RNG = np.random.default_rng(0)
 CENTRES, WEIGHTS, ROWS = RNG.normal(size=(7, 3)), RNG.normal(size=(7, 2)), RNG.normal(size=(4, 3))
@@ -46,7 +45,7 @@ def test_a_sum_of_kernels_is_that_of_scikit_learn_with_its_derivatives(name: str
     assert kernel is not None
     smooth = KernelSum(kernel, CENTRES, WEIGHTS)
     np.testing.assert_allclose(smooth.value(ROWS), theirs(ROWS, CENTRES) @ WEIGHTS, rtol=1e-12, atol=1e-13)
-    h, found = 1e-5, jacobian(smooth, ROWS)
+    h, found = 1e-5, smooth.jacobian(ROWS)
     moves = h * np.eye(3)
     # Differences of the fourth order, of scikit-learn's kernel.
     at = [np.stack([theirs(ROWS + k * move, CENTRES) @ WEIGHTS for move in moves], -1) for k in (-2, -1, 1, 2)]
@@ -58,7 +57,7 @@ def test_at_a_centre_the_derivatives_are_finite() -> None:
     for name in ("matern 0.5", "matern 1.5", "squared"):
         kernel, _ = KERNELS[name]
         assert kernel is not None
-        assert np.isfinite(jacobian(KernelSum(kernel, CENTRES, WEIGHTS), CENTRES)).all()
+        assert np.isfinite(KernelSum(kernel, CENTRES, WEIGHTS).jacobian(CENTRES)).all()
 
 
 def test_a_matern_kernel_of_another_smoothness_is_not_known() -> None:

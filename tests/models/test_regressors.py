@@ -28,7 +28,6 @@ from sklearn.preprocessing import (
 )
 
 from ctxval.models.regressors import smooth_map
-from ctxval.models.smooth_maps import jacobian
 
 RNG = np.random.default_rng(0)
 X = RNG.normal(size=(60, 3)) * [1.0, 3.0, 0.5] + [0.0, 1.0, -2.0]
@@ -87,7 +86,7 @@ def test_a_formula_predicts_as_its_regressor_with_its_derivatives(regressor: Any
     h = 1e-5
     moves = h * np.eye(3)
     differences = [(regressor.predict(ROWS + move) - regressor.predict(ROWS - move)) / (2 * h) for move in moves]
-    np.testing.assert_allclose(jacobian(smooth, ROWS), np.stack(differences, axis=-1), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(smooth.jacobian(ROWS), np.stack(differences, axis=-1), rtol=1e-6, atol=1e-6)
 
 
 def test_a_single_target_is_one_column() -> None:
@@ -95,7 +94,7 @@ def test_a_single_target_is_one_column() -> None:
         smooth = smooth_map(fitted(regressor, Y[:, 0]))
         assert smooth is not None
         np.testing.assert_allclose(smooth.value(ROWS), regressor.predict(ROWS)[:, None], rtol=1e-9)
-        assert jacobian(smooth, ROWS).shape == (6, 1, 3)
+        assert smooth.jacobian(ROWS).shape == (6, 1, 3)
 
 
 class Doubled(Ridge):

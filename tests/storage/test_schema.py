@@ -174,8 +174,8 @@ def test_a_store_of_another_spelling_is_a_store(store: Path) -> None:
 def test_a_pipe_is_no_store(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.sqlite")
     for command in ("status", "certify", "export"):
-        assert "a pipe" in said(tmp_path / "a.sqlite", command)
-    with pytest.raises(StoreAccessError, match="a pipe"):
+        assert "a FIFO" in said(tmp_path / "a.sqlite", command)
+    with pytest.raises(StoreAccessError, match="a FIFO"):
         Store(tmp_path / "a.sqlite")
 
 
@@ -215,7 +215,10 @@ def test_what_lies_beside_must_be_a_file(store: Path, tmp_path: Path, ending: st
     victim = tmp_path / "thesis.tex"
     victim.write_text("chapter 1")
     {"pipe": lambda: os.mkfifo(beside), "link": lambda: beside.symlink_to(victim), "folder": beside.mkdir}[kind]()
-    assert f"{ending} is a {kind}; move it away" in said(store)
+    what = {"pipe": "a FIFO and not a regular file", "link": "a link and not a regular file", "folder": "a folder"}[
+        kind
+    ]
+    assert f"{ending} is {what}; move it away" in said(store)
     assert len(recover(store).trials) == 5
     assert victim.read_text() == "chapter 1"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import concurrent.futures
 import contextlib
 import io
@@ -488,15 +487,8 @@ def test_an_archive_that_cannot_be_unpacked_is_refused(tmp_path: Path, fmi2: Pat
 
 
 def test_without_fmpy_the_extra_is_named(fmi2: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.partition(".")[0] == "fmpy":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(InputError, match=r'pip install "ctxval\[fmu\]"'):
+    monkeypatch.setitem(sys.modules, "fmpy", None)
+    with pytest.raises(InputError, match=r"pip install 'ctxval\[fmu\]'"):
         FMU(fmi2, **NAMES)
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import builtins
 import concurrent.futures
 import pickle
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -177,15 +177,8 @@ def test_an_input_that_is_not_finite_ends_the_trajectory() -> None:
 
 
 def test_without_gymnasium_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.partition(".")[0] == "gymnasium":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(InputError, match=r'pip install "ctxval\[mujoco\]"'):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(InputError, match=r"pip install 'ctxval\[mujoco\]'"):
         Gymnasium("Reacher-v5")
 
 

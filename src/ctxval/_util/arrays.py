@@ -23,9 +23,6 @@ Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
 ArrayLike = npt.ArrayLike
 
-_LISTED = 100
-"""Largest number of values that an error message lists."""
-
 _SHOWN = reprlib.Repr()
 _SHOWN.maxlist = _SHOWN.maxtuple = 20
 _SHOWN.maxstring = _SHOWN.maxother = 200
@@ -57,7 +54,7 @@ def as_finite(name: str, value: ArrayLike) -> Array:
     array = as_floats(name, value)
     finite = np.isfinite(array)
     if not finite.all():
-        if array.size <= _LISTED:
+        if array.size <= 100:
             raise InputError(f"{name} must be finite, got {array.tolist()}.")
         place = tuple(np.argwhere(~finite)[0].tolist())
         raise InputError(f"{name} must be finite, got {array[place]} at {list(place)}.")
@@ -102,9 +99,7 @@ def vector_norm(vectors: Array, order: float) -> Array:
     return np.asarray(np.sqrt((magnitudes**2).sum(axis=-1)))
 
 
-@functools.cache
-def _thread_pools() -> ThreadpoolController:
-    return ThreadpoolController()
+_thread_pools = functools.cache(ThreadpoolController)
 
 
 def single_threaded() -> AbstractContextManager[Any]:
@@ -114,16 +109,10 @@ def single_threaded() -> AbstractContextManager[Any]:
 
 
 def held_means(times: Array, values: Array, edges: Array, slack: float) -> Array:
-    """Return the mean of values that hold until the next one, in each interval between two edges.
+    """Return the means ``(K, m)`` of values ``(N, m)`` that hold until the next one, between edges ``(K + 1,)``.
 
-    Args:
-        times: when each value begins, increasing, shape ``(N,)``; the first value also holds before.
-        values: shape ``(N, m)``.
-        edges: increasing, shape ``(K + 1,)``.
-        slack: a time so close to an edge is that of the edge.
-
-    Returns:
-        The means, shape ``(K, m)``.
+    The times ``(N,)`` at which values begin increase, and the first value also holds before. A time within the slack of
+    an edge is that of the edge.
     """
     first = np.maximum(np.searchsorted(times, edges[:-1] + slack, side="right") - 1, 0)
     last = np.maximum(np.searchsorted(times, edges[1:] - slack) - 1, first)

@@ -28,12 +28,9 @@ def climb(
     The sum of the values is separable, so one quasi-Newton search serves all starts.
 
     Args:
-        function: what to maximise.
         starts: shape ``(..., d)``, which is the shape of the points that the function is asked about.
-        low, high: the box, shapes ``(d,)``.
         scale: the size of the sum, to which the tolerances of L-BFGS-B refer.
-        iterations: the most of L-BFGS-B; its default if None.
-        evaluations: the most calls of the function; the default of L-BFGS-B if None.
+        iterations, evaluations: the most of L-BFGS-B; its defaults if None.
     """
 
     def negative(flat: Array) -> tuple[float, Array]:
@@ -82,11 +79,8 @@ def farthest_rows(
     """Return rows of points ``(n, d)``, each farthest from all points chosen before it (Gonzalez 1985).
 
     Args:
-        points: what is chosen from.
         gaps: the distance of each point to the nearest one that is chosen already, shape ``(n,)``; minus infinity if
             the point is one of them, so that no row is taken twice even among copies of one point.
-        count: how many rows are wanted.
-        squared: whether ``gaps`` are squared distances.
         reach: the choice ends where no point is farther than this from the chosen ones.
     """
     left = np.array(gaps, dtype=np.float64)

@@ -45,8 +45,6 @@ TimeLimit = Annotated[float, Must("a positive number of seconds, or infinity", l
 Norm = Annotated[float, Must("1, 2 or inf", lambda value: value in (1, 2, np.inf))]
 Probability = Annotated[float, Must("strictly between 0 and 1", lambda value: 0 < value < 1)]
 
-_NONE = "None"
-
 _SHOWN = reprlib.Repr()
 _SHOWN.maxstring = _SHOWN.maxother = 200
 
@@ -102,7 +100,8 @@ def require(name: str, annotation: Any, value: Any) -> Any:
 def _resolved(function: Any, made: Any) -> Iterator[tuple[str, Any]]:
     """Yield the annotations of parameters; those of the fields of a dataclass are read where the field is defined."""
     variadic = {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
-    plain = {name for name, one in inspect.signature(function).parameters.items() if one.kind not in variadic}
+    parameters = inspect.signature(function).parameters
+    plain = {name for name, parameter in parameters.items() if parameter.kind not in variadic}
     for name, annotation in function.__annotations__.items():
         homes = [cls for cls in getattr(made, "__mro__", ()) if name in vars(cls).get("__annotations__", {})]
         place = vars(sys.modules[homes[0].__module__]) if homes else function.__globals__
@@ -125,13 +124,13 @@ def _missed(annotation: Any, value: Any) -> str:
         beyond = annotation is float and isinstance(value, int) and abs(value) > sys.float_info.max
         return wanted if confused or beyond or not isinstance(value, kinds) or value != value else ""
     if origin in (Union, types.UnionType):
-        missed = [_missed(one, value) for one in arguments]
-        given = [text for text in missed if text != _NONE]  # nobody needs to be told of None
+        missed = [_missed(alternative, value) for alternative in arguments]
+        given = [text for text in missed if text != "None"]  # which is the default, if it is allowed
         return " or ".join(dict.fromkeys(given)) if all(missed) else ""
     if origin is Literal:
         return "" if isinstance(value, str) and value in arguments else f"one of {', '.join(map(repr, arguments))}"
     if annotation in (None, types.NoneType):
-        return "" if value is None else _NONE
+        return "" if value is None else "None"
     if origin is Callable:
         return "" if callable(value) else "a function"
     cls = origin or annotation

@@ -21,12 +21,6 @@ _OWN = __name__.partition(".")[0]
 _SKIPPED = ("ctx", "kind", "type_comment", "returns", "annotation")
 """Fields of a syntax tree that do not affect the computation."""
 
-_MOST_ITEMS = 100
-"""Largest container whose items are searched for functions; a longer one holds data."""
-
-_INSTALLED = {"site-packages", "dist-packages"}
-"""Names of the folders of installed packages."""
-
 _Function = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 
 
@@ -77,7 +71,7 @@ def is_library(value: Any) -> bool:
     if module is None or module.__name__ == "__main__":
         return False
     file = getattr(module, "__file__", None)
-    if file is None or _top_level(module) == _OWN or _INSTALLED & set(Path(file).parts):
+    if file is None or _top_level(module) == _OWN or {"site-packages", "dist-packages"} & set(Path(file).parts):
         return True
     return any(Path(file).is_relative_to(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib"))
 
@@ -89,13 +83,13 @@ def _top_level(value: Any) -> str:
 
 def enclosed(function: types.FunctionType) -> list[Any]:
     """Return what a function closes over; None for a variable that has no value yet."""
-    found: list[Any] = []
+    contents: list[Any] = []
     for cell in function.__closure__ or ():
         try:
-            found.append(cell.cell_contents)
+            contents.append(cell.cell_contents)
         except ValueError:
-            found.append(None)
-    return found
+            contents.append(None)
+    return contents
 
 
 # What source may use
@@ -105,7 +99,7 @@ def _reached_from(item: Any) -> list[Any]:
     """Return what the source of an object may use: definitions, classes, functions, and objects that may hold some."""
     if type(item) in (list, tuple, dict):
         items = list(item.values() if isinstance(item, dict) else item)
-        return items if len(items) <= _MOST_ITEMS else []
+        return items if len(items) <= 100 else []  # a longer one holds data
     if isinstance(item, functools.partial):
         return [item.func, *item.args, *item.keywords.values()]
     if isinstance(item, types.MethodType):
@@ -143,28 +137,26 @@ def _of_class(cls: type) -> list[Any]:
 
 def functions_in(item: Any) -> list[types.FunctionType]:
     """Return the Python functions of a class attribute: a method, the functions of a property, wrapped functions."""
-    found: list[types.FunctionType] = []
     seen: list[Any] = []
     waiting = [item]
     while waiting:
-        one = waiting.pop()
-        if any(one is other for other in seen):
+        member = waiting.pop()
+        if any(member is other for other in seen):
             continue
-        seen.append(one)
-        if isinstance(one, types.FunctionType):
-            found.append(one)
-        inner = (getattr(one, name, None) for name in ("fget", "fset", "__func__", "func", "__wrapped__"))
-        waiting.extend(each for each in inner if callable(each))
-    return found
+        seen.append(member)
+        inner = (getattr(member, name, None) for name in ("fget", "fset", "__func__", "func", "__wrapped__"))
+        waiting.extend(wrapped for wrapped in inner if callable(wrapped))
+    return [member for member in seen if isinstance(member, types.FunctionType)]
 
 
 def _globals(module: types.ModuleType | None, names: set[str]) -> list[_Global]:
     """Return the definitions behind the names that source in a module uses, also those in users' modules."""
     if module is None:
         return []
-    found = [_Global(module, name) for name in sorted(names & vars(module).keys())]
-    modules = [used for one in found if inspect.ismodule(used := vars(module)[one.name]) and not is_library(used)]
-    return [*found, *(_Global(used, name) for used in modules for name in sorted(names & vars(used).keys()))]
+    used = [_Global(module, name) for name in sorted(names & vars(module).keys())]
+    values = [vars(module)[item.name] for item in used]
+    modules = [value for value in values if inspect.ismodule(value) and not is_library(value)]
+    return [*used, *(_Global(inner, name) for inner in modules for name in sorted(names & vars(inner).keys()))]
 
 
 def _names(code: types.CodeType) -> set[str]:
@@ -203,8 +195,7 @@ class _Source:
 
 
 def _source_of(module: types.ModuleType | None) -> _Source:
-    file = None if module is None or is_library(module) else getattr(module, "__file__", None)
-    return _read(file)
+    return _read(None if module is None or is_library(module) else getattr(module, "__file__", None))
 
 
 def _read(file: str | None) -> _Source:
@@ -216,24 +207,24 @@ def _read(file: str | None) -> _Source:
 
 @functools.lru_cache(maxsize=64)
 def _parsed(source: str) -> _Source:
-    found = _Source()
+    definitions = _Source()
     try:
         tree = ast.parse(source)
     except (SyntaxError, ValueError, RecursionError):
-        return found
+        return definitions
     for node in ast.walk(tree):
         if isinstance(node, _Function):
-            found.functions.setdefault(getattr(node, "name", "<lambda>"), []).append(node)
+            definitions.functions.setdefault(getattr(node, "name", "<lambda>"), []).append(node)
         elif isinstance(node, ast.ImportFrom):
             place = "." * node.level + (node.module or "")
-            found.imports.update((alias.asname or alias.name, (place, alias.name)) for alias in node.names)
+            definitions.imports.update((alias.asname or alias.name, (place, alias.name)) for alias in node.names)
     for node in tree.body:
         if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
             for name in ast.walk(node):
                 if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store):
-                    found.assigned.setdefault(name.id, []).append(node)
-    found.classes.update(_classes(tree, ""))
-    return found
+                    definitions.assigned.setdefault(name.id, []).append(node)
+    definitions.classes.update(_classes(tree, ""))
+    return definitions
 
 
 def _code_digest(value: Any) -> str:
@@ -272,14 +263,15 @@ def _classes(node: ast.AST, path: str) -> Iterator[tuple[str, ast.AST]]:
 
 
 def _function_node(code: types.CodeType) -> ast.AST | None:
-    found = [node for node in _read(code.co_filename).functions.get(code.co_name, ()) if _is_of(node, code)]
-    return min(found, key=lambda node: sum(1 for _ in ast.walk(node)), default=None)
-
-
-def _is_of(node: _Function, code: types.CodeType) -> bool:
-    if isinstance(node, ast.Lambda):
-        return all(_covers(node.body, place) for place in code.co_positions())
-    return code.co_firstlineno == min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
+    matching = []
+    for node in _read(code.co_filename).functions.get(code.co_name, ()):
+        if isinstance(node, ast.Lambda):
+            matches = all(_covers(node.body, place) for place in code.co_positions())
+        else:
+            matches = code.co_firstlineno == min(part.lineno for part in (node, *node.decorator_list))
+        if matches:
+            matching.append(node)
+    return min(matching, key=lambda node: sum(1 for _ in ast.walk(node)), default=None)
 
 
 def _covers(node: ast.expr, place: tuple[int | None, int | None, int | None, int | None]) -> bool:
@@ -295,11 +287,10 @@ def _covers(node: ast.expr, place: tuple[int | None, int | None, int | None, int
 class _WithoutImports(ast.NodeTransformer):
     """Removes imports and the texts that stand alone as statements, which document what is beside them."""
 
-    def visit_Import(self, node: ast.Import) -> None:
+    def visit_Import(self, node: ast.AST) -> None:
         """Remove an import."""
 
-    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
-        """Remove an import."""
+    visit_ImportFrom = visit_Import  # noqa: N815
 
     def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
         """Remove a docstring."""
@@ -316,17 +307,18 @@ def _plain(node: Any, *, top: bool = False) -> Any:
         return [_plain(item) for item in node]
     if not isinstance(node, ast.AST):
         return (type(node).__name__, repr(node))
+    documented = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
     fields = []
     for name, value in ast.iter_fields(node):
         empty = value == [] or (value is None and not isinstance(node, ast.Constant))
         if empty or name in _SKIPPED or (top and name == "name"):
             continue
-        fields.append((name, _plain(_without_docstring(node, value) if name == "body" else value)))
+        if (
+            documented
+            and name == "body"
+            and isinstance(value[0], ast.Expr)
+            and isinstance(value[0].value, ast.Constant)
+        ):
+            value = value[1:]  # without the docstring
+        fields.append((name, _plain(value)))
     return (type(node).__name__, *fields)
-
-
-def _without_docstring(node: ast.AST, body: Any) -> Any:
-    documented = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and isinstance(body, list)
-    if documented and body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
-        return body[1:]
-    return body

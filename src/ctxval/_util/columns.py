@@ -16,17 +16,10 @@ from ctxval.errors import InputError
 TIMES = ("t", "time", "times", "timestamp")
 """Names of columns of times, the first of which is taken: a state may be called ``time`` too."""
 
-EPISODES = (
-    *("episode", "episode_index", "episode_id", "run", "run_index", "run_id", "trial", "trial_index", "trial_id"),
-)
+EPISODES = tuple(f"{name}{ending}" for name in ("episode", "run", "trial") for ending in ("", "_index", "_id"))
 """Names of columns that number the recordings in one table."""
 
-FAR = 3.0
-"""Largest ratio between the median time of two samples and a time step to which they are interpolated."""
-
-_LIMITS = (32767.0, -32768.0, 65535.0, 2147483647.0, -2147483648.0, 4294967295.0)
-_EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""Smallest times since 1970, after 1973, in units in which no recording has such a length."""
+FAR = 3.0  # largest ratio between the median time of two samples and a time step to which they are interpolated
 
 
 def require_distinct(source: str, names: Sequence[str]) -> None:
@@ -58,7 +51,7 @@ def time_column(source: str, names: Sequence[str]) -> tuple[str, str] | None:
     """Return the column of the times and its unit, empty if it states none; None if there is no such column."""
     plain = {name: named_unit(name)[0] for name in names}
     for time in TIMES:
-        matching = [name for name, own in plain.items() if time in (own, own.casefold() if time != "t" else "")]
+        matching = [name for name, bare in plain.items() if time in (bare, bare.casefold() if time != "t" else "")]
         if time in matching or len(matching) == 1:
             column = time if time in matching else matching[0]
             return column, named_unit(column)[1]
@@ -71,7 +64,8 @@ def in_seconds(source: str, times: Array, unit: str) -> Array:
     """Return times in seconds; times since 1970 without a unit are recognised by their size."""
     if not unit and len(times):
         middle = float(np.median(times))
-        unit = next((name for least, name in _EPOCHS if middle > least), "s")
+        # The smallest times after 1973, in units in which no recording has such a length.
+        unit = next((name for least, name in ((1e17, "ns"), (1e14, "us"), (1e11, "ms")) if middle > least), "s")
     try:
         return np.asarray(times * conversion(unit or "s", "s"))
     except InputError:
@@ -99,26 +93,23 @@ def sentinels(values: Array, factor: float = 1.0) -> list[float]:
         values: recorded values.
         factor: to the unit before a conversion of the table, which converted marks such as -999 too.
     """
-    found, rest = list[float](), np.asarray(values[np.isfinite(values)])
+    marks, rest = list[float](), np.asarray(values[np.isfinite(values)])
     while len(rest):
         low, high = float(rest.min()), float(rest.max())
         largest = low if abs(low) > abs(high) else high
         others = rest[rest != largest]
-        if not len(others) or not (_stands_for_missing(largest) or _all_nines(factor * largest)):
+        size = abs(largest)
+        powers = (float(f"1e{round(np.log10(size))}"),) if 1e6 <= size < np.inf else ()
+        limits = (32767.0, -32768.0, 65535.0, 2147483647.0, -2147483648.0, 4294967295.0)
+        near = size > 1e30 or any(math.isclose(largest, mark, rel_tol=1e-7) for mark in (*limits, *powers))
+        if not len(others) or not (near or _all_nines(largest) or _all_nines(factor * largest)):
             break
         ranges = 2 * float(np.ptp(others))
         if min(abs(largest - float(others.min())), abs(largest - float(others.max()))) <= ranges:
             break
-        found.append(largest)
+        marks.append(largest)
         rest = others
-    return found
-
-
-def _stands_for_missing(value: float) -> bool:
-    size = abs(value)
-    powers = (float(f"1e{round(np.log10(size))}"),) if 1e6 <= size < np.inf else ()
-    near = any(math.isclose(value, mark, rel_tol=1e-7) for mark in (*_LIMITS, *powers))
-    return _all_nines(value) or size > 1e30 or near
+    return marks
 
 
 def _all_nines(value: float) -> bool:

@@ -16,8 +16,6 @@ from pathlib import Path
 MOST_MEMORY = 4 * 2**30
 """Largest size of the memory of a confined process in bytes; libraries reserve more than they use."""
 
-_MOST_FILE, _MOST_OPEN = 2**30, 256
-
 _CREATE, _ADD, _RESTRICT = 444, 445, 446  # system calls, with the same numbers on all processors
 _NO_NEW_PRIVILEGES = 38
 _EXECUTE, _READ_FILE, _READ_FOLDER = 1 << 0, 1 << 2, 1 << 3
@@ -29,7 +27,7 @@ def limit(seconds: int) -> None:
         return
     import resource
 
-    limits = {"AS": MOST_MEMORY, "CPU": seconds, "FSIZE": _MOST_FILE, "NOFILE": _MOST_OPEN, "CORE": 0}
+    limits = {"AS": MOST_MEMORY, "CPU": seconds, "FSIZE": 2**30, "NOFILE": 256, "CORE": 0}
     for name, most in limits.items():
         with contextlib.suppress(OSError, ValueError):  # the limit is lower already, or this system has none
             resource.setrlimit(getattr(resource, f"RLIMIT_{name}"), (most, most))

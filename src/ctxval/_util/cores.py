@@ -32,7 +32,11 @@ def on_all_cores(function: Callable[[Part], Result], parts: Sequence[Part]) -> l
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _inherit, (function,))
     try:
         with pool, forking():
-            return list(_counted(pool.map(_call, parts)))
+            results = []
+            for result in pool.map(_call, parts):
+                advance()
+                results.append(result)
+            return results
     except BrokenProcessPool:  # the system may have ended a process because memory was short
         return [function(part) for part in parts]
 
@@ -60,13 +64,6 @@ def _inherit(function: Callable[[Any], Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     mute()
     _inherited = function
-
-
-def _counted(results: Iterator[Result]) -> Iterator[Result]:
-    """Yield results as they come, and report each."""
-    for result in results:
-        advance()
-        yield result
 
 
 def _call(part: Any) -> Any:

@@ -22,22 +22,16 @@ from ctxval._util.files import MOST_BYTES, open_regular
 from ctxval._util.texts import unguarded
 from ctxval.errors import InputError
 
-_EMPTY = ("", "nan", "na", "null", "none", "-")
-"""Cells that stand for a missing value, in small letters."""
-
-MOST_ROW = 2**20
-"""Largest number of characters in a row."""
+MOST_ROW = 2**20  # largest number of characters in a row
 
 
 class CsvTable:
     """The cells of a CSV file.
 
     Attributes:
-        path: the file.
         names: the names of the columns; a column without a name has an empty one.
 
     Args:
-        path: the file.
         most: largest size of the file in bytes.
     """
 
@@ -71,7 +65,7 @@ class CsvTable:
     ) -> dict[str, Array]:
         """Return columns as numbers."""
         places = {name: place for place, name in enumerate(self.names)}
-        found = {name: array("d") for name in names}
+        columns = {name: array("d") for name in names}
         wrong: InputError | None = None
         for count, (line, row) in enumerate(self.rows(), 1):
             if wrong is not None:
@@ -80,17 +74,17 @@ class CsvTable:
                 raise InputError(f"{self.path} must have {most} rows below its header, and has more.")
             if 8 * len(names) * count > MOST_BYTES:
                 raise InputError(f"{self.path} has too many numbers: {MOST_BYTES} bytes may be read.")
-            for name, numbers in found.items():
+            for name, numbers in columns.items():
                 cell = row[places[name]]
                 try:
-                    empty = name in missing and cell.strip().lower() in _EMPTY
+                    empty = name in missing and cell.strip().lower() in ("", "nan", "na", "null", "none", "-")
                     numbers.append(math.nan if empty else self.number(line, name, cell))
                 except InputError as error:
                     if name not in last:
                         raise
                     wrong = wrong or error
                     numbers.append(math.nan)
-        return {name: np.array(numbers) for name, numbers in found.items()}
+        return {name: np.array(numbers) for name, numbers in columns.items()}
 
     def texts(self, name: str) -> Array:
         """Return the texts in a column."""
@@ -99,7 +93,18 @@ class CsvTable:
 
     def number(self, line: int, name: str, cell: str) -> float:
         """Return the number in a cell."""
-        text = cell if self._separator == "," else self._with_point(line, cell)
+        text = cell
+        if self._separator != ",":
+            mark = "," if "," in cell else "." if "." in cell else ""
+            if mark:
+                self._marks.setdefault(mark, line)
+            if len(self._marks) > 1:
+                first, second = self._marks[","], self._marks["."]
+                raise InputError(
+                    f"{self.path} has decimal commas (line {first}) and points (line {second}) in numbers: "
+                    "use one mark."
+                )
+            text = cell.replace(",", ".")
         try:
             if "_" in text:
                 raise ValueError
@@ -107,17 +112,6 @@ class CsvTable:
         except ValueError:
             shown = f"got {cell[:60]!r}" if cell.strip() else "and the cell is empty"
             raise InputError(f"{self.path}, line {line}: {name} must be a number, {shown}.") from None
-
-    def _with_point(self, line: int, cell: str) -> str:
-        mark = "," if "," in cell else "." if "." in cell else ""
-        if mark and mark not in self._marks:
-            self._marks[mark] = line
-        if len(self._marks) > 1:
-            first, second = self._marks[","], self._marks["."]
-            raise InputError(
-                f"{self.path} has decimal commas (line {first}) and points (line {second}) in numbers: use one mark."
-            )
-        return cell.replace(",", ".")
 
     def _cells(self) -> Iterator[tuple[int, list[str]]]:
         try:
@@ -128,7 +122,7 @@ class CsvTable:
                 lines = _Lines(text, self._most)
                 head = [*itertools.takewhile(lambda line: not line.strip(), lines), lines.last]
                 unquoted = re.sub('"[^"]*"', "", lines.last)
-                self._separator = next((one for one in ("\t", ";") if one in unquoted), ",")
+                self._separator = next((mark for mark in ("\t", ";") if mark in unquoted), ",")
                 reader = csv.reader(itertools.chain(head, lines), delimiter=self._separator)
                 for row in reader:
                     lines.in_row = 0

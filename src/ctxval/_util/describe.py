@@ -18,13 +18,8 @@ import numpy as np
 
 from ctxval._util.code_digest import enclosed, is_library, is_own, source_digest
 
-_DEPTH = 6
-_LISTED = 100
-_TOLERANCE = 1e-6
-"""Relative tolerance of floats: settings that are computed differ by less than this on two machines."""
 
-
-def describe(value: Any, depth: int = _DEPTH) -> Any:
+def describe(value: Any, depth: int = 6) -> Any:
     """Return the identity of an object as JSON.
 
     An object of this package is described by its type and its public values, or by the result of its ``describe()``,
@@ -42,7 +37,7 @@ def describe(value: Any, depth: int = _DEPTH) -> Any:
         return type(value).__qualname__
     if isinstance(value, np.ndarray):
         # A large array is data, and what it does is recomputed.
-        listed = value.size <= _LISTED and value.dtype.kind in "biufO"
+        listed = value.size <= 100 and value.dtype.kind in "biufO"
         return describe(value.tolist(), value.ndim + 1) if listed else {"shape": list(value.shape)}
     if inspect.isroutine(value) or isinstance(value, functools.partial | type):
         return _of_callable(value, depth)
@@ -55,21 +50,14 @@ def describe(value: Any, depth: int = _DEPTH) -> Any:
         return sorted((describe(item, depth - 1) for item in value), key=repr)
     if isinstance(value, Sequence) and not isinstance(value, bytes | bytearray | memoryview):
         return [describe(item, depth - 1) for item in value]
-    settings = _settings(value) if is_own(type(value)) else {}
+    settings: Mapping[str, Any] = {}
+    if is_own(type(value)) and hasattr(type(value), "describe"):
+        settings = value.describe()
+    elif is_own(type(value)):
+        fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
+        names = [field.name for field in fields] or getattr(value, "__dict__", {})
+        settings = {name: getattr(value, name) for name in names if not name.startswith("_")}
     return {"type": type(value).__qualname__, **{str(key): describe(item, depth - 1) for key, item in settings.items()}}
-
-
-def _settings(value: Any) -> Mapping[str, Any]:
-    """Return the settings of an object of this package."""
-    if hasattr(type(value), "describe"):
-        found: Mapping[str, Any] = value.describe()
-        return found
-    named = (
-        [field.name for field in dataclasses.fields(value)]
-        if dataclasses.is_dataclass(value)
-        else getattr(value, "__dict__", {})
-    )
-    return {name: getattr(value, name) for name in named if not name.startswith("_")}
 
 
 def _of_callable(value: Any, depth: int) -> Any:
@@ -100,8 +88,7 @@ def without_numbers(description: Any) -> Any:
 def first_difference(stored: Any, present: Any, path: str = "") -> str | None:
     """Return a sentence about the first difference of two descriptions. Returns None if they agree.
 
-    Floats agree within a relative 1e-6, so that a model fitted again on another machine is the same model. The name of
-    a function does not matter if the digest of its source is known.
+    The name of a function does not matter if the digest of its source is known.
     """
     return next((sentence for _, sentence in differences(stored, present, path)), None)
 
@@ -114,7 +101,7 @@ def differences(stored: Any, present: Any, path: str = "") -> Iterator[tuple[str
     elif isinstance(stored, list) and isinstance(present, list) and len(stored) == len(present):
         for i, (a, b) in enumerate(zip(stored, present, strict=True)):
             yield from differences(a, b, f"{path}[{i}]")
-    elif not _same(stored, present):
+    elif not (_close(stored, present) if {type(stored), type(present)} <= {int, float, bool} else stored == present):
         yield path, f"{path} was {_short(stored)} and is now {_short(present)}"
 
 
@@ -132,11 +119,10 @@ def _at_key(stored: dict[str, Any], present: dict[str, Any], key: str, path: str
         yield from differences(stored[key], present[key], here)
 
 
-def _same(stored: Any, present: Any) -> bool:
-    if isinstance(stored, int | float) and isinstance(present, int | float):
-        both_nan = math.isnan(stored) and math.isnan(present)
-        return both_nan or math.isclose(stored, present, rel_tol=_TOLERANCE, abs_tol=1e-13)
-    return bool(stored == present)
+def _close(stored: float, present: float) -> bool:
+    """Return whether numbers agree; settings that are computed differ by less than 1e-6 on two machines."""
+    both_nan = math.isnan(stored) and math.isnan(present)
+    return both_nan or math.isclose(stored, present, rel_tol=1e-6, abs_tol=1e-13)
 
 
 def _short(value: Any) -> str:

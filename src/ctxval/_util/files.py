@@ -20,26 +20,26 @@ from typing import IO, Any, BinaryIO
 
 from ctxval.errors import InputError
 
-MOST_BYTES = 256 * 2**20
-"""Largest size of a file in bytes, enough for 33 million numbers of a trajectory."""
+MOST_BYTES = 256 * 2**20  # largest size of a file in bytes, enough for 33 million numbers of a trajectory
 
-MOST_JSON = 16 * 2**20
-"""Largest size of a JSON file in bytes; reading it takes twenty times as much memory."""
+MOST_JSON = 16 * 2**20  # largest size of a JSON file in bytes; reading it takes twenty times as much memory
 
 MADE_BY = "Made by ctxval"
 """What every file contains that an option of a command names, so that the next run may replace it."""
-
-_MOST_OWN = 2**32
-
-_DATABASE = b"SQLite format 3\0"
 
 _KINDS = {
     stat.S_IFDIR: "it is a folder",
     stat.S_IFIFO: "it is a FIFO and not a regular file",
     stat.S_IFSOCK: "it is a socket and not a regular file",
+    stat.S_IFLNK: "it is a link and not a regular file",
     stat.S_IFCHR: "it is a device and not a regular file",
     stat.S_IFBLK: "it is a device and not a regular file",
 }
+
+
+def why_not_regular(mode: int) -> str:
+    """Return what a file of a mode is; empty if it is a regular file."""
+    return "" if stat.S_ISREG(mode) else _KINDS.get(stat.S_IFMT(mode), "it is not a file")
 
 
 def open_regular(path: str | Path, most: int = MOST_BYTES) -> BinaryIO:
@@ -47,21 +47,17 @@ def open_regular(path: str | Path, most: int = MOST_BYTES) -> BinaryIO:
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except (OSError, ValueError) as error:  # a ValueError for a NUL in the name
-        raise InputError(_why_not_opened(path, error)) from error
+        folder = os.path.isdir(path)  # which Windows does not open
+        reason = _KINDS[stat.S_IFDIR] if folder else str(getattr(error, "strerror", None) or error)
+        raise InputError(reason) from error
     status = os.fstat(descriptor)
-    reason = _KINDS.get(stat.S_IFMT(status.st_mode), "")
+    reason = why_not_regular(status.st_mode)
     if not reason and status.st_size > most:
         reason = f"it has {status.st_size} bytes, and at most {most} are read"
     if reason:
         os.close(descriptor)
         raise InputError(reason)
     return os.fdopen(descriptor, "rb")
-
-
-def _why_not_opened(path: str | Path, error: OSError | ValueError) -> str:
-    if os.path.isdir(path):  # Windows does not open folders
-        return _KINDS[stat.S_IFDIR]
-    return str(getattr(error, "strerror", None) or error)
 
 
 def require_regular_file(path: str | Path) -> None:
@@ -96,7 +92,7 @@ def read_json(path: str | Path) -> Any:
 def require_made_by_us(path: Path, mark: bytes = MADE_BY.encode()) -> None:
     """Check that ctxval wrote a file, if there is one, so that it may be replaced."""
     try:
-        known = not path.exists() or mark in read_bytes(path, _MOST_OWN)
+        known = not path.exists() or mark in read_bytes(path, 2**32)
     except InputError as error:
         raise InputError(f"{path} cannot be written: {error}.") from error
     if not known:
@@ -119,8 +115,10 @@ def written_whole(path: str | Path, *, text: bool = False) -> Iterator[IO[Any]]:
 
     Two processes may write the same file at once: one of the two complete files stays.
     """
-    target = Path(os.path.realpath(path))  # a link stays a link
-    if _is_database(target):
+    target, header = Path(os.path.realpath(path)), b""  # a link stays a link
+    with suppress(InputError, OSError), open_regular(target, sys.maxsize) as present:
+        header = present.read(16)
+    if header == b"SQLite format 3\0":
         raise InputError(f"{path} is a store or another database, which is never replaced.")
     beside = target.with_name(f"{target.name}.{secrets.token_hex(4)}.part")
     try:
@@ -140,11 +138,3 @@ def write_text(path: str | Path, content: str) -> Path:
     with written_whole(path, text=True) as file:
         file.write(content)
     return Path(path)
-
-
-def _is_database(path: Path) -> bool:
-    try:
-        with open_regular(path, sys.maxsize) as file:
-            return file.read(len(_DATABASE)) == _DATABASE
-    except (InputError, OSError):
-        return False

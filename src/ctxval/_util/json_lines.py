@@ -23,9 +23,6 @@ class JsonLines(Mapping[Key, Record]):
     Args:
         path: of the file; it is made, with its folder, by the first record.
         key: the fields of a record that identify it. Their values are numbers, texts, booleans or null.
-
-    Raises:
-        InputError: when the file is read, if a line is no JSON object or lacks a field of the key.
     """
 
     def __init__(self, path: Path, key: Sequence[str]) -> None:
@@ -98,20 +95,16 @@ def _parsed(line: bytes) -> Record | None:
 
 def _mend_end(path: Path) -> None:
     """Remove a last line whose end was never written; one that only lacks its newline is given it."""
-    if not path.exists() or _ends_with_newline(path):
+    if not path.exists():
         return
-    data = path.read_bytes()
-    last = data[data.rfind(b"\n") + 1 :]
     with path.open("r+b") as file:
-        if _parsed(last) is None:
-            file.truncate(len(data) - len(last))
-        else:
-            file.seek(0, 2)
-            file.write(b"\n")
-
-
-def _ends_with_newline(path: Path) -> bool:
-    with path.open("rb") as file:
         size = file.seek(0, 2)
         file.seek(max(0, size - 1))
-        return size == 0 or file.read(1) == b"\n"
+        if size == 0 or file.read(1) == b"\n":
+            return
+        file.seek(0)
+        last = file.read().rpartition(b"\n")[2]
+        if _parsed(last) is None:
+            file.truncate(size - len(last))
+        else:
+            file.write(b"\n")

@@ -9,35 +9,27 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
+from ctxval._util.extras import require_extra
 from ctxval._util.files import read_bytes
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, ModelError, ShapeError
 
 _TYPES: dict[str, type[np.float32] | type[np.float64]] = {"tensor(float)": np.float32, "tensor(double)": np.float64}
-
-_MOST_BYTES = 2**34
-"""Largest size of a network's weights in bytes; it refuses endless files, not large networks."""
 
 Width = int | None
 """Number of values in one row; None if the file leaves it open."""
 
 
-class OnnxNetwork:
+class OnnxNetwork(ShortRepr):
     """A network that maps rows of numbers to rows of numbers, on one thread of the processor.
 
     Its inputs and its output have one row for each task, shapes ``(N, k)``. If the file fixes N to 1, or the shapes are
     ``(k,)``, the network is called row by row. An ONNX file holds no code.
 
-    Args:
-        source: the file, or its bytes.
-
     Attributes:
         widths: the number of values in a row of each input; None if the file leaves it open.
         width: the number of values in a row of the output; None if the file leaves it open.
         precision: the relative rounding of the network's numbers: 1e-7 in single, 2e-16 in double precision.
-
-    Raises:
-        InputError: if onnxruntime is not installed, or the file is not a network of real numbers in rows.
     """
 
     def __init__(self, source: str | Path | bytes) -> None:
@@ -94,24 +86,19 @@ class OnnxNetwork:
     def __reduce__(self) -> tuple[Any, ...]:
         return OnnxNetwork, (self._source,)
 
-    def __repr__(self) -> str:
-        return call(self, inputs=dict(zip(self.names, self.widths, strict=True)), outputs=self.width)
-
 
 def _contents(path: Path) -> list[bytes]:
     """Return the bytes of the file, and of the file of weights that PyTorch may write beside it."""
     weights = path.with_name(f"{path.name}.data")
     try:
-        return [read_bytes(file, most=_MOST_BYTES) for file in (path, weights) if file == path or file.exists()]
+        # The largest size refuses endless files, not large networks.
+        return [read_bytes(file, most=2**34) for file in (path, weights) if file == path or file.exists()]
     except InputError as error:
         raise InputError(f"the ONNX file {path} cannot be read: {error}.") from error
 
 
 def _session(source: bytes | str) -> Any:
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise InputError('onnxruntime is not installed: pip install "ctxval[onnx]".') from error
+    onnxruntime = require_extra("onnxruntime", "onnx", "ONNX networks")
     options = onnxruntime.SessionOptions()
     # Small networks are slower on many threads, and their last bits depend on the number of threads.
     options.intra_op_num_threads = options.inter_op_num_threads = 1

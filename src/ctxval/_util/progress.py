@@ -40,8 +40,6 @@ Listener = Callable[[Progress], None]
 
 
 class _Stage:
-    """A stage that somebody listens to."""
-
     def __init__(self, listener: Listener, name: str, expected: float | None, unit: str, done: float, depth: int):
         self.listener, self.name, self.unit, self.depth = listener, name, unit, depth
         self.done, self.expected = done, expected

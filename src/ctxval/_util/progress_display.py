@@ -15,17 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.progress import Progress as Bars
 
-_DELAY = 0.4
-"""Seconds before a stage is shown; most end sooner."""
-
-_TOLD = 0.1
-"""Share of the work from which on it is told how much time is left: the first parts may take longer than others."""
-
-_LONG = 60.0
-"""Seconds after which this is told in any case."""
-
-_SILENCE = 30.0
-"""Seconds without a line in a log, after which a stage writes one."""
+_DELAY = 0.4  # seconds before a stage is shown; most end sooner
 
 
 @contextmanager
@@ -36,7 +26,14 @@ def progress_shown(wanted: bool | None = None, console: Console | None = None) -
         return
     if wanted is None:
         wanted = is_screen()
-    with listening(_display(console) if wanted else ignore):
+    if not wanted:
+        with listening(ignore):
+            yield
+        return
+    from rich.console import Console  # slow to load, and needed by few programs
+
+    screen = Console(stderr=True, markup=False, emoji=False, highlight=False) if console is None else console
+    with listening(OnScreen(screen) if screen.is_terminal or screen.is_jupyter else InLog(screen)):
         yield
 
 
@@ -45,19 +42,8 @@ def is_screen() -> bool:
     return bool(sys.stderr is not None and sys.stderr.isatty()) or "ipykernel" in sys.modules
 
 
-def _display(console: Console | None) -> OnScreen | InLog:
-    from rich.console import Console  # slow to load, and needed by few programs
-
-    found = Console(stderr=True, markup=False, emoji=False, highlight=False) if console is None else console
-    return OnScreen(found) if found.is_terminal or found.is_jupyter else InLog(found)
-
-
 class InLog:
-    """Prints each note, and what takes very long.
-
-    Args:
-        console: the console of rich.
-    """
+    """Prints each note, and after 30 s without one the amount of the present stage."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -65,10 +51,9 @@ class InLog:
         self._started: dict[int, float] = {}
 
     def __call__(self, progress: Progress) -> None:
-        """Print a line if there is a note, or if there was none for long."""
         now = time.monotonic()
         self._started.setdefault(progress.depth, now)
-        if progress.note or (now - self._last > _SILENCE and not progress.ended):
+        if progress.note or (now - self._last > 30 and not progress.ended):
             self._last = now
             text = progress.note or f"{progress.stage}: {amount(progress, now - self._started[progress.depth])}"
             self._console.print(_in_one_line(text), soft_wrap=True)
@@ -77,11 +62,7 @@ class InLog:
 
 
 class OnScreen:
-    """Shows one bar for each stage while it lasts. Notes stay on the screen, one line for each.
-
-    Args:
-        console: the console of rich.
-    """
+    """Shows one bar for each stage while it lasts. Notes stay on the screen, one line for each."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -89,8 +70,10 @@ class OnScreen:
         self._rows: dict[int, Any] = {}
 
     def __call__(self, progress: Progress) -> None:
-        """Show a report."""
-        bars = self._bars = self._bars or self._started()
+        if self._bars is None:
+            self._bars = _bars(self._console)
+            self._bars.start()
+        bars = self._bars
         if progress.note:
             bars.console.print(_in_one_line(progress.note), soft_wrap=True, markup=False, highlight=False)
         if progress.depth not in self._rows:
@@ -100,19 +83,10 @@ class OnScreen:
         text = amount(progress, task.elapsed or 0.0)
         bars.update(row, completed=progress.done, total=progress.expected, text=text)
         if progress.ended:
-            self._end(progress.depth)
-
-    def _started(self) -> Bars:
-        bars = _bars(self._console)
-        bars.start()
-        return bars
-
-    def _end(self, depth: int) -> None:
-        assert self._bars is not None
-        self._bars.remove_task(self._rows.pop(depth))
-        if not self._rows:
-            self._bars.stop()
-            self._bars = None
+            bars.remove_task(self._rows.pop(progress.depth))
+            if not self._rows:
+                bars.stop()
+                self._bars = None
 
 
 def _bars(console: Console) -> Bars:
@@ -121,11 +95,8 @@ def _bars(console: Console) -> Bars:
     from rich.progress import Progress as Bars
 
     class Delayed(Bars):
-        """Bars of the stages that have lasted for some time."""
-
         def get_renderables(self) -> Iterable[RenderableType]:
-            shown = [task for task in self.tasks if (task.elapsed or 0.0) > _DELAY]
-            yield self.make_tasks_table(shown)
+            yield self.make_tasks_table([task for task in self.tasks if (task.elapsed or 0.0) > _DELAY])
 
     return Delayed(
         TextColumn("{task.description}", markup=False),
@@ -146,7 +117,8 @@ def amount(progress: Progress, elapsed: float) -> str:
     if progress.expected is None:
         return f"{progress.done:,.0f} {progress.unit}".strip() if progress.done else ""
     text = f"{progress.done:,.0f}/{progress.expected:,.0f} {progress.unit}".strip()
-    early = progress.done < _TOLD * progress.expected and elapsed < _LONG
+    # The first parts may take longer than others.
+    early = progress.done < 0.1 * progress.expected and elapsed < 60
     if early or not progress.done or progress.ended or progress.note:
         return text
     return f"{text}, {duration(elapsed * (progress.expected - progress.done) / progress.done)} left"

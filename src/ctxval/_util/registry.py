@@ -57,23 +57,22 @@ def part(
 
     A part of this package is found once its package exports it in ``__all__``.
 
-    Args:
-        name: by which the part is found; the name of the class by default.
-        runs_code, files, folder, functions, aliases: see :class:`Declaration`.
+    It is found by the name of the class unless another name is given; :class:`Declaration` explains the arguments.
     """
 
     def declare(made: Part) -> Part:
-        called, made = made.__name__ if name is None else name, checked(made)
-        _declarations[made] = Declaration(called, runs_code, files, folder, functions or {}, aliases)
+        declaration = Declaration(name or made.__name__, runs_code, files, folder, functions or {}, aliases)
+        made = checked(made)
+        _declarations[made] = declaration
         return made
 
     return declare
 
 
-def declaration_of(found: Any) -> Declaration | None:
+def declaration_of(made: Any) -> Declaration | None:
     """Return how a class or a function was declared; None if it was not. A subclass does not inherit it."""
     try:
-        return _declarations.get(found)
+        return _declarations.get(made)
     except TypeError:  # it cannot be hashed
         return None
 
@@ -89,9 +88,6 @@ class Registry(Mapping[str, Any], Generic[Made]):
         package: the package that exports the parts; the group of the entry points has the same name.
         method: the method that each part has; None if parts are plain functions.
         modules: built-in parts that are imported when they are asked for: name -> ``module:attr``.
-
-    Attributes:
-        aliases: older names of built-in parts, each with the present name.
     """
 
     def __init__(
@@ -112,10 +108,10 @@ class Registry(Mapping[str, Any], Generic[Made]):
     def collect(self) -> None:
         """Take the parts that the package exports; for a registry that is made before the package's ``__all__``."""
         exported = vars(sys.modules[self.group])
-        for found in (exported.get(name) for name in exported["__all__"]):
-            declared = declaration_of(found)
+        for made in (exported.get(name) for name in exported["__all__"]):
+            declared = declaration_of(made)
             if declared is not None:
-                self._built_in[declared.name] = found
+                self._built_in[declared.name] = made
                 self.aliases |= dict.fromkeys(declared.aliases, declared.name)
 
     @property
@@ -174,8 +170,7 @@ class Registry(Mapping[str, Any], Generic[Made]):
         if self.method is not None and not callable(getattr(made, self.method, None)):
             got = type(made).__qualname__
             raise InputError(f"the {self.kind} {name} must have the method {self.method}; its class, {got}, has none.")
-        found: Made = made
-        return found
+        return made  # type: ignore[no-any-return]
 
     def __getitem__(self, name: str) -> Any:
         try:
@@ -209,13 +204,13 @@ class Registry(Mapping[str, Any], Generic[Made]):
     def _loaded(self, point: EntryPoint) -> Any:
         what = f"the {self.kind} {point.name!r} of the installed package {_package(point)}"
         try:
-            found = point.load()
+            made = point.load()
         except (Exception, SystemExit) as error:
             raise InputError(f"{what} cannot be loaded from {point.value!r}: {reason_of(error)}.") from error
-        if not callable(found) or (isinstance(found, type) and not has_method(found, self.method)):
+        if not callable(made) or (isinstance(made, type) and not has_method(made, self.method)):
             wanted = "a function" if self.method is None else f"a class with the method {self.method}"
             raise InputError(f"{what} must be {wanted}, which {point.value!r} is not.")
-        return found
+        return made
 
 
 def has_method(cls: type, method: str | None) -> bool:

@@ -1,7 +1,7 @@
 """What objects show at a prompt: one to five short lines without raw arrays, however large or hostile their content.
 
-Each class has a short ``__repr__`` that says what matters about it; the formatting is here. Nothing of it identifies an
-object in a store: that is :mod:`ctxval._util.describe`, and what is shown here is rounded.
+A class that inherits :class:`ShortRepr` shows its fields; another one may say in its ``__repr__`` what matters.
+Nothing of it identifies an object in a store: that is :mod:`ctxval._util.describe`, and what is shown here is rounded.
 """
 
 from __future__ import annotations
@@ -23,35 +23,13 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.texts import plain, shortened, visible
 
-LONGEST = 600
-"""Characters of one object."""
-
-LINE = 150
-"""Characters of one line of several, if all of them are not too long together."""
-
-LINES = 5
-"""Lines of one object."""
-
-_CALL = 240
-"""Characters of an object that is shown in a single line."""
-
-_VALUE = 90
-"""Characters of a value inside an object."""
-
-_NAME = 60
-"""Characters of a name: of a class, a field, a parameter, a unit."""
-
-_ITEMS = 6
-"""Items of a collection that are shown."""
-
-_DEPTH = 3
-"""How deep collections in collections are shown."""
-
-_CELL = 500
-"""Characters of one cell of an HTML table."""
-
-_ROWS = 40
-"""Rows of an HTML table."""
+LONGEST, LINES = 600, 5  # characters and lines of one object
+LINE = 150  # characters of one line of several
+_CALL = 240  # characters of an object in a single line
+_VALUE = 90  # characters of a value inside an object
+_NAME = 60  # characters of a name: of a class, a field, a parameter, a unit
+_ITEMS, _DEPTH = 6, 3  # items of a collection that are shown, and how deep collections in collections are
+_CELL, _ROWS = 500, 40  # characters of one cell of an HTML table, and its rows
 
 _UNREADABLE = re.compile(r" at 0x|\barray\(")
 """What a representation has that tells a reader nothing: an address in memory, or raw numbers."""
@@ -84,17 +62,41 @@ def lines(head: str, *rows: str) -> str:
 
 def call(owner: object, /, *items: object, **fields: object) -> str:
     """Return ``Name(item, field=value)`` in one line; fields that are None are left out."""
-    name = owner if isinstance(owner, str) else type(owner).__name__
-    inside = [
-        *map(shown, items),
-        *(f"{line(key, 40)}={shown(value)}" for key, value in fields.items() if value is not None),
-    ]
-    return cut(f"{line(name, _VALUE)}({', '.join(inside)})", _CALL)
+    return cut(_called(type(owner).__name__, items, fields), _CALL)
 
 
-def record(owner: Any) -> str:
-    """Return a dataclass with all its fields in one line."""
-    return call(owner, **{field.name: getattr(owner, field.name) for field in dataclasses.fields(owner)})
+def _called(name: str, items: Iterable[object], fields: Mapping[str, object]) -> str:
+    named = (f"{line(key, 40)}={shown(value)}" for key, value in fields.items() if value is not None)
+    return f"{line(name, _VALUE)}({', '.join([*map(shown, items), *named])})"
+
+
+def fields_of(owner: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass, or the public attributes of another object, without those that are empty."""
+    if dataclasses.is_dataclass(owner):
+        fields = {field.name: getattr(owner, field.name, None) for field in dataclasses.fields(owner) if field.repr}
+    else:
+        fields = {name: value for name, value in vars(owner).items() if not name.startswith("_")}
+    return {
+        name: value
+        for name, value in fields.items()
+        if value is not None and not (isinstance(value, str | Sequence | Mapping) and not len(value))
+    }
+
+
+class ShortRepr:
+    """A class whose objects show their fields: in one line if they fit into it, otherwise one below the other."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "__repr__" not in vars(cls):
+            cls.__repr__ = cls.__repr__  # type: ignore[method-assign]  # so that a dataclass does not make its own
+
+    def __repr__(self) -> str:
+        fields = fields_of(self)
+        text = _called(type(self).__name__, [], fields)
+        if len(text) <= _CALL:
+            return text
+        return lines(line(type(self).__name__, _VALUE), *(f"{name}: {shown(value)}" for name, value in fields.items()))
 
 
 def options(owner: object) -> dict[str, Any]:
@@ -111,7 +113,7 @@ def shown(value: Any, depth: int = _DEPTH) -> str:
     if isinstance(value, Shown) or value is None or isinstance(value, bool | np.bool_):
         return str(value)
     if isinstance(value, str | PurePath):
-        return _quoted(str(value))
+        return cut(visible(repr(shortened(plain(value), _VALUE))), 2 * _VALUE)
     if isinstance(value, bytes | bytearray | memoryview):
         return f"{len(value)} bytes"
     if isinstance(value, np.ndarray):
@@ -138,16 +140,19 @@ def number(value: Any) -> str:
 
 
 def array(values: Array) -> Shown:
-    """Return a short vector with its numbers, any other array with its shape and its range."""
+    """Return a short vector or diagonal matrix with its numbers, any other array with its shape and its range."""
     if values.ndim == 0:
         return Shown(shown(values.item()))
     if values.ndim == 1 and values.size <= _ITEMS and values.dtype.kind in "biuf":
         return Shown(f"[{', '.join(map(shown, values.tolist()))}]")
-    return Shown(f"{values.shape}{within(values)}")
+    if values.ndim == 2 and 0 < len(values) <= _ITEMS and values.dtype.kind in "iuf":
+        diagonal = np.diagonal(values)
+        if diagonal.any() and values.shape[0] == values.shape[1] and np.array_equal(values, np.diag(diagonal)):
+            return Shown(f"diag({', '.join(map(number, diagonal.tolist()))})")
+    return Shown(f"{values.shape}{_range(values)}")
 
 
-def within(values: Array) -> str:
-    """Return the range of an array's finite numbers as `` in [low, high]``; empty if it has no numbers."""
+def _range(values: Array) -> str:
     if values.dtype.kind not in "biuf" or not values.size:
         return ""
     finite = values[np.isfinite(values)]
@@ -156,14 +161,6 @@ def within(values: Array) -> str:
     low, high = number(finite.min()), number(finite.max())
     rest = "" if finite.size == values.size else ", partly not finite"
     return (f" in [{low}, {high}]" if low != high else f" all {low}") + rest
-
-
-def weight(matrix: Array) -> Shown:
-    """Return a weight matrix, ``diag(...)`` if it is a small diagonal one."""
-    diagonal = np.diagonal(matrix)
-    if diagonal.size <= _ITEMS and np.array_equal(matrix, np.diag(diagonal)):
-        return Shown(f"diag({', '.join(map(number, diagonal.tolist()))})")
-    return array(matrix)
 
 
 def named(values: Mapping[str, Any], units: Mapping[str, str] | None = None) -> Shown:
@@ -189,25 +186,20 @@ def name_of(function: Any) -> Shown:
     return Shown(line(name if isinstance(name, str) else type(function).__name__, _VALUE))
 
 
-def _quoted(text: str) -> str:
-    return cut(visible(repr(shortened(plain(text), _VALUE))), 2 * _VALUE)
-
-
 def _collection(values: Any, depth: int) -> str:
     if depth == 0:
         return f"{type(values).__name__} of {len(values)}"
+    first = list(islice(values, _ITEMS))
     if isinstance(values, Mapping):
-        first = [f"{shown(key, depth - 1)}: {shown(values[key], depth - 1)}" for key in _first(values)]
-        return cut(f"{{{', '.join([*first, *_rest(len(values))])}}}", 2 * _VALUE)
-    first = [shown(item, depth - 1) for item in _first(values)]
-    inside = ", ".join([*first, *_rest(len(values))])
+        texts = [f"{shown(key, depth - 1)}: {shown(values[key], depth - 1)}" for key in first]
+    else:
+        texts = [shown(item, depth - 1) for item in first]
+    inside = ", ".join([*texts, *_rest(len(values))])
+    if isinstance(values, Mapping):
+        return cut(f"{{{inside}}}", 2 * _VALUE)
     if isinstance(values, list):
         return cut(f"[{inside}]", 2 * _VALUE)
     return cut(f"({inside},)" if len(values) == 1 else f"({inside})", 2 * _VALUE)
-
-
-def _first(values: Iterable[Any]) -> list[Any]:
-    return list(islice(values, _ITEMS))
 
 
 def _rest(count: int) -> list[str]:
@@ -220,15 +212,15 @@ def _object(value: Any) -> str:
     Of our own objects that is their first line.
     """
     kind: Any = type(value)
-    name = name_of(kind)
     if kind.__repr__ is object.__repr__:
-        return name
+        return name_of(kind)
     try:
-        text = plain(repr(value))
+        short = kind.__repr__ is ShortRepr.__repr__
+        text = _called(kind.__name__, [], fields_of(value)) if short else plain(repr(value))
     except Exception:
-        return name
+        return name_of(kind)
     if _UNREADABLE.search(text):
-        return name
+        return name_of(kind)
     own = str(kind.__module__).partition(".")[0] == __name__.partition(".")[0]
     return cut(line(text.partition("\n")[0] if own else text, 4 * _VALUE), 2 * _VALUE)
 

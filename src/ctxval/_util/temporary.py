@@ -10,21 +10,20 @@ from pathlib import Path
 
 from ctxval._util.locks import FileLock
 
-_PREFIX = "ctxval-"
-_OWNED = "lock"
-"""Name of the file that the process that made the folder keeps locked as long as it lives."""
-
 
 class TemporaryFolder:
-    """A new temporary folder, which only this process removes.
-
-    Attributes:
-        path: the path of the folder.
-    """
+    """A new temporary folder, which only this process removes."""
 
     def __init__(self) -> None:
-        _remove_left_over()
-        self._around = Path(tempfile.mkdtemp(prefix=_PREFIX)).resolve()
+        for owned in Path(tempfile.gettempdir()).glob("ctxval-*/lock"):
+            with suppress(OSError):  # it is in use, or another user's
+                left = FileLock(owned)
+                try:
+                    left.acquire()
+                    shutil.rmtree(owned.parent, ignore_errors=True)
+                finally:
+                    left.close()
+        self._around = Path(tempfile.mkdtemp(prefix="ctxval-")).resolve()
         self._lock = _owned(self._around)
         self.path = self._around / "files"
         self.path.mkdir()
@@ -47,7 +46,7 @@ def temporary_folder() -> Iterator[Path]:
 
 
 def _owned(folder: Path) -> FileLock | None:
-    """Return the lock that marks a folder as in use.
+    """Return the lock that marks a folder as in use as long as this process lives.
 
     Returns None on a disk without locks; no other process removes a folder that has no lock file.
     """
@@ -58,17 +57,5 @@ def _owned(folder: Path) -> FileLock | None:
     except OSError:
         return None
     # The file gets its name only after it is locked, so that no other process finds it unlocked.
-    unnamed.rename(folder / _OWNED)
+    unnamed.rename(folder / "lock")
     return held
-
-
-def _remove_left_over() -> None:
-    """Remove the folders whose processes have ended."""
-    for owned in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*/{_OWNED}"):
-        with suppress(OSError):  # it is in use, or another user's
-            left = FileLock(owned)
-            try:
-                left.acquire()
-                shutil.rmtree(owned.parent, ignore_errors=True)
-            finally:
-                left.close()

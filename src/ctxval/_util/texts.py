@@ -8,9 +8,6 @@ from collections.abc import Iterable, Sequence
 LONGEST = 2_000
 """Largest number of characters of a failure's text that are kept: half from its beginning, half from its end."""
 
-_SENTENCE = 200
-"""Characters reserved for the sentence around a reason, so that a text is not shortened twice."""
-
 _ACTED_UPON = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # control characters, except tab and line feed
     "\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f"  # text directions, line separators, zero width
@@ -53,16 +50,17 @@ def _gap(characters: int) -> str:
 
 def visible(text: str) -> str:
     r"""Return a text with its control characters written out, such as ``\x1b`` for an escape."""
-    return _ACTED_UPON.sub(lambda found: _written_out(ord(found[0])), text)
+
+    def written_out(character: re.Match[str]) -> str:
+        code = ord(character[0])
+        return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+    return _ACTED_UPON.sub(written_out, text)
 
 
 def quoted(value: object, longest: int = 100) -> str:
     """Return a text of a file for a message: in one line, shortened, and with control characters written out."""
     return shortened(visible(" ".join(plain(value).split())), longest)
-
-
-def _written_out(code: int) -> str:
-    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
 def text_of(reason: object) -> str:
@@ -72,8 +70,9 @@ def text_of(reason: object) -> str:
 
 def reason_of(error: BaseException) -> str:
     """Return the type and the message of an exception, shortened to leave room for a sentence around it."""
-    name, said = type(error).__name__, plain(error)
-    return shortened(f"{name}: {said}" if said and said != name else name, LONGEST - _SENTENCE)
+    name, message = type(error).__name__, plain(error)
+    # Room for a sentence around it, so that a text is not shortened twice.
+    return shortened(f"{name}: {message}" if message and message != name else name, LONGEST - 200)
 
 
 def guarded(text: str) -> str:

@@ -31,41 +31,38 @@ _OTHER_NAMES = {
 }
 _FACTOR = re.compile(r"([A-Za-z°µμ]+|1)(?:\^?(-?[1-4]))?")
 
+# The forms ``angle [deg]``, ``angle (deg)``, ``angle_deg`` and ``rate_deg_s``.
 _BRACKETS = re.compile(r"(.*?)\s*(?:\[\s*(?!\d+\s*\])([^\[\]]*?)\s*\]|\(([^()]*)\))\s*")
 _SUFFIX = re.compile(
     r"(.+?)_(deg|rad|mrad|rpm|dps|mps|kmh|(?:[kcmun]?(?:m|s|N|Nm|V|A))|sec|msec|usec|nsec)(?:_(?:per_)?(s2?))?"
 )
-_LONGEST = 200
-"""Largest number of characters of a name in which a unit is looked for."""
-_WEAK = ("m", "s", "N", "V", "A")
-"""Endings that are units only if the name without them is looked for: ``x_m`` may be a measured x."""
 
 
 def conversion(recorded: str, wanted: str) -> float:
     """Return the factor from one unit to another."""
     if _plain(recorded) == _plain(wanted):
         return 1.0
-    own, other = _parsed(recorded), _parsed(wanted)
-    if own is None or other is None or own[1] != other[1]:
+    source, target = _parsed(recorded), _parsed(wanted)
+    if source is None or target is None or source[1] != target[1]:
         raise InputError(
             f"there is no known factor from {recorded or 'no unit'} to {wanted or 'no unit'}: give factor = ..."
         )
-    return own[0] / other[0]
+    return source[0] / target[0]
 
 
 def named_unit(column: str) -> tuple[str, str, bool]:
     """Return the name and the unit that a column states, and whether the unit may be part of the name instead.
 
-    The forms are ``angle [deg]``, ``angle (deg)`` and ``angle_deg``, ``rate_deg_s``; without a unit, it is empty.
+    Without a unit, it is empty. ``x_m`` may be a measured x, so such endings are weak.
     """
-    if len(column) > _LONGEST:
+    if len(column) > 200:
         return column, "", False
     if (bracketed := _BRACKETS.fullmatch(column)) is not None:
         return bracketed[1], (bracketed[2] or bracketed[3] or "").strip(), False
     if (ended := _SUFFIX.fullmatch(column)) is None:
         return column.strip(), "", False
     rate = {"s": "/s", "s2": "/s^2"}.get(ended[3] or "", "")
-    return ended[1], ended[2] + rate, not rate and ended[2] in _WEAK
+    return ended[1], ended[2] + rate, not rate and ended[2] in ("m", "s", "N", "V", "A")
 
 
 def _parsed(unit: str) -> tuple[float, Powers] | None:
@@ -73,18 +70,18 @@ def _parsed(unit: str) -> tuple[float, Powers] | None:
     text = _OTHER_NAMES.get(unit.strip(), unit.strip()).replace("²", "^2").replace("³", "^3").replace("**", "^")
     numerator, *denominators = text.split("/")
     factor, powers = 1.0, [0] * 5
-    for sign, part in ((1, numerator), *((-1, one) for one in denominators)):
+    for sign, part in ((1, numerator), *((-1, denominator) for denominator in denominators)):
         names = re.split(r"[\s*·.]+", part.strip())
         if sign < 0 and len(names) > 1:
             return None  # m/s kg is ambiguous
         for name in names:
             matched = _FACTOR.fullmatch(name)
-            found = None if matched is None else _single(matched[1])
-            if matched is None or found is None:
+            unit_of_name = None if matched is None else _single(matched[1])
+            if matched is None or unit_of_name is None:
                 return None
             power = sign * int(matched[2] or 1)
-            factor *= found[0] ** power
-            powers = [total + power * own for total, own in zip(powers, found[1], strict=True)]
+            factor *= unit_of_name[0] ** power
+            powers = [total + power * single for total, single in zip(powers, unit_of_name[1], strict=True)]
     return factor, tuple(powers)  # type: ignore[return-value]
 
 

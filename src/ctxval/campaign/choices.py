@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call, lines
+from ctxval._util.representation import call, fields_of, lines, shown
 from ctxval.core.plan import Plan
 from ctxval.core.trial import Origin, Trial
 
@@ -30,8 +30,8 @@ class OpenTrial:
         return self.trial.number
 
     def __repr__(self) -> str:
-        parts = repr(self.plan).splitlines()[1:]
-        return lines(call(self, self.number, origin=self.trial.origin), *(part.strip() for part in parts))
+        parts = (f"{name}: {shown(part)}" for name, part in fields_of(self.plan).items())
+        return lines(call(self, self.number, origin=self.trial.origin), *parts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,12 +26,7 @@ REGISTRY: Registry[Experiment] = Registry(
 
 
 def by_name(name: str, /, seed: int = 0, **options: Any) -> Experiment:
-    """Return a case; its seed draws the data and so the model.
-
-    Raises:
-        UnknownNameError: there is no such case, or it has no such option; the message has the nearest name.
-        InputError: the value of an option is not allowed, or the case of an installed package gives no experiment.
-    """
+    """Return a case; its seed draws the data and so the model."""
     taken = options_of(name)
     for option in options:
         if option not in taken:
@@ -46,10 +41,6 @@ def options_of(name: str) -> dict[str, Any]:
     """Return the options of a case with their defaults, ``inspect.Parameter.empty`` if there is none.
 
     The first parameter of a case is its seed, which is not an option.
-
-    Raises:
-        UnknownNameError: there is no such case.
-        InputError: the case belongs to an installed package and cannot be loaded, or does not say its parameters.
     """
     found = REGISTRY.find(name)
     try:
@@ -61,10 +52,5 @@ def options_of(name: str) -> dict[str, Any]:
 
 
 def text_of(name: str) -> str:
-    """Return what a case is, in a few words.
-
-    Raises:
-        UnknownNameError: there is no such case.
-        InputError: the case belongs to an installed package and cannot be loaded.
-    """
+    """Return what a case is, in a few words."""
     return NAMES[name] if name in NAMES else REGISTRY.summary(name)

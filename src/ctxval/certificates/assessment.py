@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.certificates.base import Certificate
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.provenance import Provenance
@@ -16,7 +16,7 @@ from ctxval.errors import CertificateError
 
 
 @dataclass(frozen=True, eq=False)
-class Assessment:
+class Assessment(ShortRepr):
     """A certificate and a verdict of the same trials.
 
     Attributes:
@@ -38,8 +38,6 @@ class Assessment:
         refused = {"kind": self.kind, "refused": self.refusal}
         proved = refused if self.certificate is None else self.certificate.to_json()
         return {**said, **proved, "expected": expected}
-
-    __repr__ = record
 
 
 def assess(

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from ctxval._util.representation import Shown, call, line, lines, record, table
+from ctxval._util.representation import ShortRepr, Shown, call, line, lines, table
 from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
 from ctxval.certificates.sample import Sample
 from ctxval.core.space import TaskSpace
@@ -122,7 +122,7 @@ class Certificate:
 
 
 @dataclass(frozen=True)
-class CertificateKind(ABC):
+class CertificateKind(ShortRepr, ABC):
     """A kind of certificate. Its fields are its options: its inputs besides the trials and the confidence.
 
     A kind is a frozen dataclass with a name and a method that computes a certificate from trials. The other methods
@@ -187,7 +187,7 @@ class CertificateKind(ABC):
         """
         return self.certify(sample, confidence), None
 
-    def require_audit_helps(self, origins: Iterable[Origin]) -> None:  # noqa: B027 (most kinds can use draws)
+    def require_audit_helps(self, origins: Iterable[Origin]) -> None:
         """Check that this certificate can use independent draws, before they are executed.
 
         Args:
@@ -197,7 +197,7 @@ class CertificateKind(ABC):
             CertificateError: if the certificate would be refused whatever the distances of the draws are.
         """
 
-    def require_usable(self, confidence: float, executions: int) -> None:  # noqa: B027 (most kinds always are)
+    def require_usable(self, confidence: float, executions: int) -> None:
         """Check that this certificate can be computed, before the executions are paid for.
 
         Args:
@@ -232,5 +232,3 @@ class CertificateKind(ABC):
     def shortfall(cls, certificate: Certificate) -> str:
         """Return the end of a sentence on why the bound or the volume left out is not smaller; empty if unknown."""
         return ""
-
-    __repr__ = record

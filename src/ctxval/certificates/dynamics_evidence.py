@@ -8,14 +8,14 @@ from typing import Any, Self
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 
 _RESAMPLES = 200
 """Number of bootstrap samples."""
 
 
 @dataclass(frozen=True)
-class CheckedPrediction:
+class CheckedPrediction(ShortRepr):
     """A prediction from earlier executions only, compared with the execution.
 
     Attributes:
@@ -59,12 +59,9 @@ class CheckedPrediction:
             for name, value in asdict(self).items()
         }
 
-    def __repr__(self) -> str:
-        return record(self)
-
 
 @dataclass(frozen=True, eq=False)
-class StateInputGap:
+class StateInputGap(ShortRepr):
     """A gap between the states and inputs that closed loops visit and those that are recorded.
 
     Attributes:
@@ -77,12 +74,9 @@ class StateInputGap:
     coordinates: tuple[str, ...]
     place: dict[str, float]
 
-    def __repr__(self) -> str:
-        return record(self)
-
 
 @dataclass(frozen=True, eq=False)
-class StateInputCoverage:
+class StateInputCoverage(ShortRepr):
     """The largest gaps between the states and inputs that closed loops visit and those that are recorded.
 
     Attributes:
@@ -101,12 +95,9 @@ class StateInputCoverage:
     task: Array
     tasks: int
 
-    def __repr__(self) -> str:
-        return record(self)
-
 
 @dataclass(frozen=True, eq=False)
-class UntriedParameter:
+class UntriedParameter(ShortRepr):
     """A task parameter that hardly changes the closed loops of M.
 
     Attributes:
@@ -119,12 +110,9 @@ class UntriedParameter:
     gap: float
     task: Array
 
-    def __repr__(self) -> str:
-        return record(self)
-
 
 @dataclass(frozen=True, eq=False)
-class DynamicsEvidence:
+class DynamicsEvidence(ShortRepr):
     """What draws of the learned dynamics say about the largest distance.
 
     Attributes:
@@ -205,9 +193,6 @@ class DynamicsEvidence:
             return cls(**{**values, **arrays, **parts})
         except (KeyError, TypeError, ValueError):
             return None
-
-    def __repr__(self) -> str:
-        return call(self, draws=len(self.maxima), executions=self.executions, evaluations=self.evaluations)
 
 
 def _plain(value: Any) -> Any:

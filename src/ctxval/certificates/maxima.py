@@ -14,7 +14,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.checked import Probability, checked
 from ctxval._util.progress import advance, stage
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import ERRORS
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.errors import CertificateError
@@ -57,7 +57,7 @@ _EXACTNESS = 3.0 * np.sqrt(EXACT)
 
 
 @dataclass(frozen=True, eq=False)
-class Maxima:
+class Maxima(ShortRepr):
     """Draws of d* from its posterior.
 
     Attributes:
@@ -71,9 +71,6 @@ class Maxima:
     points: Array
     conditioned: list[Conditioned]
     owners: Rows
-
-    def __repr__(self) -> str:
-        return call(self, len(self.draws), draws=self.draws, points=self.points, hyperparameters=len(self.conditioned))
 
     @checked
     def upper(self, confidence: Probability) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ctxval._util.checked import Probability, checked
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.base import CertificateKind
 from ctxval.certificates.covering import RESOLUTION
@@ -27,7 +27,7 @@ MOST_VOLUME = 0.5
 
 @checked
 @dataclass(frozen=True)
-class CertificateOptions:
+class CertificateOptions(ShortRepr):
     """The certificate by which trials are judged, and the volume that it may leave out.
 
     Attributes:
@@ -68,8 +68,6 @@ class CertificateOptions:
         if (confidence, stochastic, resolution) != (CONFIDENCE, False, RESOLUTION):
             raise InputError("confidence, stochastic and resolution are options of certificate=; state them there.")
         return certificate
-
-    __repr__ = record
 
 
 @checked

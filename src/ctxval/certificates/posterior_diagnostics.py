@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import ndtri, stdtr
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task
 from ctxval.gp.hyperposterior import Conditioned
 
@@ -31,7 +31,7 @@ _MOST = 100
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(ShortRepr):
     """How well the process predicts its own data.
 
     Attributes:
@@ -52,8 +52,6 @@ class Diagnosis:
     def to_json(self) -> dict[str, Any]:
         """Return the numbers, ready for JSON."""
         return {"surprise": self.surprise, "trial": self.trial, "left_out": self.left_out, "farthest": self.farthest}
-
-    __repr__ = record
 
 
 def diagnose(

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.certificates.learned import LearnedDistance
 from ctxval.certificates.sample import Sample
 from ctxval.core.space import DISTRIBUTION, TaskSpace
@@ -16,7 +16,7 @@ from ctxval.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
-class Provenance:
+class Provenance(ShortRepr):
     """Facts on a campaign, besides its trials, that concern a certificate.
 
     Attributes:
@@ -60,8 +60,6 @@ class Provenance:
             CertificateError: if there is no trial, or one is still open.
         """
         return replace(Sample.of(trials, self.search, self.learned), distribution=self.distribution)
-
-    __repr__ = record
 
 
 def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval.certificates.learned import LearnedDistance
 from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
@@ -23,7 +23,7 @@ _SAME_TASK = 1e-9
 
 
 @dataclass(frozen=True)
-class MadeGood:
+class MadeGood(ShortRepr):
     """A failed trial whose task was executed with success later.
 
     Attributes:
@@ -35,11 +35,10 @@ class MadeGood:
     trial: int
     by: int
     because: str | None
-    __repr__ = record
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class Sample(ShortRepr):
     """Executed trials as a certificate sees them: points, distances, and why each task was chosen.
 
     Attributes:
@@ -85,9 +84,6 @@ class Sample:
         if "open" in self.states:
             waiting = [str(n) for n, state in zip(self.numbers, self.states, strict=True) if state == "open"]
             raise CertificateError(f"trials are open: {', '.join(waiting)}; tell how they ended before certifying.")
-
-    def __repr__(self) -> str:
-        return call(self, len(self), best=self.best, failed=self.failed, points=self.points)
 
     def __len__(self) -> int:
         return len(self.distances)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, checked
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.certificates.covering import covering, most_contested
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
@@ -27,7 +27,7 @@ from ctxval.errors import CertificateError, InputError
 
 
 @dataclass(frozen=True, eq=False)
-class StoppingDecision:
+class StoppingDecision(ShortRepr):
     """Whether a campaign stops, and the next task that the rule asks for.
 
     Attributes:
@@ -37,7 +37,6 @@ class StoppingDecision:
 
     decided: bool = False
     next_point: Array | None = None
-    __repr__ = record
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Screening:
 
 @checked
 @dataclass(frozen=True)
-class StoppingRule:
+class StoppingRule(ShortRepr):
     """The rule by which a campaign stops when its verdict on a threshold is reached.
 
     Attributes:
@@ -144,8 +143,6 @@ class StoppingRule:
             < self.options.confidence - one.margin
             for one in self.screenings
         )
-
-    __repr__ = record
 
 
 def _ended(trials: Sequence[Trial]) -> Sample:

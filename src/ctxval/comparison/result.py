@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ctxval._util.representation import call, line, lines
+from ctxval._util.representation import ShortRepr, call, line, lines
 from ctxval._util.representation import table as html_table
 from ctxval.comparison.candidates import Question
 from ctxval.core.space import Point
@@ -20,7 +20,7 @@ WORDS: dict[Question, str] = {"worst": "largest distance d*", "mean": "expected 
 
 
 @dataclass(frozen=True)
-class CandidateResult:
+class CandidateResult(ShortRepr):
     """What is known of one candidate.
 
     Attributes:
@@ -44,9 +44,6 @@ class CandidateResult:
     bound: float | None
     draws: int
     mean: float | None
-
-    def __repr__(self) -> str:
-        return call(self, self.name, executions=self.executions, largest=self.largest, bound=self.bound, mean=self.mean)
 
 
 @dataclass(frozen=True)

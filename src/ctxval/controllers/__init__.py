@@ -6,8 +6,8 @@ from ctxval._util.registry import Registry
 from ctxval.controllers.ilqr import ILQR, ILQRSolution
 from ctxval.controllers.lqr import LQR, StationaryLQR
 from ctxval.controllers.mpc import MPC, RecedingHorizon
-from ctxval.controllers.onnx_policy import BoundOnnxPolicy, OnnxPolicy
-from ctxval.core.controller import AffineFeedback, Limits, Policy, Synthesizer
+from ctxval.controllers.onnx_policy import OnnxPolicy
+from ctxval.core.controller import AffineFeedback, BoundPolicy, Limits, Policy, Synthesizer
 from ctxval.core.exchange import ControllerFile, read_controller, write_controller
 
 __all__ = [
@@ -16,7 +16,7 @@ __all__ = [
     "MPC",
     "REGISTRY",
     "AffineFeedback",
-    "BoundOnnxPolicy",
+    "BoundPolicy",
     "ControllerFile",
     "ILQRSolution",
     "Limits",

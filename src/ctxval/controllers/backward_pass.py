@@ -15,18 +15,9 @@ from ctxval.controllers.cost import QuadraticCost
 from ctxval.controllers.riccati import linear_gains
 from ctxval.core.controller import Limits
 
-_STEP_LENGTHS = 0.5 ** np.arange(12)
-"""Step lengths of projected Newton steps, the longest first."""
-_FEW = 16
-"""Number of entries below which LAPACK inverts matrices of two rows faster than the closed form."""
-_ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
-"""Signs of the entries of the adjugate of a matrix of two rows."""
-_NEWTON_STEPS = 50
-"""Largest number of projected Newton steps for inputs with limits."""
-_NEWTON_DECREASE = 0.1
-"""Share of its linear decrease that a projected Newton step must reach."""
-_NEWTON_SETTLED = 1e-26
-"""Share of the largest decrease so far at which projected Newton steps have converged."""
+_STEP_LENGTHS = 0.5 ** np.arange(12)  # of projected Newton steps
+_NEWTON_DECREASE = 0.1  # share of its linear decrease that a projected Newton step must reach
+_ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])  # signs of the entries of the adjugate of a matrix of two rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +33,7 @@ class Change:
 
 
 @dataclass(frozen=True, eq=False)
-class Policy:
+class InputStep:
     """A step of the inputs with its feedback, and what it is expected to change.
 
     Attributes:
@@ -78,14 +69,10 @@ class Expansion:
         return self.A.ndim == 2 and self.B.ndim == 2
 
 
-def minimise(cost: QuadraticCost, around: Expansion, limits: Limits | None, damping: Array) -> Policy:
+def minimise(cost: QuadraticCost, around: Expansion, limits: Limits | None, damping: Array) -> InputStep:
     """Return the step that minimises the expansion of the cost, over inputs within the limits.
 
-    Args:
-        cost: the weights.
-        around: the states, inputs and derivatives.
-        limits: limits of the inputs, if any.
-        damping: added to the curvature of the inputs of each task, shape ``(N,)``.
+    The damping ``(N,)`` is added to the curvature of the inputs of each task.
     """
     damped = bool(damping.any())
     if limits is None and around.linear and not damped:
@@ -95,7 +82,7 @@ def minimise(cost: QuadraticCost, around: Expansion, limits: Limits | None, damp
     return _recursion(cost, around, _Stage(ridge, box))
 
 
-def _linear(cost: QuadraticCost, around: Expansion) -> Policy:
+def _linear(cost: QuadraticCost, around: Expansion) -> InputStep:
     """Return the step for a linear model: its gains are known, so only the slope of the cost-to-go is computed."""
     horizon, batch = around.inputs.shape[:2]
     known = linear_gains(cost, around.A, around.B, horizon)
@@ -109,10 +96,10 @@ def _linear(cost: QuadraticCost, around: Expansion) -> Policy:
     Q_u = weighed + slopes @ around.B
     k = -Q_u @ known.inverses
     slope = _inner(k, Q_u)
-    return Policy(known.gains, k, Change(slope, -slope))
+    return InputStep(known.gains, k, Change(slope, -slope))
 
 
-def _recursion(cost: QuadraticCost, around: Expansion, stage: _Stage) -> Policy:
+def _recursion(cost: QuadraticCost, around: Expansion, stage: _Stage) -> InputStep:
     """Expand the cost-to-go as ``v'dx + 1/2 dx'V dx`` from the horizon to the start.
 
     With z = (x, u) and F = (A, B), its expansion in z is ``q'dz + 1/2 dz'M dz`` with q = (Q_x, Q_u) and M of the blocks
@@ -138,7 +125,7 @@ def _recursion(cost: QuadraticCost, around: Expansion, stage: _Stage) -> Policy:
             v += times(Q_uu_k[t] + Q_u, K)
             V = V + _T(K) @ (Q_uu @ K + Q_ux)
         V = 0.5 * (V + _T(V))
-    return Policy(K_all, k_all, Change(_inner(k_all, slopes), _inner(k_all, Q_uu_k)))
+    return InputStep(K_all, k_all, Change(_inner(k_all, slopes), _inner(k_all, Q_uu_k)))
 
 
 def _joined(around: Expansion, shape: tuple[int, int]) -> tuple[Array, Array]:
@@ -196,13 +183,13 @@ def _within(box: tuple[Array, Array], best: Array, Q_uu: Array, Q_u: Array, Q_ux
     (low, high), m = box, Q_u.shape[-1]
     k = np.clip(best, low, high)
     largest = float(-(Q_u * best).sum(axis=-1).min())
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(50):
         slope = Q_u + times(k, Q_uu)
         free = ~(((k <= low) & (slope > 0)) | ((k >= high) & (slope < 0)))
         inverse = _inverses(np.where(free[:, :, None] & free[:, None, :], Q_uu, np.eye(m)))
         direction = -times(np.where(free, slope, 0.0), inverse)
         decrease = float(-np.where(free, slope * direction, 0.0).sum(axis=-1).min())
-        if decrease <= _NEWTON_SETTLED * largest:
+        if decrease <= 1e-26 * largest:
             break
         k = _projected(k, direction, slope, Q_uu, box)
     return -inverse @ np.where(free[:, :, None], Q_ux, 0.0), k
@@ -235,12 +222,12 @@ def _inverses(matrices: Array) -> Array:
     m = matrices.shape[-1]
     if m == 1:
         return 1.0 / matrices
-    if m > 2 or matrices.size < _FEW:
+    if m > 2 or matrices.size < 16:  # LAPACK inverts few matrices of two rows faster than the closed form
         return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
     determinants = matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0]
-    found = np.swapaxes(matrices[..., ::-1, ::-1], -1, -2) * _ADJUGATE
-    found *= (1.0 / determinants)[..., None, None]
-    return np.asarray(found)
+    inverses = np.swapaxes(matrices[..., ::-1, ::-1], -1, -2) * _ADJUGATE
+    inverses *= (1.0 / determinants)[..., None, None]
+    return np.asarray(inverses)
 
 
 def times(rows: Array, matrix: np.ndarray[Any, np.dtype[np.floating[Any]]]) -> Array:

@@ -5,22 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_weight
-from ctxval._util.representation import Shown, call, weight
+from ctxval._util.representation import ShortRepr
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
 
 
-class QuadraticCost:
+class QuadraticCost(ShortRepr):
     """The cost ``1/2 sum_t (x_t - r_t)' Q (x_t - r_t) + u_t' R u_t``, with ``Q_final`` instead of Q at the horizon.
 
     Args:
         Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
         R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``; positive definite.
         Q_final: weight of the last state, in the same form as Q; Q by default.
-
-    Raises:
-        InputError: if a weight is not symmetric positive semidefinite, or R is not positive definite.
-        ShapeError: if a weight is not a square matrix or a diagonal, or Q_final does not have the shape of Q.
     """
 
     def __init__(self, Q: ArrayLike, R: ArrayLike, Q_final: ArrayLike | None = None) -> None:
@@ -44,11 +40,3 @@ class QuadraticCost:
         final = deviations[-1]
         cost = ((running @ self.Q) * running).sum(axis=(0, -1)) + ((inputs @ self.R) * inputs).sum(axis=(0, -1))
         return np.asarray(0.5 * (cost + ((final @ self.Q_final) * final).sum(axis=-1)))
-
-    def weights(self) -> dict[str, Shown]:
-        """Return the weights by name, as they are shown; ``Q_final`` only if it is not Q."""
-        names = ("Q", "R") if self.Q_final is self.Q else ("Q", "R", "Q_final")
-        return {name: weight(getattr(self, name)) for name in names}
-
-    def __repr__(self) -> str:
-        return call(self, **self.weights())

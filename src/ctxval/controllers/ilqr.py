@@ -10,8 +10,8 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
 from ctxval._util.checked import PositiveFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval._util.representation import call, record
-from ctxval.controllers.backward_pass import Expansion, Policy, minimise
+from ctxval._util.representation import ShortRepr
+from ctxval.controllers.backward_pass import Expansion, InputStep, minimise
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike, fed_back
 from ctxval.core.model import Model, linearize
@@ -19,26 +19,11 @@ from ctxval.core.task import Task
 from ctxval.errors import DesignError, ModelError
 
 _STEP_LENGTHS: Array = np.asarray(0.5 ** np.arange(12), dtype=np.float64)
-"""Step lengths of the line search, the longest first."""
-_TOGETHER = 4
-"""Largest number of step lengths that are tried in one call; most tasks that need a shorter step need one of these."""
-_LOOPS = 256
-"""Number of loops on a model that takes batches, up to which one more costs little."""
-_SUFFICIENT_DECREASE = 1e-4
-"""Share of the expected decrease of the cost that a step must reach."""
-_DAMPING_MIN = 1e-6
-"""Smallest damping that is not zero."""
-_DAMPING_MAX = 1e10
-"""Damping above which the iteration of a task stops, because no step improves its cost."""
-_ROUNDING = 1e12
-"""Largest ratio of the old cost to the new one in one step; beyond it rounding errors call for another step.
-
-Below it the relative error of the states is below 1e-10.
-"""
+_LEAST_DAMPING = 1e-6  # that is not zero
 
 
 @dataclass(frozen=True, eq=False)
-class ILQRSolution:
+class ILQRSolution(ShortRepr):
     """The solution of iLQR for one task or a batch.
 
     Attributes:
@@ -53,11 +38,10 @@ class ILQRSolution:
     cost: Array
     iterations: Array
     converged: Array
-    __repr__ = record
 
 
 @part()
-class ILQR:
+class ILQR(ShortRepr):
     """Finite-horizon iterative LQR on any model, for a whole batch of tasks at once.
 
     It minimises a quadratic cost on the deviation from the task's reference. On a linear model without limits it
@@ -67,17 +51,10 @@ class ILQR:
     limit get no feedback, and roll-outs are clipped. The controller clips its inputs on the model and on the system.
 
     Args:
-        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
-        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
-        Q_final: weight of the last state; Q by default.
+        Q, R, Q_final: weights of the state, the input and the last state (Q by default), as diagonals or as matrices.
         iterations: largest number of steps for one task.
         tolerance: the iteration stops if the next step would lower the cost by less than this fraction of it.
-        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
-            rows ``[low, high]``, one for each input.
-
-    Raises:
-        InputError: if a weight is not positive semidefinite, R is not positive definite, or the limits are ambiguous
-            or not low < high.
+        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
     batched = True
@@ -124,11 +101,6 @@ class ILQR:
             descent.undamp(np.flatnonzero(~descent.converged))
         return descent.solution(task.batch_shape)
 
-    def __repr__(self) -> str:
-        return call(
-            self, **self.cost.weights(), iterations=self.iterations, tolerance=self.tolerance, limits=self.limits
-        )
-
 
 class _Descent:
     """The iterates of all tasks, time first: states X ``(H+1, N, n)``, inputs U ``(H, N, m)``."""
@@ -153,12 +125,13 @@ class _Descent:
         self.iterations = np.zeros(batch, dtype=int)
         self.converged = np.zeros(batch, dtype=bool)
         # Steps of a plain function cost as much in a batch as one by one, so step lengths are not tried together.
-        self.together = _TOGETHER if getattr(model, "vectorized", True) else 1
+        # Most tasks that need a shorter step need one of the first four.
+        self.together = 4 if getattr(model, "vectorized", True) else 1
         self.latest: tuple[Rows, Array, Array] | None = None  # the latest derivatives, and their tasks
 
     def active_rows(self) -> Rows:
         """Return the tasks whose iteration continues."""
-        stuck = self.damping > _DAMPING_MAX
+        stuck = self.damping > 1e10  # no step improves the cost
         return np.flatnonzero(~self.converged & ~stuck & (self.iterations < self.settings.iterations))
 
     def advance(self, rows: Rows) -> None:
@@ -175,8 +148,9 @@ class _Descent:
         moved = self._line_search(rows, policy, np.flatnonzero(~arrived))
         if around.linear and self.limits is None:
             # The model is linear, so the step was the exact minimiser, and its gains hold everywhere. If the cost was
-            # far larger before, as on an unstable model, rounding errors call for another step.
-            self.converged[rows[moved]] = (before <= _ROUNDING * self.J[rows])[moved]
+            # far larger before, as on an unstable model, rounding errors call for another step. Up to this ratio the
+            # relative error of the states is below 1e-10.
+            self.converged[rows[moved]] = (before <= 1e12 * self.J[rows])[moved]
 
     def undamp(self, rows: Rows) -> None:
         """Give tasks that did not converge the gains of an undamped step at their last iterates.
@@ -196,13 +170,13 @@ class _Descent:
         finite = np.isfinite(policy.K).all(axis=(0, -2, -1)) & np.ones(len(rows), dtype=bool)
         self._keep(policy, np.flatnonzero(finite), rows)
 
-    def _step(self, rows: Rows) -> tuple[Expansion, Policy]:
+    def _step(self, rows: Rows) -> tuple[Expansion, InputStep]:
         """Return the expansion at the iterates of these tasks, and the step that minimises it."""
         X, U = self.X[:, rows], self.U[:, rows]
         around = Expansion(X - self.reference[:, rows], U, *self._linearised(rows, X, U))
         return around, minimise(self.cost, around, self.limits, self.damping[rows])
 
-    def _keep(self, policy: Policy, chosen: Rows, rows: Rows) -> None:
+    def _keep(self, policy: InputStep, chosen: Rows, rows: Rows) -> None:
         """Keep the gains of some of the tasks of a step."""
         self.K[:, rows[chosen]] = policy.K[:, chosen] if policy.K.ndim == 4 else policy.K[:, None]
 
@@ -213,7 +187,7 @@ class _Descent:
             known = self.latest = rows, *linearize(self.model, X[:-1], U)
         return known[1:]
 
-    def _line_search(self, rows: Rows, policy: Policy, waiting: Rows) -> Rows:
+    def _line_search(self, rows: Rows, policy: InputStep, waiting: Rows) -> Rows:
         """Accept for each waiting task the longest step that lowers its cost; return the tasks with such a step.
 
         A task whose last step was the full one tries only this at first. Others try several lengths in one call.
@@ -221,26 +195,27 @@ class _Descent:
         moved, tried = [waiting[:0]], np.zeros(len(waiting), dtype=int)
         while len(waiting):
             several = self.shortened[rows[waiting]] | (tried > 0)
-            width = int(np.clip(_LOOPS // max(1, several.sum()), 1, self.together))
+            # Up to 256 loops on a model that takes batches, one more costs little.
+            width = int(np.clip(256 // max(1, several.sum()), 1, self.together))
             counts = np.minimum(np.where(several, width, 1), len(_STEP_LENGTHS) - tried)
             accepted = self._try(rows, policy, waiting, tried, counts)
             moved.append(waiting[accepted])
             waiting, tried = waiting[~accepted], (tried + counts)[~accepted]
             exhausted = tried == len(_STEP_LENGTHS)
             refused = rows[waiting[exhausted]]
-            self.damping[refused] = np.maximum(_DAMPING_MIN, 10 * self.damping[refused])
+            self.damping[refused] = np.maximum(_LEAST_DAMPING, 10 * self.damping[refused])
             self.refused[refused] = self.shortened[refused] = True
             waiting, tried = waiting[~exhausted], tried[~exhausted]
         return np.concatenate(moved)
 
-    def _try(self, rows: Rows, policy: Policy, waiting: Rows, tried: Rows, counts: Rows) -> Mask:
+    def _try(self, rows: Rows, policy: InputStep, waiting: Rows, tried: Rows, counts: Rows) -> Mask:
         """Try the next ``counts`` step lengths of each waiting task in one call; return which tasks have moved."""
         of = np.repeat(np.arange(len(waiting)), counts)
         index = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts - tried, counts)
         lengths, tasks = _STEP_LENGTHS[index], waiting[of]
         X, U, J = self._forward(rows[tasks], policy, tasks, lengths)
         expected = lengths * policy.change.slope[tasks] + 0.5 * lengths**2 * policy.change.curvature[tasks]
-        good = np.flatnonzero(self.J[rows[tasks]] - J >= -_SUFFICIENT_DECREASE * expected)
+        good = np.flatnonzero(self.J[rows[tasks]] - J >= -1e-4 * expected)
         moved, first = np.unique(of[good], return_index=True)
         chosen, to = good[first], rows[waiting[moved]]
         self.X[:, to], self.U[:, to], self.J[to] = X[:, chosen], U[:, chosen], J[chosen]
@@ -248,10 +223,10 @@ class _Descent:
         self.iterations[to] += 1
         self.refused[to] = False
         self.shortened[to] = index[chosen] > 0
-        self.damping[to] = np.where(self.damping[to] > _DAMPING_MIN, self.damping[to] / 10, 0.0)
+        self.damping[to] = np.where(self.damping[to] > _LEAST_DAMPING, self.damping[to] / 10, 0.0)
         return np.isin(np.arange(len(waiting)), moved)
 
-    def _forward(self, rows: Rows, policy: Policy, tasks: Rows, lengths: Array) -> tuple[Array, Array, Array]:
+    def _forward(self, rows: Rows, policy: InputStep, tasks: Rows, lengths: Array) -> tuple[Array, Array, Array]:
         """Run the model under ``u = u_old + length * k + K (x - x_old)``; return states, inputs and costs."""
         X_old = self.X[:, rows]
         U = self.U[:, rows] + lengths[:, None] * policy.k[:, tasks]

@@ -8,7 +8,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.controllers.riccati import LinearGains, linear_gains
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
@@ -18,7 +18,7 @@ from ctxval.errors import DesignError, InputError
 
 
 @part()
-class LQR:
+class LQR(ShortRepr):
     """The linear-quadratic regulator that tracks the task's reference over its horizon.
 
     A nonlinear model is linearised once, at the task's initial state and zero input.
@@ -27,15 +27,8 @@ class LQR:
     are optimal as long as no limit is reached. iLQR and MPC take limits into account in the design.
 
     Args:
-        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
-        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
-        Q_final: weight of the last state; Q by default.
-        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
-            rows ``[low, high]``, one for each input.
-
-    Raises:
-        InputError: if a weight is not positive semidefinite, R is not positive definite, or the limits are ambiguous
-            or not low < high.
+        Q, R, Q_final: weights of the state, the input and the last state (Q by default), as diagonals or as matrices.
+        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
     batched = True
@@ -65,12 +58,9 @@ class LQR:
         """Return what identifies this synthesizer in a store."""
         return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
 
-    def __repr__(self) -> str:
-        return call(self, **self.cost.weights(), limits=self.limits)
-
 
 @part()
-class StationaryLQR:
+class StationaryLQR(ShortRepr):
     """The infinite-horizon linear-quadratic regulator, with one gain from the algebraic Riccati equation.
 
     The feedback ``u = u_g + K (x - r_t)`` follows the task's reference. The input u_g holds the task's goal as well as
@@ -80,14 +70,8 @@ class StationaryLQR:
     Limits only clip the inputs, as for :class:`LQR`.
 
     Args:
-        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
-        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
-        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
-            rows ``[low, high]``, one for each input.
-
-    Raises:
-        InputError: if a weight is not positive semidefinite, R is not positive definite, or the limits are ambiguous
-            or not low < high.
+        Q, R: weights of the state and the input, as diagonals or as matrices.
+        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
     batched = True
@@ -117,9 +101,6 @@ class StationaryLQR:
     def describe(self) -> dict[str, Any]:
         """Return what identifies this synthesizer in a store."""
         return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
-
-    def __repr__(self) -> str:
-        return call(self, **self.cost.weights(), limits=self.limits)
 
 
 def _require_inputs(cost: QuadraticCost, B: Array) -> None:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
 from ctxval._util.checked import PositiveFloat, PositiveInt
+from ctxval._util.extras import require_extra
 from ctxval._util.registry import part
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval.controllers.cost import QuadraticCost
 from ctxval.core.controller import Limits, LimitsLike
 from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task
-from ctxval.errors import DesignError, InputError, ShapeError
+from ctxval.errors import DesignError, ShapeError
 
 _SETTLED = 1e-9  # relative change of the cost at which the iteration stops
 _STEP_LENGTHS = 0.5 ** np.arange(10)
@@ -25,7 +25,7 @@ _STRICT = 1e-6  # quadratic share of the cost of a violation, which keeps the pr
 
 
 @part()
-class MPC:
+class MPC(ShortRepr):
     """Receding-horizon control that plans with limits, by sequential quadratic programming in CasADi.
 
     At every step it minimises the quadratic cost of the model's prediction over the next steps, relative to the task's
@@ -38,18 +38,12 @@ class MPC:
     ``violation_cost`` makes the state limits soft, so that there is always a solution.
 
     Args:
-        Q: weight of the state, as a diagonal ``(n,)`` or a matrix ``(n, n)``.
-        R: weight of the input, as a diagonal ``(m,)`` or a matrix ``(m, m)``.
-        Q_final: weight of the last predicted state; Q by default.
+        Q, R, Q_final: weights of the state, the input and the last state (Q by default), as diagonals or as matrices.
         steps: number of predicted steps.
-        limits: limits of the inputs: one number h for -h to h, ``Limits(low=, high=)``, a mapping of low and high, or
-            rows ``[low, high]``, one for each input.
+        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
         state_limits: limits of the states, in the same forms; infinite for states without limits.
         violation_cost: cost of exceeding the state limits by 1, for each predicted step; None makes them hard.
         iterations: largest number of quadratic programs for one input.
-
-    Raises:
-        InputError: if CasADi is not installed, or a weight, limit or number cannot be used.
     """
 
     batched = False
@@ -72,26 +66,18 @@ class MPC:
         self.limits = Limits.of(np.inf if limits is None else limits, m)
         self.state_limits = Limits.of(np.inf if state_limits is None else state_limits, n)
         self.violation_cost = violation_cost
-        _casadi()
+        require_extra("casadi", "mpc", "MPC controllers")
 
     def design(self, task: Task, model: Model) -> RecedingHorizon:
-        """Return the controller, which solves an optimal control problem at every step.
-
-        Raises:
-            ShapeError: if the task is a batch, or its number of states differs from that of the weights.
-        """
+        """Return the controller, which solves an optimal control problem at every step."""
         self.cost.require_task(task)
         if task.batch_shape:
             raise ShapeError(f"MPC designs for one task at a time, got a batch of shape {task.batch_shape}.")
         return RecedingHorizon(self, task, model)
 
-    def __repr__(self) -> str:
-        bounds = {"limits": self.limits, "state_limits": self.state_limits, "violation_cost": self.violation_cost}
-        return call(self, **self.cost.weights(), steps=self.steps, iterations=self.iterations, **bounds)
-
 
 @dataclass(frozen=True, eq=False)
-class RecedingHorizon:
+class RecedingHorizon(ShortRepr):
     """The controller of :class:`MPC` for one task."""
 
     settings: MPC
@@ -99,11 +85,7 @@ class RecedingHorizon:
     model: Model
 
     def __call__(self, t: int, x: Array) -> Array:
-        """Return the input ``(m,)`` at step t.
-
-        Raises:
-            DesignError: if no inputs keep the prediction within the state limits, or the prediction is not finite.
-        """
+        """Return the input ``(m,)`` at step t."""
         first: Array = self.plan(t, x)[1][0]
         return first
 
@@ -118,8 +100,6 @@ class RecedingHorizon:
         problem = _Problem(self.settings, self.model, as_floats("the state", x), self.task.reference[rows])
         with np.errstate(all="ignore"):
             return problem.solve(t)
-
-    __repr__ = record
 
 
 class _Problem:
@@ -173,14 +153,14 @@ class _Problem:
         rows = G[:, self.limited].reshape(-1, steps * m)
         gap_low = (self.settings.state_limits.low - X[1:])[:, self.limited].ravel()
         gap_high = (self.settings.state_limits.high - X[1:])[:, self.limited].ravel()
-        soft = self.settings.violation_cost
+        box, gaps, soft = (low.ravel(), high.ravel()), (gap_low, gap_high), self.settings.violation_cost
         if soft is None or not len(rows):
-            found = _quadratic_program(hessian, slope, rows, (low.ravel(), high.ravel()), (gap_low, gap_high))
+            solution = _quadratic_program(hessian, slope, rows, box, gaps)
         else:
-            found = _softened(hessian, slope, rows, (low.ravel(), high.ravel()), (gap_low, gap_high), soft, steps)
-        if found is None:
+            solution = _softened(hessian, slope, rows, box, gaps, soft, steps)
+        if solution is None:
             return None
-        change, largest = found
+        change, largest = solution
         self.weight = max(self.weight, _EXACT * largest) if soft is None else soft
         return change[: steps * m].reshape(steps, m)
 
@@ -246,7 +226,7 @@ def _quadratic_program(
 
     Returns z and the largest multiplier of a row, or None if there is no solution.
     """
-    casadi = _casadi()
+    casadi = require_extra("casadi", "mpc", "MPC controllers")
     dense = casadi.Sparsity.dense
     sizes = {"h": dense(*hessian.shape), "a": dense(len(rows), len(slope))}
     # DAQP is an active-set method, exact up to rounding, and prints nothing.
@@ -256,11 +236,3 @@ def _quadratic_program(
         return None
     multipliers = np.abs(np.array(solution["lam_a"]).ravel())
     return np.array(solution["x"], dtype=np.float64).ravel(), float(multipliers.max(initial=0.0))
-
-
-def _casadi() -> Any:
-    try:
-        import casadi
-    except ImportError as error:
-        raise InputError('CasADi is not installed: pip install "ctxval[mpc]".') from error
-    return casadi

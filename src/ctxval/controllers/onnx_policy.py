@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,8 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
 from ctxval._util.registry import part
-from ctxval._util.representation import call, record
-from ctxval.core.controller import Limits, LimitsLike, describe_limits, given_limits
+from ctxval._util.representation import ShortRepr
+from ctxval.core.controller import BoundPolicy, Limits, LimitsLike
 from ctxval.core.model import Model
 from ctxval.core.task import Task
 from ctxval.errors import InputError
@@ -22,7 +21,7 @@ Observe = Callable[[int, Array, Task], Array]
 
 
 @part(files=("source",), functions={"observe": "(t, x, task) -> observations"})
-class OnnxPolicy:
+class OnnxPolicy(ShortRepr):
     """A synthesizer that uses the same trained network for every task; the model is not used.
 
     The network takes one row of observations for each task and returns the inputs as its first output, such as the
@@ -34,12 +33,7 @@ class OnnxPolicy:
             the task; by default the observations are the states.
         scale: factor of the network's outputs, a number or ``(m,)``: with a scale of 5 a policy in ``[-1, 1]`` drives
             a motor of 5 N m.
-        limits: limits to which the inputs are clipped: one number h for -h to h, ``Limits(low=, high=)``, a mapping of
-            low and high, or rows ``[low, high]``, one for each input.
-
-    Raises:
-        InputError: if onnxruntime is not installed, the file is not a network with one input, or the limits cannot be
-            used.
+        limits: limits to which inputs are clipped, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
     batched = True
@@ -55,45 +49,21 @@ class OnnxPolicy:
         self.network = OnnxNetwork(source)
         self.observe = observe
         self.scale = scale
-        self.limits = given_limits(limits)
+        self.limits = None if limits is None else Limits.of(limits)
         if len(self.network.widths) != 1:
             raise InputError(
                 f"a policy must have one input, the observations, but the network has {', '.join(self.network.names)}."
             )
 
-    def design(self, task: Task, model: Model) -> BoundOnnxPolicy:
+    def inputs(self, t: int, x: Array, task: Task) -> Array:
+        """Return the inputs ``(..., m)`` at step t before they are clipped."""
+        observations: Any = x if self.observe is None else self.observe(t, x, task)
+        return self.network(np.asarray(observations, dtype=np.float64)) * self.scale
+
+    def design(self, task: Task, model: Model) -> BoundPolicy:
         """Return the policy bound to the task."""
-        return BoundOnnxPolicy(self, task)
+        return BoundPolicy(self.inputs, task, self.limits)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this synthesizer in a store."""
-        fields = {name: getattr(self, name) for name in ("network", "observe", "scale")}
-        return {**fields, "limits": describe_limits(self.limits)}
-
-    def __repr__(self) -> str:
-        return call(self, self.network, observe=self.observe, scale=self.scale, limits=self.limits)
-
-
-@dataclass(frozen=True, eq=False)
-class BoundOnnxPolicy:
-    """The controller of :class:`OnnxPolicy` for one task or a batch."""
-
-    settings: OnnxPolicy
-    task: Task
-
-    def __call__(self, t: int, x: Array) -> Array:
-        """Return the inputs ``(..., m)`` at step t.
-
-        Raises:
-            ShapeError: if the number of observations differs from the network's.
-        """
-        observe, limits = self.settings.observe, self.settings.limits
-        observations: Any = x if observe is None else observe(t, x, self.task)
-        u = self.settings.network(np.asarray(observations, dtype=np.float64)) * self.settings.scale
-        return u if limits is None else Limits.of(limits, u.shape[-1]).clip(u)
-
-    def __getitem__(self, index: int) -> BoundOnnxPolicy:
-        """Return the controller of one task of the batch."""
-        return BoundOnnxPolicy(self.settings, self.task[index])
-
-    __repr__ = record
+        return {name: getattr(self, name) for name in ("network", "observe", "scale", "limits")}

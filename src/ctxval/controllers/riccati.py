@@ -13,9 +13,6 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.controllers.cost import QuadraticCost
 
-_KEPT = 16
-"""Largest number of models and horizons whose gains are kept: enough for M and its variants in one campaign."""
-
 
 @dataclass(frozen=True, eq=False)
 class LinearGains:
@@ -38,19 +35,13 @@ def linear_gains(cost: QuadraticCost, A: Array, B: Array, horizon: int) -> Linea
     """Return the gains for a linear model; a second call with equal numbers returns the same object.
 
     The numbers themselves are the key, not the model, so a model that is changed in place gets gains of its own.
-
-    Args:
-        cost: the weights.
-        A: matrix of the states, shape ``(n, n)``.
-        B: matrix of the inputs, shape ``(n, m)``.
-        horizon: the number of steps H.
     """
     parts = (A, B, cost.Q, cost.R, cost.Q_final)
     contents = tuple(np.ascontiguousarray(part, dtype=np.float64).tobytes() for part in parts)
     return _recursion(contents, B.shape, horizon)
 
 
-@functools.lru_cache(maxsize=_KEPT)
+@functools.lru_cache(maxsize=16)  # enough for M and its variants in one campaign
 def _recursion(contents: tuple[bytes, ...], shape: tuple[int, int], horizon: int) -> LinearGains:
     """Solve the Riccati recursion backwards, for the contents of A, B, Q, R and Q_final."""
     n, m = shape
@@ -65,7 +56,7 @@ def _recursion(contents: tuple[bytes, ...], shape: tuple[int, int], horizon: int
         steps.append((K, inverse, closed, P))
         P = Q + A.T @ P @ closed
         P = 0.5 * (P + P.T)
-    found = [np.stack(parts[::-1]) for parts in zip(*steps, strict=True)]
-    for array in found:
+    gains = [np.stack(parts[::-1]) for parts in zip(*steps, strict=True)]
+    for array in gains:
         array.flags.writeable = False  # many controllers share it
-    return LinearGains(*found)
+    return LinearGains(*gains)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
 from ctxval._util.registry import part
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
@@ -41,19 +41,14 @@ class Synthesizer(Protocol):
 
 
 def converged_of(controller: object, batch_shape: tuple[int, ...] = ()) -> Mask | None:
-    """Return whether the design of a controller converged, shape ``batch_shape``; None if the controller does not tell.
-
-    Args:
-        controller: a controller of one task or of a batch, with or without the attribute ``converged``.
-        batch_shape: the shape of the batch of tasks; ``()`` for one task.
-    """
-    told = getattr(controller, "converged", None)
-    if told is None:
+    """Return whether the design of a controller converged, of the shape of its batch; None if it does not tell."""
+    given = getattr(controller, "converged", None)
+    if given is None:
         return None
-    found = np.asarray(told)
-    if found.dtype != np.bool_ or found.shape not in ((), batch_shape):
-        raise ShapeError(f"converged of a controller must be booleans of shape {batch_shape}, got {told!r}.")
-    return np.broadcast_to(found, batch_shape)
+    converged = np.asarray(given)
+    if converged.dtype != np.bool_ or converged.shape not in ((), batch_shape):
+        raise ShapeError(f"converged of a controller must be booleans of shape {batch_shape}, got {given!r}.")
+    return np.broadcast_to(converged, batch_shape)
 
 
 _SPELLINGS = (
@@ -63,16 +58,12 @@ _SPELLINGS = (
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Limits:
+class Limits(ShortRepr):
     """Limits of the inputs, ``low <= u <= high``.
 
     Attributes:
         low, high: the lower and upper limits: a number for all inputs, or one for each input, shape ``(m,)``; infinite
             if there is no limit.
-
-    Raises:
-        InputError: if a limit is NaN, or a lower limit is not below its upper limit.
-        ShapeError: if the limits are neither numbers nor lists of the same length.
     """
 
     low: Array
@@ -103,19 +94,15 @@ class Limits:
             limits: one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and
                 high, numbers or ``(m,)``; or rows ``[low, high]``, one for each input, shape ``(m, 2)``.
             inputs: the number of inputs m, to which single numbers are expanded; None leaves them as they are.
-
-        Raises:
-            InputError: if the limits are ambiguous or NaN, or a lower limit is not below its upper limit.
-            ShapeError: if the number of limits is not the number of inputs.
         """
-        found = limits if isinstance(limits, Limits) else _read_limits(limits)
+        box = limits if isinstance(limits, Limits) else _read_limits(limits)
         if inputs is None:
-            return found
-        if any(bound.shape not in ((), (inputs,)) for bound in (found.low, found.high)):
+            return box
+        if any(bound.shape not in ((), (inputs,)) for bound in (box.low, box.high)):
             raise ShapeError(
-                f"limits must be numbers or have shape ({inputs},), got {found.low.shape} and {found.high.shape}."
+                f"limits must be numbers or have shape ({inputs},), got {box.low.shape} and {box.high.shape}."
             )
-        return cls(*(np.array(np.broadcast_to(bound, (inputs,))) for bound in (found.low, found.high)))
+        return cls(*(np.array(np.broadcast_to(bound, (inputs,))) for bound in (box.low, box.high)))
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies these limits in a store."""
@@ -124,8 +111,6 @@ class Limits:
     def clip(self, u: Array) -> Array:
         """Return inputs ``(..., m)`` clipped to the limits; NaN stays NaN."""
         return np.asarray(np.clip(u, self.low, self.high))
-
-    __repr__ = record
 
 
 LimitsLike = float | Limits | Mapping[str, ArrayLike] | ArrayLike
@@ -157,33 +142,13 @@ def _flat(listed: list[float]) -> InputError:
     """Return the error that limits are a flat list, with the forms in which the user can write them instead."""
     ways = []
     if len(listed) == 2 and listed[0] < listed[1]:
-        ways.append(f"{_table(*listed)} for {listed[0]:g} to {listed[1]:g} of every input")
+        low, high = listed
+        ways.append(f"{{ low = {low}, high = {high} }} for {low:g} to {high:g} of every input")
     if all(high > 0 for high in listed):
         ways.append(f"{[[-high, high] for high in listed]} for one row [low, high] for each input")
     if len(ways) == 2:
         return InputError(f"limits {listed} can be read in two ways: write {ways[0]}, or {ways[1]}.")
     return InputError(f"limits must not be a flat list, got {listed}: {'write ' + ways[0] if ways else _SPELLINGS}.")
-
-
-def _table(low: Any, high: Any) -> str:
-    return f"{{ low = {low}, high = {high} }}"
-
-
-def given_limits(limits: LimitsLike | None) -> float | Limits | None:
-    """Check limits while the number of inputs is not known yet; return them, with a single number as a number."""
-    if limits is None:
-        return None
-    found = Limits.of(limits)
-    # Stores of version 0.1.0 describe a single number as a number.
-    given_a_number = not isinstance(limits, Limits | Mapping) and np.ndim(limits) == 0
-    return float(found.high) if given_a_number else found
-
-
-def describe_limits(limits: float | Limits | None) -> Any:
-    """Return what identifies the limits of a policy in a store, in the form of version 0.1.0 if it is unambiguous."""
-    if not isinstance(limits, Limits) or not (limits.low.ndim or limits.high.ndim):
-        return limits
-    return [limits.low.tolist(), limits.high.tolist()]
 
 
 def fed_back(K: Array, deviations: Array) -> Array:
@@ -193,7 +158,7 @@ def fed_back(K: Array, deviations: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class AffineFeedback:
+class AffineFeedback(ShortRepr):
     """Time-varying affine feedback ``u = v_t + K_t (x - x_t)``, clipped to its limits if it has any.
 
     Attributes:
@@ -211,11 +176,7 @@ class AffineFeedback:
     converged: Mask | None = None
 
     def __call__(self, t: int, x: Array) -> Array:
-        """Return the input at step t, shape ``(..., m)``.
-
-        Raises:
-            InputError: if the task has no such step.
-        """
+        """Return the input at step t, shape ``(..., m)``."""
         steps = self.inputs.shape[-2]
         if not 0 <= t < steps:
             raise InputError(f"the controller has inputs for the steps 0 to {steps - 1}, got step {t}.")
@@ -229,22 +190,15 @@ class AffineFeedback:
         converged = None if self.converged is None else np.asarray(self.converged[index])
         return AffineFeedback(gains, self.inputs[index], self.states[index], self.limits, converged)
 
-    def __repr__(self) -> str:
-        return call(self, gains=self.gains, inputs=self.inputs, limits=self.limits)
-
 
 @part(functions={"policy": "(t, x, task) -> u"})
-class Policy:
+class Policy(ShortRepr):
     """A synthesizer that uses the same policy ``policy(t, x, task) -> u`` for every task.
 
     Args:
         policy: function of the step's index, the states ``(..., n)`` and the task; returns the inputs ``(..., m)``.
         vectorized: False if the policy takes only one state ``(n,)`` at a time.
-        limits: limits to which the inputs are clipped: one number h for -h to h, ``Limits(low=, high=)``, a mapping of
-            low and high, or rows ``[low, high]``, one for each input.
-
-    Raises:
-        InputError: if the limits are ambiguous, or a lower limit is not below its upper limit.
+        limits: limits to which inputs are clipped, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
     def __init__(
@@ -256,34 +210,30 @@ class Policy:
     ) -> None:
         self.policy = policy
         self.batched = vectorized
-        self.limits = given_limits(limits)
+        self.limits = None if limits is None else Limits.of(limits)
 
     def design(self, task: Task, model: Model) -> Controller:
         """Return the policy bound to the task; the model is not used."""
-        return _BoundPolicy(self.policy, task, self.limits)
+        return BoundPolicy(self.policy, task, self.limits)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this synthesizer in a store."""
-        return {"policy": self.policy, **({} if self.limits is None else {"limits": describe_limits(self.limits)})}
-
-    def __repr__(self) -> str:
-        return call(self, self.policy, vectorized=self.batched, limits=self.limits)
+        return {"policy": self.policy, **({} if self.limits is None else {"limits": self.limits})}
 
 
 @dataclass(frozen=True, eq=False)
-class _BoundPolicy:
-    """A policy for one task or a batch; unlike a lambda it can be pickled for another process."""
+class BoundPolicy(ShortRepr):
+    """The controller of a policy for one task or a batch; unlike a lambda it can be pickled for another process."""
 
     policy: Callable[[int, Array, Task], Array]
     task: Task
-    limits: float | Limits | None
+    limits: Limits | None
 
     def __call__(self, t: int, x: Array) -> Array:
+        """Return the inputs ``(..., m)`` at step t, within the limits."""
         u = np.asarray(self.policy(t, x, self.task), dtype=np.float64)
         return u if self.limits is None else Limits.of(self.limits, u.shape[-1]).clip(u)
 
-    def __getitem__(self, index: int) -> _BoundPolicy:
+    def __getitem__(self, index: int) -> BoundPolicy:
         """Return the controller of one task of the batch."""
-        return _BoundPolicy(self.policy, self.task[index], self.limits)
-
-    __repr__ = record
+        return BoundPolicy(self.policy, self.task[index], self.limits)

@@ -25,13 +25,7 @@ def write_columns(
     state_names: Sequence[str] | None,
     input_names: Sequence[str] | None,
 ) -> None:
-    """Write times ``(H + 1,)``, states ``(H + 1, n)`` and inputs ``(H, m)`` as CSV; the last row has no inputs.
-
-    Args:
-        path: the file.
-        times, states, inputs: the numbers.
-        state_names, input_names: the names of the columns; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
-    """
+    """Write times ``(H + 1,)``, states ``(H + 1, n)`` and inputs ``(H, m)`` as CSV; the last row has no inputs."""
     n, m = states.shape[-1], inputs.shape[-1]
     header = ["t", *_column_names("x", state_names, n), *_column_names("u", input_names, m)]
     with written_whole(path, text=True) as file:
@@ -91,12 +85,12 @@ def _chosen(table: CsvTable, letter: str, names: Sequence[str] | None) -> dict[s
         count = sum(1 for plain in units if plain[:1] == letter and plain[1:].isdigit())
         columns = {f"{letter}{i}": units.get(f"{letter}{i}") for i in range(count)}
         wanted = dict(zip(columns, wanted.values(), strict=False)) if len(wanted) == count else {}
-    found = dict[str, float]()
+    factors = dict[str, float]()
     for name, column in columns.items():
         if column is None:
             raise InputError(f"{path} has no column {name}; there are {_listed(table.names)}.")
         try:
-            found[column[0]] = conversion(column[1], wanted.get(name) or column[1]) if column[1] else 1.0
+            factors[column[0]] = conversion(column[1], wanted.get(name) or column[1]) if column[1] else 1.0
         except InputError:
             raise InputError(f"{path} has {name} in {column[1]}, and {wanted[name]} is needed.") from None
-    return found
+    return factors

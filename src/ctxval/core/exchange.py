@@ -17,7 +17,7 @@ import numpy as np
 from ctxval._util.arrays import Array, as_finite, as_floats
 from ctxval._util.files import read_bytes, read_json, written_whole
 from ctxval._util.npz import Archive
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import AffineFeedback, Limits
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
@@ -31,19 +31,12 @@ Content = TypeVar("Content")
 Names = Mapping[str, str]
 """The names of states or inputs, and their units."""
 
-_UNREADABLE = (
-    *(ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, MemoryError, RecursionError),
-)
-"""Exceptions that content of unexpected types raises."""
-
 
 @dataclass(frozen=True, eq=False)
-class ControllerFile:
+class ControllerFile(ShortRepr):
     """A controller that was read from a file.
 
     Attributes:
-        controller: the feedback for one task.
-        dt: length of a step, seconds.
         states, inputs: the names of the states and inputs with their units, in the order of the components.
     """
 
@@ -51,7 +44,6 @@ class ControllerFile:
     dt: float
     states: dict[str, str]
     inputs: dict[str, str]
-    __repr__ = record
 
 
 def write_controller(
@@ -62,12 +54,7 @@ def write_controller(
     Args:
         path: the file; its suffix, ``.json`` or ``.npz``, determines the format.
         controller: affine feedback, as LQR and iLQR design it.
-        dt: length of a step, seconds.
         states, inputs: names and units of the components; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
-
-    Raises:
-        InputError: if the controller is not affine feedback or not finite, or the file cannot be written.
-        ShapeError: if the controller is for a batch of tasks, or the number of names differs from that of components.
     """
     if not isinstance(controller, AffineFeedback):
         raise InputError(
@@ -99,11 +86,7 @@ def write_controller(
 
 
 def read_controller(path: str | Path) -> ControllerFile:
-    """Read a controller from a ``.json`` or ``.npz`` file.
-
-    Raises:
-        InputError: if the file is not a controller file or is damaged; the message says what is wrong.
-    """
+    """Read a controller from a ``.json`` or ``.npz`` file."""
     return _read(Path(path), CONTROLLER_FORMAT, _controller)
 
 
@@ -111,8 +94,6 @@ def write_task(path: str | Path, task: Task, *, states: Names | None = None) -> 
     """Write one task as JSON: its initial state, reference, horizon and time step.
 
     Args:
-        path: the file; it ends in ``.json``.
-        task: one task.
         states: names and units of the states; ``x0, x1, ...`` by default.
     """
     if task.batch_shape:
@@ -139,14 +120,21 @@ def _write(path: Path, about: dict[str, Any], arrays: Mapping[str, Array]) -> No
         if path.suffix == ".npz":
             np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
         else:
-            content = about | {name: _listed(array) for name, array in arrays.items()}
+            content = about | {name: array.tolist() for name, array in arrays.items()}
+            for name in {"low", "high"} & set(arrays):  # of which JSON cannot hold infinite ones
+                content[name] = [limit if np.isfinite(limit) else None for limit in content[name]]
             lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in content.items())
             file.write(f"{{\n{lines}\n}}\n".encode())
 
 
 def _read(path: Path, expected: str, build: Callable[[Mapping[str, Any]], Content]) -> Content:
     try:
-        content = _npz_content(path) if path.suffix == ".npz" else read_json(path)
+        if path.suffix == ".npz":
+            arrays = Archive(read_bytes(path))
+            numbers = {name: arrays.numbers(name) for name in arrays.names if name != "about"}
+            content = {**json.loads(arrays.text("about")), **numbers}
+        else:
+            content = read_json(path)
         if not isinstance(content, Mapping):
             raise InputError("it must be a JSON object.")
         if content["format"] != expected:
@@ -154,15 +142,9 @@ def _read(path: Path, expected: str, build: Callable[[Mapping[str, Any]], Conten
         if content["version"] != VERSION:
             raise InputError(f"this version of ctxval reads version {VERSION}, got {str(content['version'])[:40]}.")
         return build(content)
-    except _UNREADABLE as error:
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, RecursionError) as error:
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {str(error)[:100]}"
         raise InputError(f"{path} cannot be read as a {expected}: {reason.removesuffix('.')}.") from error
-
-
-def _npz_content(path: Path) -> Any:
-    arrays = Archive(read_bytes(path))
-    about = json.loads(arrays.text("about"))
-    return {**about, **{name: arrays.numbers(name) for name in arrays.names if name != "about"}}
 
 
 def _controller(content: Mapping[str, Any]) -> ControllerFile:
@@ -193,11 +175,6 @@ def _task(content: Mapping[str, Any]) -> Task:
         dt=content["dt"],
         reference=content["reference"],
     )
-
-
-def _listed(array: Array) -> Any:
-    """Return an array as lists for JSON, with null for infinite limits."""
-    return [value if np.isfinite(value) else None for value in array.tolist()] if array.ndim == 1 else array.tolist()
 
 
 def _bound(values: Any, infinite: float) -> Array:

@@ -25,7 +25,6 @@ class Experiment:
 
     Attributes:
         name: a short name for files and displays.
-        validation: the map p -> d(p).
         budget: the default number of executions of S.
         threshold: the default threshold tau; without a threshold there is no verdict.
         truth: a function that finds d*, for simulated systems; None if there is none.
@@ -48,11 +47,11 @@ class Experiment:
     inputs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        own = self.validation.labels
-        labels = Labels(self.states or own.states, self.inputs or own.inputs, self.units or own.units)
+        given = self.validation.labels
+        labels = Labels(self.states or given.states, self.inputs or given.inputs, self.units or given.units)
         for name in ("states", "inputs", "units"):
             object.__setattr__(self, name, getattr(labels, name))
-        if labels != own:
+        if labels != given:
             object.__setattr__(self, "validation", self.validation.with_labels(labels))
         if self.mixed_units:
             warnings.warn(mixed_units_sentence(self.mixed_units), UnitsWarning, stacklevel=3)

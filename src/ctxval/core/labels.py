@@ -6,22 +6,19 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from ctxval._util.checked import checked
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import parted, shortened
 from ctxval.errors import InputError
 
 
 @checked
 @dataclass(frozen=True)
-class Labels:
+class Labels(ShortRepr):
     """Names and units, which change nothing that is computed.
 
     Attributes:
         states, inputs: one label ``name [unit]`` for each state and each input; empty if they have no names.
         units: the units of the distance.
-
-    Raises:
-        InputError: if a recording with columns of these names cannot be read.
     """
 
     states: tuple[str, ...] = ()
@@ -35,10 +32,6 @@ class Labels:
         """Return the names of n states and m inputs with their units.
 
         They are these labels, else the names that the system itself has, else ``x0, x1, ...`` and ``u0, u1, ...``.
-
-        Args:
-            system: the system, whose attributes ``states`` and ``inputs`` may be names, or names with units.
-            states, inputs: the numbers of states and of inputs.
         """
         return (
             _named(self.states, names_of(system, "states"), "x", states),
@@ -52,8 +45,6 @@ class Labels:
     def require_readable(self, system: object) -> None:
         """Refuse a system whose own names make a recording unreadable, if these labels do not replace them."""
         require_names(self.states or names_of(system, "states"), self.inputs or names_of(system, "inputs"))
-
-    __repr__ = record
 
 
 def require_names(states: Iterable[str], inputs: Iterable[str]) -> None:
@@ -80,10 +71,10 @@ def labels_of(named: Mapping[str, str]) -> tuple[str, ...]:
 
 def names_of(system: object, kind: str) -> dict[str, str]:
     """Return the names and units of the ``"states"`` or ``"inputs"`` of a system; empty if it names none."""
-    own = getattr(system, kind, None)
-    if isinstance(own, Mapping):
-        return {str(name): str(unit) for name, unit in own.items()}
-    return dict.fromkeys(map(str, own), "") if isinstance(own, list | tuple) else {}
+    names = getattr(system, kind, None)
+    if isinstance(names, Mapping):
+        return {str(name): str(unit) for name, unit in names.items()}
+    return dict.fromkeys(map(str, names), "") if isinstance(names, list | tuple) else {}
 
 
 def _named(labels: tuple[str, ...], own: dict[str, str], letter: str, count: int) -> dict[str, str]:

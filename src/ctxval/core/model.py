@@ -9,19 +9,12 @@ import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, ModelError
 
 Step = Callable[[Array, Array], Array]
 
-_PROBED = 3
-"""Number of points at which the precision of a model is found out."""
-_FINE, _COARSE = 2.0**-27, 2.0**-17
-"""A change that single precision hardly resolves, and one that it does, as shares of a state or of 1."""
-
-_BLOCK = 4096
-"""Number of points at which a model is evaluated in one call for differences: larger arrays do not fit into the cache.
-"""
+_BLOCK = 4096  # points at which a model is evaluated in one call for differences, so that they fit into the cache
 
 
 @runtime_checkable
@@ -37,7 +30,7 @@ class Model(Protocol):
 
 
 @part(functions={"step": "(x, u) -> x_next"})
-class Function:
+class Function(ShortRepr):
     """A plain function ``(x, u) -> x_next`` as a model.
 
     Args:
@@ -53,14 +46,16 @@ class Function:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         if self.vectorized or x.ndim == 1:
             return np.asarray(self.function(x, u), dtype=np.float64)
-        batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        states = rows_of(np.broadcast_to(x, (*batch, x.shape[-1])))
-        inputs = rows_of(np.broadcast_to(u, (*batch, u.shape[-1])))
-        rows = [np.asarray(self.function(xi, ui), dtype=np.float64) for xi, ui in zip(states, inputs, strict=True)]
-        return np.stack(rows).reshape(*batch, -1)
+        states, inputs = paired(x, u)
+        pairs = zip(rows_of(states), rows_of(inputs), strict=True)
+        rows = [np.asarray(self.function(xi, ui), dtype=np.float64) for xi, ui in pairs]
+        return np.stack(rows).reshape(*states.shape[:-1], -1)
 
-    def __repr__(self) -> str:
-        return call(self, self.function, vectorized=self.vectorized)
+
+def paired(x: Array, u: Array) -> tuple[Array, Array]:
+    """Return states ``(..., n)`` and inputs ``(..., m)`` with the same batch axes."""
+    batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+    return np.broadcast_to(x, (*batch, x.shape[-1])), np.broadcast_to(u, (*batch, u.shape[-1]))
 
 
 def as_model(model: Model | Step) -> Model:
@@ -69,13 +64,7 @@ def as_model(model: Model | Step) -> Model:
 
 
 def require_time_step(model: object, dt: float, whose: str) -> None:
-    """Refuse a model that states, or was learned from, steps of another length.
-
-    Args:
-        model: the model; its attribute ``dt``, or that of its ``data``, is the length of a step in seconds.
-        dt: the length that it is used with, seconds.
-        whose: what has this length, for the message.
-    """
+    """Refuse a model whose own ``dt``, or that of its ``data``, is not the step of what it is used with."""
     own = getattr(model, "dt", None) or getattr(getattr(model, "data", None), "dt", None)
     if isinstance(own, int | float) and not np.isclose(own, dt, rtol=1e-3, atol=0):
         raise InputError(
@@ -102,17 +91,12 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
 def central_differences(step: Step, x: Array, u: Array, precision: float | None = None) -> tuple[Array, Array]:
     """Return A ``(..., n, n)`` and B ``(..., n, m)`` at states ``(..., n)`` and inputs ``(..., m)`` by differences.
 
-    The steps suit the precision of the model: 6e-6 in double precision, and 5e-3 in single precision, in which smaller
-    steps would be lost in its rounding.
+    The steps suit the precision of the model, which is found out if it is not given: 6e-6 in double precision, and 5e-3
+    in single precision, in whose rounding smaller steps would be lost.
 
     All differences are taken in one batch, in blocks that fit into the processor's cache. Complex steps would halve the
     evaluations, but NumPy's complex functions take two to three times as long, and the result is silently wrong
     wherever a model uses ``abs``, ``maximum`` or a branch.
-
-    Args:
-        step: the model's step, which takes batches.
-        x, u: states and inputs.
-        precision: the relative rounding of the model's numbers; None to find it out.
     """
     n, width, batch = x.shape[-1], x.shape[-1] + u.shape[-1], x.shape[:-1]
     z = np.concatenate([x, u], axis=-1).reshape(-1, width)
@@ -131,13 +115,14 @@ def _precision(step: Step, z: Array, n: int) -> float:
     A change that is a thousand times as large shows how much the model should change. The answer of most points counts,
     because a few may be next to a kink. What a model converts to double precision afterwards does not matter.
     """
-    some = z[:: max(1, len(z) // _PROBED)][:_PROBED]
-    size = np.maximum(1.0, np.abs(some))
-    moved = np.concatenate([some, some + _FINE * size, some - _COARSE * size, some + _COARSE * size])
+    some = z[:: max(1, len(z) // 3)][:3]
+    # A change that single precision hardly resolves, and one that it does.
+    size, little, much = np.maximum(1.0, np.abs(some)), 2.0**-27, 2.0**-17
+    moved = np.concatenate([some, some + little * size, some - much * size, some + much * size])
     still, fine, down, up = np.asarray(step(moved[:, :n], moved[:, n:])).reshape(4, -1, n)
     with np.errstate(all="ignore"):  # a model that is not finite is refused later
-        expected = (up - down) * (0.5 * _FINE / _COARSE)
-        margin = 1e-3 * np.abs(expected) + 1e-5 * _FINE * np.abs(still).max(initial=0.0)
+        expected = (up - down) * (0.5 * little / much)
+        margin = 1e-3 * np.abs(expected) + 1e-5 * little * np.abs(still).max(initial=0.0)
         lost = np.abs(fine - still - expected) > margin
     single = lost.any(axis=1).sum() > len(some) / 2
     return float(np.finfo(np.float32 if single else np.float64).eps)

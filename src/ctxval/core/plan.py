@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Mask
-from ctxval._util.representation import call, lines, shown
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
@@ -17,14 +17,10 @@ from ctxval.errors import InputError, ShapeError
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """Everything that is known about a task before S is executed; one task or a batch.
+class Plan(ShortRepr):
+    """What is known of a task g_p before S is executed: its controller pi(x; g_p, M) and the closed loop on M.
 
-    Attributes:
-        parameters: p.
-        task: the task g_p.
-        controller: pi(x; g_p, M).
-        model_trajectory: the closed loop on the model.
+    It may also be a batch of tasks.
     """
 
     parameters: Parameters
@@ -33,41 +29,18 @@ class Plan:
     model_trajectory: Trajectory
 
     def of(self, index: int, parameters: Parameters) -> Plan:
-        """Return the plan of one task of a batch, whose parameters are given.
-
-        Raises:
-            TypeError: if the controller of the batch has no ``__getitem__``.
-        """
+        """Return the plan of one task of a batch, whose parameters are given."""
         controller: Any = self.controller
         return Plan(parameters, self.task[index], controller[index], self.model_trajectory[index])
 
-    def __repr__(self) -> str:
-        fields = ("parameters", "task", "controller", "model_trajectory")
-        return lines(type(self).__name__, *(f"{name}: {shown(getattr(self, name))}" for name in fields))
-
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """A plan after the execution of S.
-
-    Attributes:
-        plan: the plan of the task.
-        system_trajectory: the closed loop on the system.
-        distance: d(p).
-    """
+class Outcome(ShortRepr):
+    """A plan after the execution of S."""
 
     plan: Plan
     system_trajectory: Trajectory
     distance: float
-
-    def __repr__(self) -> str:
-        known = {
-            "parameters": self.plan.parameters,
-            "task": self.plan.task,
-            "model_trajectory": self.plan.model_trajectory,
-            "system_trajectory": self.system_trajectory,
-        }
-        return lines(call(self, distance=self.distance), *(f"{name}: {shown(part)}" for name, part in known.items()))
 
 
 @dataclass(frozen=True)
@@ -84,14 +57,7 @@ class Measurement:
 
 
 def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> None:
-    """Check that a complete trajectory belongs to the task of a plan.
-
-    Args:
-        plan: the plan of the task.
-        trajectory: the trajectory.
-        start_tolerance: the largest difference between the first state and the initial state of the task, as a fraction
-            of the range of each state in the trajectory of the model, or of its initial value if that is larger.
-    """
+    """Check that a complete trajectory belongs to the task of a plan; see :class:`Validation` for the tolerance."""
     expected = plan.model_trajectory
     require_times(trajectory, plan.task.times)
     if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:
@@ -115,12 +81,8 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
 def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
     """Return whether the controller of a plan gives the recorded inputs at the recorded states.
 
-    The execution is then also one of this controller: a deterministic system cannot tell the two apart.
-
-    Args:
-        plan: the plan of one task.
-        trajectory: an execution of this task, perhaps with another controller.
-        tolerance: the largest difference, as a share of the largest magnitude of each input.
+    The execution is then also one of this controller: a deterministic system cannot tell the two apart. The tolerance
+    is a share of the largest magnitude of each input.
     """
     states, inputs = trajectory.states, trajectory.inputs
     if plan.model_trajectory.states.shape != states.shape or plan.model_trajectory.inputs.shape != inputs.shape:

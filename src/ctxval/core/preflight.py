@@ -20,18 +20,9 @@ from ctxval.errors import InputError
 if TYPE_CHECKING:
     from ctxval.core.validation import Validation
 
-LONGEST = 1_000_000
-"""Default of the largest horizon that is planned."""
+LONGEST = 1_000_000  # default of the largest horizon that is planned
 
-_LONG = 100_000
-"""Horizon from which on the cost of a plan is stated before the first one."""
-
-_PROBED = 100
-"""Number of steps from which the cost of a long horizon is estimated."""
-
-_ZERO = 1e-9
-"""Largest distance between a trajectory and itself that counts as 0."""
-
+_LONG = 100_000  # horizon from which on the cost of a plan is stated before the first one
 _stated: WeakSet[Validation] = WeakSet()
 
 
@@ -50,7 +41,7 @@ def try_distance(validation: Validation, plan: Plan) -> None:
         DistanceWarning: if the distance is not 0. A distance to the task has the attribute ``to_task = True``.
     """
     value = validation.measure(plan, plan.model_trajectory.copy())
-    if value > _ZERO and not (validation.is_on_model or getattr(validation.distance, "to_task", False)):
+    if value > 1e-9 and not (validation.is_on_model or getattr(validation.distance, "to_task", False)):
         warnings.warn(
             f"the distance between the trajectory of the model and itself is {value:.3g}, not 0, for the task "
             f"{validation.space.describe_point(plan.parameters.points)}. If it measures how S completes its task, give "
@@ -69,7 +60,7 @@ def require_affordable(validation: Validation, parameters: Parameters, task: Tas
     steps, permitted = task.horizon, task.horizon <= validation.longest
     if permitted and (steps <= _LONG or validation in _stated):
         return
-    probed = min(_PROBED, steps)
+    probed = min(100, steps)
     first = Task(task.initial_state, horizon=probed, dt=task.dt, reference=task.reference[..., : probed + 1, :])
     begun = time.process_time()
     plan = validation.plan_of(parameters, first)

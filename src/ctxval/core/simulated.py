@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.model import Function, Model, Step
 from ctxval.core.rollout import rollout
@@ -12,15 +12,12 @@ from ctxval.core.trajectory import Trajectory
 
 
 @part(functions={"step": "(x, u) -> x_next"})
-class Simulated:
+class Simulated(ShortRepr):
     """A step function, or a model, as the true system.
 
     Args:
         step: function ``(x, u) -> x_next``, or an object with such a method ``step`` that takes batches.
         vectorized: whether a plain function takes whole batches ``(..., n)`` and ``(..., m)``.
-
-    Raises:
-        InputError: if ``step`` is neither a function nor a model.
     """
 
     batched = True
@@ -31,6 +28,3 @@ class Simulated:
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Run the closed loop from the task's initial state over its horizon."""
         return rollout(self.model.step, controller, task)
-
-    def __repr__(self) -> str:
-        return call(self, self.model)

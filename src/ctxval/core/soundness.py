@@ -16,21 +16,11 @@ from ctxval.core.controller import Limits, Synthesizer
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 
-NEAR = 0.1
-"""Two tasks are neighbours if they are nearer than this, in diagonals of the task space."""
+NEAR = 0.1  # two tasks are neighbours if they are nearer than this, in diagonals of the task space
 
-MISSED = 0.1
-"""M misses its goal if it ends farther away than this, as a share of the range of a state."""
+MISSED = 0.1  # M misses its goal if it ends farther away than this, as a share of the range of a state
 
-SATURATED = 0.01
-"""Least share of steps at a limit that is worth a note."""
-
-_FLIPPED = 0.5
-"""Controllers of neighbours flip if their inputs on M differ by more than this share of the range of the inputs, and as
-signals by more than this share of their size."""
-
-_SEVERAL = 3
-"""Number of steps of one execution at an extreme value from which this value is taken to be a limit."""
+SATURATED = 0.01  # least share of steps at a limit that is worth a note
 
 
 @dataclass(frozen=True)
@@ -51,33 +41,24 @@ class Flips:
 
 
 def flips(points: Array, inputs: Sequence[Array]) -> Flips | None:
-    """Return how much the controllers of neighbouring tasks differ; None if no tasks are neighbours.
+    """Return how much the inputs on M, ``(H, m)``, of neighbouring tasks ``(N, d)`` differ; None if there are none.
 
     A pair flips if the inputs differ at some time by more than half of their range, and as signals by more than half of
     the sum of their norms. Two controllers that only leave a limit at another time are alike.
-
-    Args:
-        points: tasks, points of the unit cube ``(N, d)``.
-        inputs: the inputs on M of each task, shape ``(H, m)``.
     """
     near = scipy.spatial.KDTree(points / np.sqrt(points.shape[1])).query_pairs(NEAR)
     pairs = [(i, j) for i, j in sorted(near) if inputs[i].shape == inputs[j].shape and inputs[i].size]
     if not pairs:
         return None
     spans = ranges(inputs)
-    changes = [float((np.abs(inputs[i] - inputs[j]) / spans).max()) for i, j in pairs]
-    flipped = [
-        change > _FLIPPED and _contrast(inputs[i] / spans, inputs[j] / spans) > _FLIPPED
-        for change, (i, j) in zip(changes, pairs, strict=True)
-    ]
+    changes, flipped = list[float](), list[bool]()
+    for i, j in pairs:
+        changes.append(float((np.abs(inputs[i] - inputs[j]) / spans).max()))
+        sizes = float(np.linalg.norm(inputs[i] / spans) + np.linalg.norm(inputs[j] / spans))
+        contrast = float(np.linalg.norm((inputs[i] - inputs[j]) / spans)) / sizes if sizes > 0 else 0.0
+        flipped.append(changes[-1] > 0.5 and contrast > 0.5)
     largest = max(range(len(pairs)), key=lambda k: (flipped[k], changes[k]))
     return Flips(len(pairs), sum(flipped), changes[largest], pairs[largest])
-
-
-def _contrast(first: Array, second: Array) -> float:
-    """Return the norm of the difference of two signals, as a share of the sum of their norms."""
-    whole = float(np.linalg.norm(first) + np.linalg.norm(second))
-    return float(np.linalg.norm(first - second)) / whole if whole > 0 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,34 +77,27 @@ class Saturation:
 def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> Saturation | None:
     """Return how often inputs are at their limits; None if there are no inputs.
 
-    If the synthesizer has no attribute ``limits``, the extreme values of all tasks are taken to be limits in those
-    tasks that stay there for several steps.
+    If the synthesizer has no attribute ``limits``, or is not known, the extreme values of all tasks are taken to be
+    limits in those tasks that stay there for three steps.
 
     Args:
         inputs: the inputs of each task, shape ``(H, m)``.
-        synthesizer: the synthesizer; None if it is not known.
     """
-    executed = [one for one in inputs if one.size]
-    if not executed:
+    signals = [signal for signal in inputs if signal.size]
+    if not signals:
         return None
-    together = np.concatenate(executed)
-    given = getattr(synthesizer, "limits", None)
-    if given is None:
-        return Saturation(_at_ends(executed, together).mean(axis=0), False)
-    spans, limits = np.maximum(np.ptp(together, axis=0), 1e-300), Limits.of(given, together.shape[-1])
-    at_limit = (together <= limits.low + 1e-6 * spans) | (together >= limits.high - 1e-6 * spans)
-    return Saturation(at_limit.mean(axis=0), True)
-
-
-def _at_ends(executed: Sequence[Array], together: Array) -> Mask:
-    """Return which inputs ``(N, m)`` are at an extreme value for several steps of one task."""
-    spans = np.maximum(np.ptp(together, axis=0), 1e-300)
+    together = np.concatenate(signals)
+    spans, given = np.maximum(np.ptp(together, axis=0), 1e-300), getattr(synthesizer, "limits", None)
+    if given is not None:
+        limits = Limits.of(given, together.shape[-1])
+        at_limit = (together <= limits.low + 1e-6 * spans) | (together >= limits.high - 1e-6 * spans)
+        return Saturation(at_limit.mean(axis=0), True)
     low, high = together.min(axis=0) + 1e-9 * spans, together.max(axis=0) - 1e-9 * spans
     parts = []
-    for inputs in executed:
-        at_ends = inputs <= low, inputs >= high
-        parts.append(np.logical_or(*(at & (at.sum(axis=0) >= _SEVERAL) for at in at_ends)) & (low < high))
-    return np.concatenate(parts)
+    for signal in signals:
+        at_ends = signal <= low, signal >= high
+        parts.append(np.logical_or(*(at & (at.sum(axis=0) >= 3) for at in at_ends)) & (low < high))
+    return Saturation(np.concatenate(parts).mean(axis=0), False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,31 +127,21 @@ class GoalMisses:
 
 
 def goal_misses(validation: Validation, on_model: Sequence[Trajectory], goals: Sequence[Array]) -> GoalMisses | None:
-    """Return how far M ends from its goals; None if it is not known which states are to reach a goal.
-
-    Args:
-        validation: the map p -> d(p), which is not executed.
-        on_model: the trajectories of M, at least one.
-        goals: the goal of each task, shape ``(n,)``.
-    """
+    """Return how far trajectories of M end from their goals ``(n,)``; None if no state is known to have a goal."""
     aimed = aimed_states(validation, on_model[0].states.shape[-1])
     if not len(aimed):
         return None
-    spans = ranges([one.states for one in on_model])[aimed]
-    ends = np.array([one.final_state for one in on_model])
+    spans = ranges([trajectory.states for trajectory in on_model])[aimed]
+    ends = np.array([trajectory.final_state for trajectory in on_model])
     misses = np.abs(ends - np.array(goals))[:, aimed]
     return GoalMisses(aimed, misses, misses / spans)
 
 
 def aimed_states(validation: Validation, count: int) -> Rows:
-    """Return the indices of the states that controllers bring to their goals; none if the synthesizer does not tell.
+    """Return the indices of the states, of ``count``, that controllers bring to their goals; none if it is not known.
 
-    The attribute ``cost`` of the synthesizer tells them by the weights ``Q_final`` or ``Q``. If the distance compares
-    some states only (``components``), the others are left out.
-
-    Args:
-        validation: the map p -> d(p), which is not executed.
-        count: the number of states n.
+    The weights ``Q_final`` or ``Q`` of the synthesizer's attribute ``cost`` show them. If the distance compares some
+    states only (``components``), the others are left out.
     """
     cost = getattr(validation.synthesizer, "cost", None)
     weights = getattr(cost, "Q_final", getattr(cost, "Q", None))

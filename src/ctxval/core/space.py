@@ -42,10 +42,7 @@ class Parameters:
         return self[name]
 
     def __getitem__(self, name: str) -> Any:
-        columns = self._space.columns(name)
-        if isinstance(columns, int):
-            return self.points[..., columns]
-        return self.points[..., columns]
+        return self.points[..., self._space.columns(name)]
 
     def __repr__(self) -> str:
         if self.points.ndim == 1:
@@ -63,9 +60,6 @@ class TaskSpace:
     >>> space = TaskSpace(goal=(-3.14, 3.14, "rad"), offset=([0, 0], [1, 2]))
     >>> space.names
     ('goal', 'offset[0]', 'offset[1]')
-
-    Raises:
-        InputError: if there is no parameter, a name is reserved, or bounds are reversed, equal, NaN or infinite.
     """
 
     def __init__(self, **bounds: tuple[Any, ...]) -> None:
@@ -114,8 +108,8 @@ class TaskSpace:
     @property
     def labels(self) -> tuple[str, ...]:
         """An axis label for each scalar parameter: its name and its unit."""
-        units = self._scalar_units()
-        return tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, units, strict=True))
+        units = zip(self.names, self._scalar_units(), strict=True)
+        return tuple(f"{name} [{unit}]" if unit else name for name, unit in units)
 
     def _scalar_units(self) -> list[str]:
         return [shortened(self._units[name]) for name, at in self._columns.items() for _ in np.atleast_1d(self.low[at])]
@@ -130,18 +124,14 @@ class TaskSpace:
 
         A distribution of tasks is part of it only if there is one.
         """
-        set_one = {} if self._distribution is None else {DISTRIBUTION: self._distribution.describe()}
-        return set_one | {
+        distribution = {} if self._distribution is None else {DISTRIBUTION: self._distribution.describe()}
+        return distribution | {
             name: [float(low), float(high), *([unit] if unit else [])]
             for name, low, high, unit in zip(self.names, self.low, self.high, self._scalar_units(), strict=True)
         }
 
     def columns(self, name: str) -> int | slice:
-        """Return the index or the slice of a parameter in a row of points.
-
-        Raises:
-            UnknownNameError: if the space has no such parameter.
-        """
+        """Return the index or the slice of a parameter in a row of points."""
         try:
             return self._columns[name]
         except KeyError:
@@ -176,21 +166,11 @@ class TaskSpace:
         return np.where((rows == 0) | (rows == 1), rows, self.to_unit(short))
 
     def parameters(self, points: ArrayLike) -> Parameters:
-        """Return points ``(..., d)`` of the space as named parameters.
-
-        Raises:
-            ShapeError: if the last axis is not d.
-        """
+        """Return points ``(..., d)`` of the space as named parameters."""
         return Parameters(self, require_shape("points", as_floats("points", points), (self.dimension,)))
 
     def point(self, values: Mapping[str, Any]) -> Array:
-        """Return the point ``(d,)`` with these values by name.
-
-        Raises:
-            UnknownNameError: if the space has no parameter of a given name.
-            ShapeError: if a value does not have the shape of its parameter.
-            InputError: if a parameter is missing, or a value is outside the box.
-        """
+        """Return the point ``(d,)`` with these values by name."""
         point = np.full(self.dimension, np.nan)
         for name, value in values.items():
             columns, given = self.columns(name), as_finite(name, value)
@@ -241,10 +221,6 @@ class TaskSpace:
         Args:
             by_name: for each parameter, a :class:`Normal` or a frozen continuous distribution of ``scipy.stats``. It
                 is truncated to the parameter's bounds. The components of a vector are independent.
-
-        Raises:
-            UnknownNameError: if the space has no such parameter.
-            InputError: if a distribution cannot be used.
         """
         if not by_name:
             raise InputError("distributed needs the distribution of at least one parameter, such as goal=Normal(0, 1).")
@@ -257,9 +233,6 @@ class TaskSpace:
 
         Args:
             sampler: ``(rng, n)`` -> n independent tasks, rows ``(n, d)`` within the bounds, in the space's own units.
-
-        Raises:
-            InputError: if it is not a function.
         """
         if not callable(sampler):
             raise InputError(f"sampler must be a function (rng, n) -> rows (n, d), got {sampler!r}.")
@@ -272,9 +245,9 @@ class TaskSpace:
         return np.clip(self.to_unit(self._distribution.draw(n, rng)), 0.0, 1.0)
 
     def _with(self, distribution: TaskDistribution) -> TaskSpace:
-        found = copy.copy(self)
-        found._distribution = distribution
-        return found
+        space = copy.copy(self)
+        space._distribution = distribution
+        return space
 
     # Sets of points
 

@@ -23,10 +23,6 @@ class Task:
         dt: length of a step, seconds.
         goal: the state to reach, given like ``initial_state``; a goal is a constant reference.
         reference: the states to follow, array ``(..., H + 1, n)``; give this or ``goal``, not both.
-
-    Raises:
-        InputError: if a value cannot be used.
-        ShapeError: if the shape of the goal or the reference does not match that of the initial state.
     """
 
     def __init__(

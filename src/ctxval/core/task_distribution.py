@@ -11,18 +11,12 @@ import scipy
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats
 from ctxval._util.describe import describe
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import shortened
 from ctxval.errors import InputError
 
 Sampler = Callable[[np.random.Generator, int], ArrayLike]
 """``(rng, n)`` -> n independent tasks, rows ``(n, d)`` in the units of the task space."""
-
-_LEAST_MASS = 1e-12
-"""Least probability that a distribution must have within the bounds of its parameter."""
-
-_LONGEST = 400
-"""Characters of the text of a distribution."""
 
 
 @runtime_checkable
@@ -43,15 +37,12 @@ class Continuous(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Normal:
+class Normal(ShortRepr):
     """The normal distribution of a task parameter; a task space truncates it to the parameter's bounds.
 
     Args:
         mean: the mean, before the truncation, in the parameter's units; one number, or one for each component.
         deviation: the standard deviation, before the truncation, in the same form.
-
-    Raises:
-        InputError: if they are not finite, or if a standard deviation is not positive.
     """
 
     mean: ArrayLike
@@ -91,8 +82,6 @@ class Normal:
         mean, deviation = self._floats
         return {"mean": mean.tolist(), "deviation": deviation.tolist()}
 
-    __repr__ = record
-
 
 class TaskDistribution(Protocol):
     """A distribution of tasks over a box."""
@@ -109,13 +98,7 @@ class ByParameter:
     """Independent task parameters: some with a distribution that is truncated to its bounds, all others uniform.
 
     Attributes:
-        low, high: the bounds of the task space, shape ``(d,)``.
         columns: the columns of each parameter that has a distribution.
-        distributions: the distribution of each of these parameters.
-
-    Raises:
-        InputError: if a distribution is none of a continuous variable, does not fit the shape of its parameter, or has
-            no probability within its bounds.
     """
 
     low: Array
@@ -124,38 +107,54 @@ class ByParameter:
     distributions: Mapping[str, Continuous]
 
     def __post_init__(self) -> None:
-        for name, one in self.distributions.items():
-            if not _is_continuous(one):
+        for name, marginal in self.distributions.items():
+            continuous = not _of_scipy(marginal) or hasattr(getattr(marginal, "dist", None), "pdf")
+            if not (isinstance(marginal, Continuous) and continuous):
                 raise InputError(
                     f"the distribution of {name} must be a Normal or a frozen continuous distribution of scipy.stats, "
-                    f"such as scipy.stats.expon(scale=2.0), got {one!r}."
+                    f"such as scipy.stats.expon(scale=2.0), got {marginal!r}."
                 )
-            self._require_mass(name, one)
-
-    def _require_mass(self, name: str, one: Continuous) -> None:
-        low, high = self.low[self.columns[name]], self.high[self.columns[name]]
-        try:
-            mass = np.maximum(one.cdf(high) - one.cdf(low), one.sf(low) - one.sf(high)) * np.ones(len(low))
-            fits = np.shape(mass) == np.shape(low)
-        except ValueError:
-            fits = False
-        if not fits:
-            raise InputError(f"the distribution of {name} must have one component or {len(low)}, got {one!r}.")
-        if not (mass > _LEAST_MASS).all():
-            raise InputError(f"the distribution of {name} has no probability within its bounds.")
+            low, high = self.low[self.columns[name]], self.high[self.columns[name]]
+            try:
+                mass = np.maximum(
+                    marginal.cdf(high) - marginal.cdf(low), marginal.sf(low) - marginal.sf(high)
+                ) * np.ones(len(low))
+                fits = np.shape(mass) == np.shape(low)
+            except ValueError:
+                fits = False
+            if not fits:
+                raise InputError(f"the distribution of {name} must have one component or {len(low)}, got {marginal!r}.")
+            if not (mass > 1e-12).all():
+                raise InputError(f"the distribution of {name} has no probability within its bounds.")
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """Return n independent tasks, rows ``(n, d)`` in the units of the task space."""
         shares = rng.random((n, len(self.low)))
         points = self.low + shares * (self.high - self.low)
-        for name, one in self.distributions.items():
+        for name, marginal in self.distributions.items():
             at = self.columns[name]
-            points[:, at] = _quantiles(one, shares[:, at], self.low[at], self.high[at])
+            low, high, share = self.low[at], self.high[at], shares[:, at]
+            below, above = marginal.cdf(low), marginal.sf(high)
+            from_below = marginal.ppf(below + share * (marginal.cdf(high) - below))
+            from_above = marginal.isf(above + (1 - share) * (marginal.sf(low) - above))
+            # Above the median, because ``cdf`` is rounded to 1 there.
+            quantiles = as_floats("a task", np.where(below > 0.5, from_above, from_below))
+            points[:, at] = np.clip(quantiles, low, high)
         return points
 
     def describe(self) -> dict[str, Any]:
-        """Return the distribution of each parameter that has one, by name."""
-        return {name: _described(one) for name, one in self.distributions.items()}
+        """Return the distribution of each parameter that has marginal, by name."""
+        described = {}
+        for name, marginal in self.distributions.items():
+            if isinstance(marginal, Normal):
+                described[name] = {"type": "normal", **marginal.describe()}
+            elif _of_scipy(marginal):
+                frozen: Any = marginal
+                settings = describe({"arguments": list(frozen.args), "options": dict(frozen.kwds)})
+                described[name] = {"type": f"scipy.stats.{frozen.dist.name}", **settings}
+            else:
+                described[name] = dict(describe(marginal))
+        return described
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +162,6 @@ class BySampler:
     """Tasks that a function draws.
 
     Attributes:
-        low, high: the bounds of the task space, shape ``(d,)``.
         sampler: ``(rng, n)`` -> n independent tasks, rows ``(n, d)`` in the units of the task space.
     """
 
@@ -188,47 +186,21 @@ class BySampler:
 def distribution_text(described: object) -> str:
     """Return a distribution of tasks as a text for a person, from its description in a store."""
     if not isinstance(described, Mapping):
-        return shortened(str(described), _LONGEST)
+        return shortened(str(described), 400)
     if "sampler" in described:
         sampler = described["sampler"]
         name = sampler.get("function", sampler.get("type")) if isinstance(sampler, Mapping) else sampler
-        return shortened(f"tasks from the sampler {name}", _LONGEST)
-    found = [f"{name} {_marginal_text(one)}" for name, one in described.items()]
-    return shortened(", ".join([*found, "all else uniform"]), _LONGEST)
+        return shortened(f"tasks from the sampler {name}", 400)
+    texts = []
+    for name, marginal in described.items():
+        text = str(marginal)
+        if isinstance(marginal, Mapping):
+            numbers = (f"{key} {value}" for key, value in marginal.items() if key != "type" and value not in ([], {}))
+            text = f"{marginal.get('type')} ({', '.join(numbers)})"
+        texts.append(f"{name} {text}")
+    return shortened(", ".join([*texts, "all else uniform"]), 400)
 
 
-def _marginal_text(described: Any) -> str:
-    if not isinstance(described, Mapping):
-        return str(described)
-    numbers = ", ".join(f"{key} {value}" for key, value in described.items() if key != "type" and value not in ([], {}))
-    return f"{described.get('type')} ({numbers})"
-
-
-def _described(one: Any) -> dict[str, Any]:
-    if isinstance(one, Normal):
-        return {"type": "normal", **one.describe()}
-    if not _of_scipy(one):
-        return dict(describe(one))
-    plain = describe({"arguments": list(one.args), "options": dict(one.kwds)})
-    return {"type": f"scipy.stats.{one.dist.name}", **plain}
-
-
-def _is_continuous(one: object) -> bool:
-    return isinstance(one, Continuous) and (not _of_scipy(one) or hasattr(getattr(one, "dist", None), "pdf"))
-
-
-def _of_scipy(one: object) -> bool:
+def _of_scipy(distribution: object) -> bool:
     """Return whether an object is a frozen distribution of ``scipy.stats``."""
-    return hasattr(one, "dist") and hasattr(one, "kwds")
-
-
-def _quantiles(one: Continuous, shares: Array, low: Array, high: Array) -> Array:
-    """Return the quantiles of a distribution that is truncated to its bounds.
-
-    Above the median they are computed from the upper tail, because ``cdf`` is rounded to 1 there.
-    """
-    below, above = one.cdf(low), one.sf(high)
-    from_below = one.ppf(below + shares * (one.cdf(high) - below))
-    from_above = one.isf(above + (1 - shares) * (one.sf(low) - above))
-    found = as_floats("a task", np.where(below > 0.5, from_above, from_below))
-    return np.clip(found, low, high)
+    return hasattr(distribution, "dist") and hasattr(distribution, "kwds")

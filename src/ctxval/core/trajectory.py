@@ -13,7 +13,7 @@ from ctxval._util.arrays import Array, Mask, as_floats, held_means, rows_of
 from ctxval._util.columns import FAR, unit_advice
 from ctxval._util.files import MOST_BYTES, read_bytes
 from ctxval._util.npz import Archive
-from ctxval._util.representation import Shown, call, counted, number
+from ctxval._util.representation import ShortRepr, Shown, call, counted, number
 from ctxval.core.csv_columns import read_columns, write_columns
 from ctxval.errors import InputError, ShapeError
 
@@ -21,7 +21,7 @@ COMPLETE = "complete"
 
 
 @dataclass(frozen=True, eq=False)
-class Transitions:
+class Transitions(ShortRepr):
     """Recorded steps of a system: in state x, the input u led to x_next.
 
     Attributes:
@@ -29,9 +29,6 @@ class Transitions:
         u: the inputs, shape ``(N, m)``.
         x_next: the next states, shape ``(N, n)``.
         dt: length of a step in seconds, if it is known.
-
-    Raises:
-        ShapeError: if the shapes of the three arrays do not match.
     """
 
     x: Array
@@ -54,16 +51,11 @@ class Transitions:
 
     @staticmethod
     def joined(parts: Sequence[Transitions]) -> Transitions:
-        """Return several sets of transitions as one set.
-
-        Raises:
-            ShapeError: if they have different numbers of states or inputs.
-            InputError: if their steps have different lengths.
-        """
+        """Return several sets of transitions as one set."""
         sizes = sorted({(part.x.shape[1], part.u.shape[1]) for part in parts})
         if len(sizes) > 1:
-            said = " and ".join(f"{n} states and {m} inputs" for n, m in sizes)
-            raise ShapeError(f"recorded steps must have the same numbers of states and inputs, got {said}.")
+            different = " and ".join(f"{n} states and {m} inputs" for n, m in sizes)
+            raise ShapeError(f"recorded steps must have the same numbers of states and inputs, got {different}.")
         steps = [part.dt for part in parts if part.dt is not None]
         if steps and not np.allclose(steps, steps[0], rtol=1e-3, atol=0):
             raise InputError(f"recorded steps must have one length, got {min(steps):g} s and {max(steps):g} s.")
@@ -74,22 +66,16 @@ class Transitions:
             steps[0] if steps else None,
         )
 
-    def __repr__(self) -> str:
-        return call(self, len(self), x=self.x, u=self.u, x_next=self.x_next)
-
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """The times, states and inputs of a closed loop, for one task or a batch of tasks.
 
     Attributes:
-        times: the times of the states, shape ``(H + 1,)``, seconds.
-        states: the states, shape ``(..., H + 1, n)``.
-        inputs: the inputs, shape ``(..., H, m)``.
+        times: seconds, shape ``(H + 1,)``.
+        states: shape ``(..., H + 1, n)``.
+        inputs: shape ``(..., H, m)``.
         ended: ``"complete"``, or the reason why the trajectory ended before its horizon.
-
-    Raises:
-        ShapeError: if the shapes of the three arrays do not match.
     """
 
     times: Array
@@ -129,8 +115,8 @@ class Trajectory:
 
     def __getitem__(self, index: int) -> Trajectory:
         """Return one trajectory of the batch; the batch's ``ended`` applies to trajectories that are not finite."""
-        one = Trajectory(self.times, self.states[index], self.inputs[index])
-        return one if self.ended == COMPLETE or one.finite.all() else replace(one, ended=self.ended)
+        single = Trajectory(self.times, self.states[index], self.inputs[index])
+        return single if self.ended == COMPLETE or single.finite.all() else replace(single, ended=self.ended)
 
     def transitions(self) -> Transitions:
         """Return all steps of all tasks of the batch as one set of transitions."""
@@ -158,20 +144,17 @@ class Trajectory:
             source: the bytes, or the path of a regular file.
             shape: shape ``(H + 1, n)`` that the states of a complete trajectory must have; None allows any shape.
             most: largest size in bytes of the file, and of the numbers in it.
-
-        Raises:
-            InputError: if the source is not an NPZ file with a trajectory, or is too large.
-            ShapeError: if the shapes of the arrays do not match each other or ``shape``.
         """
         name = "these bytes" if isinstance(source, bytes) else str(source)
         try:
             arrays = Archive(source if isinstance(source, bytes) else read_bytes(source, most), most)
             ended = arrays.text("ended") if "ended" in arrays else COMPLETE
-            shapes = [arrays.shape(part) for part in _ARRAYS]
+            names = ("times", "states", "inputs")
+            shapes = [arrays.shape(name) for name in names]
             _require_fitting(*shapes)
             if shape is not None and ended == COMPLETE and shapes[1] != shape:
                 raise ShapeError(f"the trajectory must have states of shape {shape}, got {shapes[1]}.")
-            times, states, inputs = (arrays.numbers(part) for part in _ARRAYS)
+            times, states, inputs = (arrays.numbers(name) for name in names)
             return Trajectory(times, states, inputs, ended)
         except ShapeError:
             raise
@@ -186,12 +169,7 @@ class Trajectory:
         """Write one trajectory as CSV. The last row has no inputs.
 
         Args:
-            path: the file.
-            states, inputs: names of the columns of states and inputs; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
-                The column of the times is ``t``.
-
-        Raises:
-            ShapeError: if the trajectory is a batch, or the number of names differs from that of columns.
+            states, inputs: names of the columns; ``x0, x1, ...`` and ``u0, u1, ...`` by default. Times are ``t``.
         """
         if self.batch_shape:
             raise ShapeError(f"a CSV file must hold one trajectory, got a batch of shape {self.batch_shape}.")
@@ -212,44 +190,31 @@ class Trajectory:
         in the last row. Columns are separated by commas, or by semicolons or tabs, with which decimal commas are read.
 
         Args:
-            path: the file.
             states, inputs: names of the columns, with or without units. If the file has none of the names, the
                 numbered columns ``x0, x1, ...`` and ``u0, u1, ...`` are read.
             most_rows: largest number of rows below the header; a file with more rows is refused. None allows any
                 number up to the largest size of a file.
-
-        Raises:
-            InputError: if the file cannot be read, is not a regular file or is too large, if a row has more or fewer
-                cells than the header, if a column is missing, is there twice or has a unit that cannot be converted, or
-                if a cell is not a number.
         """
         return Trajectory(*read_columns(path, states, inputs, most_rows))
 
     def resampled(self, times: Array) -> Trajectory:
-        """Return one recorded trajectory at other times: states interpolated linearly, inputs averaged over the steps.
+        """Return one recorded trajectory at other times ``(H + 1,)``, in seconds after its first time, from 0.
 
-        An input holds until the next sample.
-
-        Args:
-            times: seconds after the first time of the recording, from 0, shape ``(H + 1,)``.
-
-        Raises:
-            InputError: if the trajectory is a batch, its times do not increase, its steps are much longer than the new
-                ones, or it ends before the last new time.
+        States are interpolated linearly. Inputs, which hold until the next sample, are averaged over the steps.
         """
-        own, wanted = self.times - self.times[0], as_floats("times", times)
-        if self.batch_shape or not (np.diff(own) > 0).all():
+        recorded, wanted = self.times - self.times[0], as_floats("times", times)
+        if self.batch_shape or not (np.diff(recorded) > 0).all():
             raise InputError("only a single trajectory with increasing times can be resampled.")
-        dt, period = float(wanted[1] - wanted[0]), float(np.median(np.diff(own)))
+        dt, period = float(wanted[1] - wanted[0]), float(np.median(np.diff(recorded)))
         if period > FAR * dt:
             raise InputError(f"the recording has steps of {period:g} s instead of {dt:g} s{_advice(period, dt)}.")
-        if not own[-1] >= wanted[-1] - _TIMES * dt:
+        if not recorded[-1] >= wanted[-1] - _TIMES * dt:
             raise InputError(
-                f"the recording ends after {own[-1]:g} s, and {wanted[-1]:g} s are needed{_advice(period, dt)}."
+                f"the recording ends after {recorded[-1]:g} s, and {wanted[-1]:g} s are needed{_advice(period, dt)}."
             )
-        states = np.stack([np.interp(wanted, own, column) for column in self.states.T], axis=-1)
+        states = np.stack([np.interp(wanted, recorded, column) for column in self.states.T], axis=-1)
         # A sample that belongs to a time may have been recorded just after it.
-        inputs = held_means(own[:-1], self.inputs, wanted, 1e-6 * dt)
+        inputs = held_means(recorded[:-1], self.inputs, wanted, 1e-6 * dt)
         return Trajectory(wanted, states, inputs, self.ended)
 
     def __repr__(self) -> str:
@@ -257,35 +222,31 @@ class Trajectory:
         return call(self, length, self.ended, states=self.states, inputs=self.inputs)
 
 
-_TIMES = 0.01
-"""Largest difference between the times of a recording and those of its task, in steps."""
+_TIMES = 0.01  # largest difference between the times of a recording and those of its task, in steps
 
 
 def require_times(trajectory: Trajectory, times: Array) -> None:
     """Check that a trajectory has these times ``(H + 1,)``, counted from its first time."""
-    dt, own = times[1] - times[0], trajectory.times - trajectory.times[0]
-    period = float(np.median(np.diff(own)))
+    dt, recorded = times[1] - times[0], trajectory.times - trajectory.times[0]
+    period = float(np.median(np.diff(recorded)))
     advice = _advice(period, dt) or "; --resample interpolates a recording to these times"
-    if len(own) != len(times):
+    if len(recorded) != len(times):
         raise InputError(
-            f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, got {len(own)} with "
-            f"steps of {period:g} s{advice}."
+            f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, "
+            f"got {len(recorded)} with steps of {period:g} s{advice}."
         )
-    misses = np.abs(own - times)
+    misses = np.abs(recorded - times)
     if not (misses <= _TIMES * dt).all():
         k = int(np.argmax(~(misses <= _TIMES * dt)))
         raise InputError(
             f"the trajectory must have steps of {dt:g} s: time {k} must be {times[k]:g} s after the first, "
-            f"got {own[k]:g} s. The largest difference is {np.max(misses):.3g} s{advice}."
+            f"got {recorded[k]:g} s. The largest difference is {np.max(misses):.3g} s{advice}."
         )
 
 
 def _advice(period: float, dt: float) -> str:
     advice = unit_advice(period, dt)
     return f"; {advice}" if advice else ""
-
-
-_ARRAYS = ("times", "states", "inputs")
 
 
 def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tuple[int, ...]) -> None:

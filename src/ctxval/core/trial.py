@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call, counted, line, lines, record, table
+from ctxval._util.representation import ShortRepr, call, counted, line, lines, table
 from ctxval.core.space import Point
 
 Origin = Literal["iid", "initial", "acquisition", "covering", "manual"]
@@ -75,32 +75,23 @@ class Trial:
         return lines(head, *(f"{name}: {line(text)}" for name, text in texts.items() if text is not None))
 
     def _repr_html_(self) -> str:
-        return table(
-            f"Trial {self.number}",
-            [
-                ("origin", self.origin),
-                ("state", self.state),
-                ("distance", self.distance),
-                ("failure", self.failure),
-                ("seconds", self.seconds),
-                ("attempts", self.attempts),
-                ("because", self.because),
-                *self.parameters.items(),
-            ],
-        )
+        names = ("origin", "state", "distance", "failure", "seconds", "attempts", "because")
+        known = ((name, getattr(self, name)) for name in names)
+        return table(f"Trial {self.number}", [*known, *self.parameters.items()])
 
 
 def designs_sentence(trials: Sequence[Trial]) -> str | None:
     """Return which controllers of executed tasks did not converge or jump; None if nothing of the kind is recorded."""
     executed = [trial for trial in trials if trial.executed]
-    told = [trial.note[CONVERGED] for trial in executed if trial.note is not None and CONVERGED in trial.note]
+    designs = [trial.note[CONVERGED] for trial in executed if trial.note is not None and CONVERGED in trial.note]
     worst = max(executed, key=lambda trial: -1.0 if trial.distance is None else trial.distance, default=None)
     among = worst is not None and (worst.note or {}).get(CONVERGED) is False
     parts = []
-    if told.count(False):
+    if designs.count(False):
         which = ", among them the worst one" if among else ""
         parts.append(
-            f"the design of the controller did not converge at {told.count(False)} of {len(told)} executed tasks{which}"
+            f"the design of the controller did not converge at {designs.count(False)} of {len(designs)} executed "
+            f"tasks{which}"
         )
     rejected = sum(count for trial in trials if isinstance(count := (trial.note or {}).get(UNSTEADY), int))
     if rejected:
@@ -112,7 +103,7 @@ def designs_sentence(trials: Sequence[Trial]) -> str | None:
 
 
 @dataclass(frozen=True)
-class Change:
+class Change(ShortRepr):
     """A later change of a store.
 
     Attributes:
@@ -126,4 +117,3 @@ class Change:
     why: str
     content: dict[str, Any]
     at: str = ""
-    __repr__ = record

@@ -21,36 +21,23 @@ from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, che
 from ctxval._util.describe import describe, without_numbers
 from ctxval._util.files import written_whole
 from ctxval._util.progress import stage
-from ctxval._util.representation import call, line, lines
+from ctxval._util.representation import ShortRepr
 from ctxval.core.space import AxisPoints, Parameters
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 
-_STEP = 1e-6
-"""Step of the central differences, in widths of the unit cube."""
+_FINER = 9  # number of points on each axis of a refined grid around one point
 
-_FINER = 9
-"""Number of points on each axis of a refined grid around one point."""
+_PROBES = 16  # number of tasks whose distances show that a stored truth belongs to a system
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
-    """The largest distance over the task space that a method found.
-
-    Attributes:
-        distance: the largest distance d*.
-        parameters: the parameters of a task that has this distance.
-        method: a description of the method that found it.
-    """
+class Truth(ShortRepr):
+    """The largest distance over the task space that a method found."""
 
     distance: float
     parameters: Parameters
     method: str
-
-    def __repr__(self) -> str:
-        return lines(
-            call(self, distance=self.distance), f"parameters: {self.parameters}", f"method: {line(self.method)}"
-        )
 
 
 @checked
@@ -58,12 +45,7 @@ def grid_truth(validation: Validation, per_axis: AxisPoints = 2001, refinements:
     """Return the maximum on a dense grid, refined around its best points. S is executed for each grid point.
 
     Args:
-        validation: the map p -> d(p).
-        per_axis: number of grid points on each axis.
         refinements: number of refinements, each with a finer grid around the best points.
-
-    Raises:
-        InputError: if every execution failed.
     """
     count = per_axis**validation.space.dimension + 8 * refinements * _FINER**validation.space.dimension
     with stage("searching the largest distance", count, "executions"):
@@ -79,8 +61,10 @@ def _grid_truth(validation: Validation, per_axis: int, refinements: int) -> Trut
     cell = (space.high - space.low) / (per_axis - 1)
     best, best_value = points[np.nanargmax(values)], float(np.nanmax(values))
     centres = points[np.argsort(-np.nan_to_num(values, nan=-np.inf))[:8]]
+    corners = np.meshgrid(*[np.linspace(-1, 1, _FINER)] * len(cell), indexing="ij")
+    offsets = np.stack(corners, axis=-1).reshape(-1, len(cell))
     for _ in range(refinements):
-        points = _around(centres, cell, space.low, space.high)
+        points = (centres[:, None, :] + offsets * cell).reshape(-1, len(cell)).clip(space.low, space.high)
         values = validation.distances(points)
         cell = cell / 4
         centres = points[np.argsort(-np.nan_to_num(values, nan=-np.inf))[:8]]
@@ -88,13 +72,6 @@ def _grid_truth(validation: Validation, per_axis: int, refinements: int) -> Trut
             best, best_value = points[np.nanargmax(values)], float(np.nanmax(values))
     count = f"{per_axis:,} points" + (" an axis" if space.dimension > 1 else "")
     return Truth(best_value, space.parameters(best), f"dense grid of {count}, refined {refinements} times")
-
-
-def _around(centres: Array, cell: Array, low: Array, high: Array) -> Array:
-    """Return a grid of a quarter of the cell around each centre, inside the box."""
-    offsets = np.stack(np.meshgrid(*[np.linspace(-1, 1, _FINER)] * len(cell), indexing="ij"), axis=-1)
-    points = centres[:, None, :] + offsets.reshape(-1, len(cell)) * cell
-    return np.clip(points.reshape(-1, len(cell)), low, high)
 
 
 @checked
@@ -115,29 +92,23 @@ def search_truth(
     when the two best repeats agree. S is executed some hundred thousand times, in batches.
 
     Args:
-        validation: the map p -> d(p).
-        seed: seed of the random numbers.
         agreement: relative difference of the two best repeats at which the search ends.
-        repeats: largest number of repeats.
         population: number of points in a generation, for each dimension.
         generations: largest number of generations in one repeat.
         climbs: number of climbs from random starts in one repeat; each starts at the best of sixteen random points.
-
-    Raises:
-        InputError: if every execution failed.
     """
     search = _TruthSearch(validation, population, generations, climbs)
-    found: list[tuple[float, Array]] = []
+    maxima: list[tuple[float, Array]] = []
     with stage("searching the largest distance", unit="executions"):
-        while len(found) < repeats and not _gap(found) <= agreement:
-            found.append(search.repeat(np.random.default_rng(np.random.SeedSequence([seed, len(found)]))))
-    distance, unit_point = max(found, key=lambda repeat: repeat[0])
+        while len(maxima) < repeats and not _gap(maxima) <= agreement:
+            maxima.append(search.repeat(np.random.default_rng(np.random.SeedSequence([seed, len(maxima)]))))
+    distance, unit_point = max(maxima, key=lambda maximum: maximum[0])
     if not math.isfinite(distance):
         raise InputError("the truth is unknown: every execution of the search failed.")
-    doubt = "" if _gap(found) <= agreement else ", so the maximum may well be larger"
+    doubt = "" if _gap(maxima) <= agreement else ", so the maximum may well be larger"
     method = (
         f"best known value of {search.evaluations:,} evaluations: differential evolution and {climbs} climbs from "
-        f"elsewhere, {len(found)} repeats, of which the two best differ by {_gap(found):.2%}{doubt}"
+        f"elsewhere, {len(maxima)} repeats, of which the two best differ by {_gap(maxima):.2%}{doubt}"
     )
     return Truth(distance, validation.space.parameters(validation.space.from_unit(unit_point)), method)
 
@@ -159,7 +130,11 @@ class _TruthSearch:
 
     def repeat(self, rng: np.random.Generator) -> tuple[float, Array]:
         """Return the largest value of one search, and its point ``(d,)``."""
-        tops = [self._evolve(rng)] + [self._random_start(rng) for _ in range(self.climbs)]
+        tops = [self._evolve(rng)]
+        for _ in range(self.climbs):
+            starts = rng.random((16, self.dimension))
+            values = self.values(starts)
+            tops.append((float(values.max()), starts[np.argmax(values)]))
         points = np.array([self._climb(*top) for top in tops])
         # A diverging loop amplifies the rounding of a batch, so the distance of the task executed alone counts.
         alone = np.array([self.values(point[None])[0] for point in points])
@@ -182,35 +157,25 @@ class _TruthSearch:
         )
         return -float(evolved.fun), np.asarray(evolved.x)
 
-    def _random_start(self, rng: np.random.Generator) -> tuple[float, Array]:
-        points = rng.random((16, self.dimension))
-        values = self.values(points)
-        return float(values.max()), points[np.argmax(values)]
-
     def _climb(self, value: float, point: Array) -> Array:
         scale = value if 0 < value < np.inf else 1.0  # L-BFGS-B's tolerances suit values about 1
 
         def sloped(points: Array) -> tuple[Array, Array]:
-            here, slope = self._value_and_slope(points[0], scale)
-            return here, slope[None]
+            moves = 1e-6 * np.eye(self.dimension)
+            up, down = np.clip(points + moves, 0, 1), np.clip(points - moves, 0, 1)
+            values = self.values(np.concatenate([points, up, down])) / scale
+            widths = np.diagonal(up) - np.diagonal(down)
+            slope = (values[1 : self.dimension + 1] - values[self.dimension + 1 :]) / widths
+            return values[:1], np.where(np.isfinite(slope), slope, 0.0)[None]
 
         with np.errstate(all="ignore"):
             climbed, top = climb(sloped, point[None], np.zeros(self.dimension), np.ones(self.dimension))
         return climbed[0] if top * scale > value else point
 
-    def _value_and_slope(self, point: Array, scale: float) -> tuple[Array, Array]:
-        """Return d at a point, shape ``(1,)``, and its central differences ``(d,)``, both over the scale."""
-        moves = _STEP * np.eye(self.dimension)
-        up, down = np.clip(point + moves, 0, 1), np.clip(point - moves, 0, 1)
-        values = self.values(np.concatenate([point[None], up, down])) / scale
-        widths = np.diagonal(up) - np.diagonal(down)
-        slope = (values[1 : self.dimension + 1] - values[self.dimension + 1 :]) / widths
-        return values[:1], np.where(np.isfinite(slope), slope, 0.0)
 
-
-def _gap(found: list[tuple[float, Array]]) -> float:
+def _gap(maxima: list[tuple[float, Array]]) -> float:
     """Return the relative difference of the two best values; infinity if there are fewer than two."""
-    values = sorted((value for value, _ in found if math.isfinite(value)), reverse=True)
+    values = sorted((value for value, _ in maxima if math.isfinite(value)), reverse=True)
     if len(values) < 2:
         return math.inf
     return (values[0] - values[1]) / values[0] if values[0] > 0 else 0.0
@@ -230,12 +195,15 @@ def cached_truth(
     some others give the stored distances again.
 
     Args:
-        validation: the map p -> d(p).
         compute: a function that finds the truth; its settings, such as those of
             ``functools.partial(search_truth, seed=1)``, are part of the hash.
-        folder: the folder of the files; it is created if it does not exist.
     """
-    path = Path(folder) / f"{_fingerprint(validation, compute)}.json"
+    # The signature adds the default values, which the description of a function leaves out.
+    method = [describe(compute), str(inspect.signature(compute))]
+    identity = json.dumps(
+        [validation.space.describe(), without_numbers(validation.describe()), *method], sort_keys=True
+    )
+    path = Path(folder) / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.json"
     stored = list[Any]()
     with suppress(OSError, ValueError):
         read = json.loads(path.read_text(encoding="utf-8"))
@@ -245,23 +213,18 @@ def cached_truth(
         if truth is not None:
             return truth
     truth = compute(validation)
+    content = {
+        "distance": truth.distance,
+        "parameters": validation.space.describe_point(truth.parameters.points),
+        "method": truth.method,
+        "probes": [str(value) for value in validation.distances(_probes(validation))],
+    }
     # If the folder cannot be written, this call still returns the truth; the next call must find it again.
     with suppress(OSError, InputError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with written_whole(path) as file:
-            file.write(json.dumps([*stored, _content_of(truth, validation)], indent=1).encode())
+            file.write(json.dumps([*stored, content], indent=1).encode())
     return truth
-
-
-_PROBES = 16
-"""Number of tasks whose distances show that a stored truth belongs to a system."""
-
-
-def _fingerprint(validation: Validation, compute: Callable[[Validation], Truth]) -> str:
-    # The signature adds the default values, which the description of a function leaves out.
-    how = [describe(compute), str(inspect.signature(compute))]
-    known = [validation.space.describe(), without_numbers(validation.describe()), *how]
-    return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def _truth_of(content: Any, validation: Validation) -> Truth | None:
@@ -274,12 +237,6 @@ def _truth_of(content: Any, validation: Validation) -> Truth | None:
     except (ValueError, KeyError, TypeError):
         return None
     return Truth(distance, validation.space.parameters(point), method) if same else None
-
-
-def _content_of(truth: Truth, validation: Validation) -> dict[str, Any]:
-    parameters = validation.space.describe_point(truth.parameters.points)
-    probes = [str(value) for value in validation.distances(_probes(validation))]
-    return {"distance": truth.distance, "parameters": parameters, "method": truth.method, "probes": probes}
 
 
 def _probes(validation: Validation) -> Array:

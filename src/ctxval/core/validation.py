@@ -37,13 +37,10 @@ from ctxval.errors import (
     ShapeError,
 )
 
-START = 0.05
-"""Default start tolerance, as a fraction of the range of each state in the trajectory of the model."""
+START = 0.05  # default start tolerance, as a fraction of the range of each state in the trajectory of the model
 
-_CHUNK = 4096
-"""Number of tasks in one batched call: large enough for speed, small enough for the memory."""
-_PLANNED = 256
-"""Number of tasks that are planned in one call if S executes one at a time: more would hardly be faster."""
+_CHUNK = 4096  # tasks in one batched call: enough for speed, few enough for the memory
+_PLANNED = 256  # tasks that are planned in one call if S executes one at a time: more would hardly be faster
 
 
 @checked
@@ -145,7 +142,6 @@ class Validation:
         """Design the controller for the task at ``(d,)`` and run it on the model; S is not executed.
 
         Raises:
-            InputError: if the task function does not return one task for the point.
             DesignError: if the synthesizer failed.
             ModelError: if the model failed, or its closed loop is not finite.
         """
@@ -179,13 +175,11 @@ class Validation:
         """Check that a trajectory is a complete and finite execution of a plan; return it.
 
         Args:
-            plan: the plan of the task.
-            trajectory: the result of the system, or a recording.
             start_tolerance: replaces the start tolerance of this validation.
 
         Raises:
             ExecutionError: if it is not a complete and finite execution.
-            InputError: if it belongs to another task, that is, if its dimensions, its times or its first state differ.
+            InputError: if it belongs to another task.
         """
         if not isinstance(trajectory, Trajectory):
             raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
@@ -201,14 +195,8 @@ class Validation:
 
         This is the single check for all executions: those of a system, those of workers, and recordings of users.
 
-        Args:
-            plan: the plan of the task.
-            trajectory: the result of the system, or a recording.
-            start_tolerance: replaces the start tolerance of this validation.
-
         Raises:
             ExecutionError: if it is not a complete and finite execution.
-            InputError: if it belongs to another task.
         """
         executed = self.require(plan, trajectory, start_tolerance)
         try:
@@ -225,11 +213,7 @@ class Validation:
         return self._measured(plan.parameters, plan.task, plan.model_trajectory, trajectory)
 
     def remeasure(self, point: ArrayLike, model_trajectory: Trajectory, system_trajectory: Trajectory) -> float:
-        """Return d(p) between two known trajectories, without the design of a controller.
-
-        Raises:
-            DistanceError: as in :meth:`measure`.
-        """
+        """Return d(p) between two known trajectories, as :meth:`measure` does, without the design of a controller."""
         parameters = self.space.parameters(point)
         return self._measured(parameters, self.task_at(parameters), model_trajectory, system_trajectory)
 
@@ -266,10 +250,7 @@ class Validation:
         return [plan for chunk in chunks for plan in self._planned_together(chunk) or map(self.plan, chunk)]
 
     def _planned_together(self, points: Array) -> list[Plan] | None:
-        """Return the plans of points ``(N, d)`` from one design; None if they must be made one by one.
-
-        That is so if a part takes no batches, and if a task fails: only its own plan shows the reason.
-        """
+        """Return the plans of points ``(N, d)`` from one design; None if a part takes no batches, or a task fails."""
         if len(points) == 1 or not getattr(self.synthesizer, "batched", False):
             return None
         try:
@@ -291,22 +272,17 @@ class Validation:
             DistanceError: if the distance function raises an exception or returns the wrong shape.
         """
         rows = require_shape("points", as_floats("points", points), (self.space.dimension,))
-        if not len(rows):
-            return np.array([])
-        measured, size = (self._batch_distances, _CHUNK) if self.batched else (self._single_distances, _PLANNED)
-        return np.concatenate([measured(rows[i : i + size]) for i in range(0, len(rows), size)])
+        if self.batched and len(rows):
+            return np.concatenate([self._batch_distances(rows[i : i + _CHUNK]) for i in range(0, len(rows), _CHUNK)])
+        distances = []
+        for first in range(0, len(rows), _PLANNED):
+            chunk = rows[first : first + _PLANNED]
+            distances += [
+                self._distance_or_nan(plan) for plan in self._planned_together(chunk) or map(self.plan, chunk)
+            ]
+        return np.array(distances)
 
-    def _single_distances(self, points: Array) -> Array:
-        """Return the distances of points ``(N, d)``, with one execution after the other."""
-        plans = self._planned_together(points)
-        if plans is None:
-            return np.array([self._distance_or_nan(point) for point in points])
-        return np.array([self._executed_or_nan(plan) for plan in plans])
-
-    def _distance_or_nan(self, point: Array) -> float:
-        return self._executed_or_nan(self.plan(point))
-
-    def _executed_or_nan(self, plan: Plan) -> float:
+    def _distance_or_nan(self, plan: Plan) -> float:
         try:
             trajectory = self.execute(plan)
         except ExecutionError:
@@ -329,7 +305,7 @@ class Validation:
             trajectory = self.system.execute(plan.controller, plan.task)
         except Exception:
             # Only single executions show which task failed.
-            return np.array([self._distance_or_nan(point) for point in points])
+            return np.array([self._distance_or_nan(self.plan(point)) for point in points])
         values = self._distance(plan.task, plan.model_trajectory, trajectory)
         if values.shape != (len(points),):
             raise DistanceError(f"the distance must have shape ({len(points)},) over the batch, got {values.shape}.")

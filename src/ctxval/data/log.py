@@ -15,7 +15,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.columns import EPISODES, TIMES, column_of, in_seconds, require_distinct, time_column
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval.errors import InputError
 
@@ -26,7 +26,7 @@ _INDEX = re.compile(r"(.+?)\[(\d{1,6})\]")
 
 
 @dataclass(frozen=True, eq=False)
-class Signal:
+class Signal(ShortRepr):
     """One field of a log over time.
 
     Attributes:
@@ -44,9 +44,6 @@ class Signal:
     word: str = "row"
     unit: str = ""
     clock: str = ""
-
-    def __repr__(self) -> str:
-        return call(self, times=self.times, values=self.values)
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ class Clock:
     stamp: str = "auto"
 
 
-class Log(ABC):
+class Log(ShortRepr, ABC):
     """One recording, such as a file or an episode of a data set.
 
     Attributes:
@@ -109,9 +106,6 @@ class Log(ABC):
     def missing(self, field: str) -> InputError:
         """Return the error that there is no such field; its message lists those that there are."""
         return InputError(f"{self.source} has no field {field!r}; it has {enumerated(self.fields(), LISTED)}.")
-
-    def __repr__(self) -> str:
-        return call(self, self.source)
 
 
 class Table(Log):

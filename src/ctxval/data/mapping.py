@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 
 from ctxval._util.columns import column_of
 from ctxval._util.files import read_bytes
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval._util.units import conversion, named_unit
 from ctxval.data.log import LISTED, Clock, Log
@@ -88,7 +88,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class LogMapping:
+class LogMapping(ShortRepr):
     """How recordings become states and inputs at equal steps.
 
     Attributes:
@@ -223,8 +223,6 @@ class LogMapping:
                 f"with --state and --input or in a mapping; the fields are {enumerated(known, LISTED)}."
             )
         return LogMapping(*found, dt=log.period)
-
-    __repr__ = record
 
 
 def _in_units(own: Mapping[str, Field], units: Mapping[str, str]) -> dict[str, Field]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Rows
 from ctxval._util.columns import FAR, sentinels, time_column, unit_advice
-from ctxval._util.representation import Shown, call, counted
+from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.units import conversion
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.log import Log, Table
@@ -26,7 +26,7 @@ _LARGEST = 1e100
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class Recording(ShortRepr):
     """A part of a log without gaps, at equal steps.
 
     Attributes:
@@ -39,12 +39,9 @@ class Recording:
     start: float
     trajectory: Trajectory
 
-    def __repr__(self) -> str:
-        return call(self, self.source, self.trajectory, start=self.start)
-
 
 @dataclass(frozen=True, eq=False)
-class Recordings:
+class Recordings(ShortRepr):
     """Recordings of one system with one time step.
 
     Attributes:
@@ -78,10 +75,6 @@ class Recordings:
         return replace(Transitions.joined(parts), dt=self.dt), np.repeat(
             np.array(numbers, dtype=np.intp), [len(part) for part in parts]
         )
-
-    def __repr__(self) -> str:
-        size = Shown(f"{counted(len(self.runs), 'recording')}, {counted(self.steps, 'step')} of {self.dt:g} s")
-        return call(self, size, states=list(self.states), inputs=list(self.inputs), breaks=len(self.breaks))
 
 
 def read_recordings(

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, held_means
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
 
@@ -48,7 +48,7 @@ class Break:
 
 
 @dataclass(frozen=True, eq=False)
-class Channel:
+class Channel(ShortRepr):
     """One state or input over time, in the unit of the model.
 
     Attributes:
@@ -77,8 +77,6 @@ class Channel:
         steps = np.diff(self.times)
         steps = steps[steps > 0]
         return float(np.median(steps)) if len(steps) else 0.0
-
-    __repr__ = record
 
 
 def sampled(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval._util.units import named_unit
 from ctxval.data.log import Clock, Log, Signal
 from ctxval.errors import InputError
@@ -23,7 +23,7 @@ _OBJECT = 256
 
 
 @dataclass(frozen=True, eq=False)
-class Message:
+class Message(ShortRepr):
     """One message of a topic.
 
     Attributes:
@@ -36,9 +36,6 @@ class Message:
     logged: int
     published: int
     content: Any
-
-    def __repr__(self) -> str:
-        return call(self, self.topic, logged=self.logged)
 
 
 class TopicLog(Log):

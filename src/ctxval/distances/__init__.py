@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from ctxval._util.registry import Registry
 from ctxval.core.distance import ComposedDistance, Distance
-from ctxval.distances.at_times import AtTimes
 from ctxval.distances.base import StateNorm
 from ctxval.distances.crossing import AtCrossing, CrossingTime
-from ctxval.distances.final_state import FinalState
-from ctxval.distances.goal_error import GoalError
-from ctxval.distances.maximum_deviation import MaximumDeviation
-from ctxval.distances.mean_deviation import MeanDeviation
-from ctxval.distances.relative_deviation import RelativeDeviation
-from ctxval.distances.tracking_error import TrackingError
-from ctxval.distances.whole_trajectory import WholeTrajectory
+from ctxval.distances.deviations import (
+    AtTimes,
+    FinalState,
+    GoalError,
+    MaximumDeviation,
+    MeanDeviation,
+    RelativeDeviation,
+    TrackingError,
+    WholeTrajectory,
+)
 
 __all__ = [
     "REGISTRY",

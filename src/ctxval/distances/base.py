@@ -12,15 +12,13 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, vector_norm
 from ctxval._util.checked import Norm
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 
-_COMPARABLE = ("weights", "scales", "angles")
 
-
-class NamedStates:
+class NamedStates(ShortRepr):
     """A dataclass whose options ``components``, ``angles`` and ``state`` may have names of states besides indices."""
 
     def with_states(self, names: Sequence[str]) -> Self:
@@ -28,9 +26,6 @@ class NamedStates:
 
         Args:
             names: the names of all states; if empty, nothing is replaced.
-
-        Raises:
-            UnknownNameError: if no state has a name.
         """
 
         def index(value: Any) -> Any:
@@ -38,20 +33,17 @@ class NamedStates:
                 raise UnknownNameError.among("state", value, names)
             return names.index(value) if isinstance(value, str) else value
 
-        found: dict[str, Any] = {}
-        for name in _STATES if names else ():
-            value: Any = getattr(self, name, None)
+        indices: dict[str, Any] = {}
+        for option in ("components", "angles", "state") if names else ():
+            value: Any = getattr(self, option, None)
             if isinstance(value, str):
-                found[name] = index(value)
+                indices[option] = index(value)
             elif isinstance(value, list | tuple) and any(isinstance(item, str) for item in value):
-                found[name] = tuple(map(index, value))
-        return dataclasses.replace(self, **found) if found else self  # type: ignore[type-var]
+                indices[option] = tuple(map(index, value))
+        return dataclasses.replace(self, **indices) if indices else self  # type: ignore[type-var]
 
 
-_STATES = ("components", "angles", "state")
-
-
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class StateNorm(NamedStates):
     """A norm of differences between states.
 
@@ -65,11 +57,6 @@ class StateNorm(NamedStates):
         scales: the unit of comparison of each compared state, a positive number; 1 by default.
         angles: the states that are angles in radians, by index or name: the difference is taken on the circle, so it
             is at most pi.
-
-    Raises:
-        InputError: if the order of the norm is not 1, 2 or infinity, no state is compared, or a weight or a scale
-            cannot be used.
-        ShapeError: if the number of weights or scales is not that of the compared states.
     """
 
     norm: Norm = 1
@@ -97,9 +84,6 @@ class StateNorm(NamedStates):
 
         Args:
             states, others: states, shape ``(..., n)``; each axis before the last must match or be 1.
-
-        Raises:
-            ShapeError: if there is no state of an index, or the number of weights or scales is another one.
         """
         gap = selected(self.unwrapped(states - others), self.components)
         counts = [len(given) for given in (self.weights, self.scales) if given is not None]
@@ -127,24 +111,20 @@ class StateNorm(NamedStates):
             return ()
         compared = range(len(units)) if self.components is None else self.components
         places = [i for i in compared if not isinstance(i, str) and -len(units) <= i < len(units)]
-        found = dict.fromkeys(units[i] for i in places if units[i])
-        return tuple(found) if len(found) > 1 else ()
+        distinct = dict.fromkeys(units[i] for i in places if units[i])
+        return tuple(distinct) if len(distinct) > 1 else ()
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies the distance in a store. Weights and scales that change nothing are left out."""
-        found = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        kept = {name: value for name, value in found.items() if name not in _COMPARABLE}
+        names = [field.name for field in dataclasses.fields(self)]
+        described = {name: getattr(self, name) for name in names if name not in ("weights", "scales", "angles")}
         factors = self.factors
-        return (
-            kept | ({} if factors is None else {"factors": factors}) | ({"angles": self.angles} if self.angles else {})
-        )
-
-    def __repr__(self) -> str:
-        found = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return call(self, **{name: value for name, value in found.items() if value is not None and value != ()})
+        if factors is not None:
+            described["factors"] = factors
+        return described | ({"angles": self.angles} if self.angles else {})
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class ErrorNorm(StateNorm, ABC):
     """Norm of an error vector of the trajectories of one task; see :class:`StateNorm` for the attributes."""
 
@@ -184,13 +164,9 @@ def require_indices(name: str, indices: Sequence[int | str], count: int) -> list
 
 
 def require_numbers(name: str, given: ArrayLike | None, components: Sequence[int | str] | None, *, zero: bool) -> None:
-    """Check that an option is None or a list of finite numbers, one for each component if these are known.
+    """Check that an option is None or a list of positive numbers, one for each component if these are known.
 
-    Args:
-        name: the name of the option.
-        given: the value.
-        components: the compared states, if they are known.
-        zero: whether 0 is allowed, though not for all of them.
+    With ``zero``, some of them may be 0.
     """
     if given is None:
         return

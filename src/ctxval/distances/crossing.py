@@ -10,7 +10,6 @@ import numpy as np
 from ctxval._util.arrays import Array, vector_norm
 from ctxval._util.checked import FiniteFloat, Norm, PositiveInt
 from ctxval._util.registry import part
-from ctxval._util.representation import record
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.distances.base import ErrorNorm, NamedStates, require_indices, turned
@@ -19,7 +18,7 @@ Direction = Literal["up", "down", "either"]
 
 
 @part()
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class AtCrossing(ErrorNorm):
     """Largest norm of the difference between the states at which M and S first cross a level, such as a gate.
 
@@ -27,16 +26,12 @@ class AtCrossing(ErrorNorm):
     trajectory that does not cross so often is compared at its final state.
 
     Attributes:
-        norm: order of the norm over the states at one crossing: 1, 2 or infinity.
-        components: the states that are compared, by index or name; all states by default.
+        norm, components, weights, scales, angles: as in :class:`StateNorm`. An angle crosses the level wherever it does
+            on the circle.
         state: index or name of the state that crosses the level.
         level: the level, in the unit of this state.
         direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
         crossings: number of crossings that are compared; only the first one by default.
-        weights, scales, angles: as in :class:`StateNorm`. An angle crosses the level wherever it does on the circle.
-
-    Raises:
-        InputError: if an argument cannot be used.
     """
 
     norm: Norm = 2
@@ -69,7 +64,7 @@ class AtCrossing(ErrorNorm):
 
 
 @part()
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class CrossingTime(NamedStates):
     """Difference in seconds between the times at which M and S first cross a level; interpolated between samples.
 
@@ -80,9 +75,6 @@ class CrossingTime(NamedStates):
         level: the level, in the unit of this state.
         direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
         angle: whether the state is an angle in radians, which crosses the level wherever it crosses it on the circle.
-
-    Raises:
-        InputError: if an argument cannot be used.
     """
 
     state: int | str = 0
@@ -99,8 +91,6 @@ class CrossingTime(NamedStates):
         above = trajectory.states[..., state] - self.level
         return _crossings(above, self.direction, 1, self.angle)[..., 0]
 
-    __repr__ = record
-
 
 def _crossings(above: Array, direction: Direction, count: int, on_circle: bool) -> Array:
     """Return the places of the first crossings of 0 in steps, ``(..., count)``; the last step if there is none."""
@@ -114,9 +104,9 @@ def _crossings(above: Array, direction: Direction, count: int, on_circle: bool) 
     with np.errstate(all="ignore"):
         places = np.arange(first.shape[-1]) + first / (first - second)
     numbers = np.cumsum(crossed, axis=-1)
-    found = []
+    first_places = []
     for number in range(1, count + 1):
         at = crossed & (numbers == number)
         place = np.take_along_axis(places, at.argmax(axis=-1)[..., None], axis=-1)[..., 0]
-        found.append(np.where(at.any(axis=-1), place, float(first.shape[-1])))
-    return np.stack(found, axis=-1)
+        first_places.append(np.where(at.any(axis=-1), place, float(first.shape[-1])))
+    return np.stack(first_places, axis=-1)

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, Limits
 from ctxval.core.plan import Plan
 from ctxval.core.trajectory import Trajectory
@@ -73,7 +73,7 @@ def _chirp(horizon: int, rng: np.random.Generator) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Excited:
+class Excited(ShortRepr):
     """A controller with a signal added to its inputs, within limits.
 
     Attributes:
@@ -91,11 +91,8 @@ class Excited:
         whole = np.asarray(self.controller(t, x)) + self.signal[t]
         return np.asarray(np.clip(whole, self.limits.low, self.limits.high))
 
-    def __repr__(self) -> str:
-        return call(self, self.controller, signal=self.signal)
 
-
-class Excitation:
+class Excitation(ShortRepr):
     """Executes random tasks of an experiment with a signal that is added to the inputs.
 
     Run k depends only on the seed and on k.
@@ -146,6 +143,3 @@ class Excitation:
         signal = excitation(self.kind, plan.task.horizon, self.amplitude, np.random.default_rng([self.seed, number, 1]))
         excited = Excited(plan.controller, signal, self.limits)
         return self.validation.execute(Plan(plan.parameters, plan.task, excited, plan.model_trajectory))
-
-    def __repr__(self) -> str:
-        return call(self, self.validation, self.kind, amplitude=self.amplitude)

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.representation import call, counted, record
+from ctxval._util.representation import ShortRepr, counted
 from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.recordings import Recording, Recordings
@@ -37,7 +37,7 @@ _MOST = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class FittedModel:
+class FittedModel(ShortRepr):
     """A model that was learned from recordings.
 
     Attributes:
@@ -74,12 +74,9 @@ class FittedModel:
             f"{counted(worst.steps, 'step')} is {100 * worst.relative:.3g} % of the recorded change"
         )
 
-    def __repr__(self) -> str:
-        return call(self, self.kind, self.model, relative=self.relative)
-
 
 @dataclass(frozen=True)
-class FailedFit:
+class FailedFit(ShortRepr):
     """A kind of model that could not be learned from recordings.
 
     Attributes:
@@ -89,11 +86,10 @@ class FailedFit:
 
     kind: Kind
     reason: str
-    __repr__ = record
 
 
 @dataclass(frozen=True, eq=False)
-class FitReport:
+class FitReport(ShortRepr):
     """Models that were learned from the same recordings, with their errors on the same held-out recordings.
 
     Attributes:
@@ -124,9 +120,6 @@ class FitReport:
         failed = [asdict(one) for one in self.failed]
         report = {"fitted": found, "failed": failed, "learned_from": sizes, "held_out": held}
         return {**plain_numbers(report), "dt": self.held_out.dt, "notes": list(self.held_out.notes)}
-
-    def __repr__(self) -> str:
-        return call(self, [one.kind for one in self.fitted], failed=[one.kind for one in self.failed])
 
 
 def fit(

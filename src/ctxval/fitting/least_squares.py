@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import reason_of
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import CtxvalError, InputError, ModelError
@@ -28,7 +28,7 @@ _CONDITION = 1e8
 
 
 @dataclass(frozen=True)
-class FittedParameter:
+class FittedParameter(ShortRepr):
     """One parameter of a model.
 
     Attributes:
@@ -43,7 +43,6 @@ class FittedParameter:
     low: float
     high: float
     note: str = ""
-    __repr__ = record
 
 
 def fit_parameters(

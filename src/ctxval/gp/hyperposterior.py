@@ -16,7 +16,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Rows
 from ctxval._util.boxes import farthest_rows
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise
 from ctxval.gp.kernels import Matern
@@ -119,7 +119,7 @@ class Prior:
 
 
 @dataclass(frozen=True, eq=False)
-class Hyperparameters:
+class Hyperparameters(ShortRepr):
     """One draw of the hyperparameters.
 
     Attributes:
@@ -144,12 +144,9 @@ class Hyperparameters:
     def _theta(self) -> Array:
         return np.concatenate([[0.0], self.log_scales])
 
-    def __repr__(self) -> str:
-        return record(self)
-
 
 @dataclass(frozen=True, eq=False)
-class Conditioned:
+class Conditioned(ShortRepr):
     """A Gaussian process with one draw of hyperparameters, conditioned on data.
 
     Attributes:
@@ -171,9 +168,6 @@ class Conditioned:
     mean_variance: float
     scale2: float
     log_likelihood: float
-
-    def __repr__(self) -> str:
-        return call(self, self.hyperparameters, values=self.y, mean=self.mean, scale2=self.scale2)
 
 
 def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: Warp | None = None) -> Conditioned:

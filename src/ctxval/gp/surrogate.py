@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError
 from ctxval.gp.hyperposterior import Warp
 from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
@@ -36,7 +36,7 @@ _LEARNED_FROM = 300
 
 
 @dataclass(frozen=True, eq=False)
-class Surrogate:
+class Surrogate(ShortRepr):
     """A GP of the distance over the unit cube.
 
     Attributes:
@@ -52,9 +52,6 @@ class Surrogate:
         """Return posterior mean and standard deviation at unit-cube points ``(m, d)``, shapes ``(m,)``."""
         mean, variance = self.process.predict(points)
         return self.shift + self.scale * mean, self.scale * np.sqrt(variance)
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 def fit_surrogate(
@@ -123,7 +120,7 @@ def _with_imputed(process: GaussianProcess, points: Array) -> GaussianProcess:
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
+class Learned(ShortRepr):
     """Learned hyperparameters, with which a process can be conditioned on the same values and on later ones.
 
     Attributes:
@@ -150,9 +147,6 @@ class Learned:
         known = np.isfinite(values)
         process = condition(_KERNEL, self.theta, points[known], self.standardised(values[known]))
         return _with_imputed(process, points[~known])
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 def learn(points: Array, values: Array) -> Learned:

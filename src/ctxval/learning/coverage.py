@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ctxval._util.arrays import Array, Rows
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.learning.closed_loops import Loops, PlannedTasks
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
@@ -42,7 +42,7 @@ class Gap:
 
 
 @dataclass(frozen=True, eq=False)
-class Coverage:
+class Coverage(ShortRepr):
     """The largest gaps between what closed loops visit and what is recorded.
 
     Attributes:
@@ -61,9 +61,6 @@ class Coverage:
     task: Array
     resolution: Array
     tasks: int
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 def coverage(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.learning.kernel_expansion import KernelExpansion
 from ctxval.learning.residual_data import ResidualData
@@ -17,7 +17,7 @@ _LARGEST = 1e6
 
 
 @dataclass(frozen=True, eq=False)
-class DynamicsDraws:
+class DynamicsDraws(ShortRepr):
     """S models ``M + r_s``, run together: a draw is the first axis of states and inputs.
 
     Attributes:
@@ -71,9 +71,6 @@ class DynamicsDraws:
     def model_of(self, index: int) -> DrawnModel:
         """Return one draw as a model."""
         return DrawnModel(self[index])
-
-    def __repr__(self) -> str:
-        return call(self, self.model, draws=len(self))
 
 
 def bounded(z: Array) -> Array:

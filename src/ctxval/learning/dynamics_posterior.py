@@ -17,7 +17,7 @@ from itertools import groupby
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
@@ -83,7 +83,7 @@ class PosteriorSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class LearnedCovariances:
+class LearnedCovariances(ShortRepr):
     """The posterior of the hyperparameters, learned from the transitions of some executions.
 
     Attributes:
@@ -109,12 +109,9 @@ class LearnedCovariances:
         with single_threaded():
             return [self.posterior.mode, *self.posterior.draw(self.settings.hyperparameters - 1, rng)]
 
-    def __repr__(self) -> str:
-        return call(self, self.model)
-
 
 @dataclass(frozen=True, eq=False)
-class DynamicsPosterior:
+class DynamicsPosterior(ShortRepr):
     """The posterior of the dynamics of S, given recorded transitions.
 
     Attributes:
@@ -299,9 +296,6 @@ class DynamicsPosterior:
         It is the median over the draws of the hyperparameters, of the state in which it is largest.
         """
         return float(np.median([(one.noise**2).max() for one in self.components]))
-
-    def __repr__(self) -> str:
-        return call(self, self.model, data=self.data)
 
 
 def learn_covariances(

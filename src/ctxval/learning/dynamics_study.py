@@ -13,7 +13,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.boxes import moves_to_bounds
 from ctxval._util.describe import describe
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
@@ -47,7 +47,7 @@ _PAIRS = 300
 """Largest number of pairs from which the pivots of a single task are chosen."""
 
 
-class DynamicsStudy:
+class DynamicsStudy(ShortRepr):
     """Learns the dynamics of one experiment from growing sets of executions.
 
     Everything is a function of the executions and the seed. Controllers that are designed are kept.
@@ -216,12 +216,9 @@ class DynamicsStudy:
             return None
         return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)
 
-    def __repr__(self) -> str:
-        return call(self, self.validation, seed=self.seed)
-
 
 @dataclass(frozen=True, eq=False)
-class LearnedDynamics:
+class LearnedDynamics(ShortRepr):
     """The dynamics learned from the executions so far; everything that follows is computed once, if it is needed.
 
     Attributes:
@@ -341,9 +338,6 @@ class LearnedDynamics:
 
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng([self.study.seed, len(self.executed), purpose])
-
-    def __repr__(self) -> str:
-        return call(self, self.posterior, executed=len(self.executed))
 
 
 def _scheduled(count: int) -> int:

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.draws import DynamicsDraws
@@ -30,7 +30,7 @@ _DIVERGED = 1e6
 
 
 @dataclass(frozen=True)
-class ExecutionPrediction:
+class ExecutionPrediction(ShortRepr):
     """Draws of the trajectory and of the distance of one task, summarised in plain numbers for JSON.
 
     Attributes:
@@ -116,9 +116,6 @@ class ExecutionPrediction:
         scale2 = self.deviation**2 + (_NEGLIGIBLE_DISTANCE * max(distance, self.median)) ** 2
         of_distance = (distance - self.median) ** 2 / max(scale2, 1e-300)
         return PredictionScore(max(of_states, of_distance), rank, distance / max(self.median, 1e-300))
-
-    def __repr__(self) -> str:
-        return call(self, median=self.median, deviation=self.deviation, learned_from=self.learned_from)
 
 
 @dataclass(frozen=True)

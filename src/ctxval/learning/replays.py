@@ -14,7 +14,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.progress import advance
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -25,7 +25,7 @@ from ctxval.learning.error_vectors import Executed, executions_of
 
 
 @dataclass(frozen=True, eq=False)
-class Replay:
+class Replay(ShortRepr):
     """One executed task on M, and on the corrected model that is learned from all other tasks.
 
     Attributes:
@@ -37,9 +37,6 @@ class Replay:
     task: Task
     corrected: Trajectory | None
     distance: float
-
-    def __repr__(self) -> str:
-        return call(self, self.task, distance=self.distance)
 
 
 def replay_executed(validation: Validation, executed: Executed, wanted: Sequence[Array]) -> list[Replay | None]:

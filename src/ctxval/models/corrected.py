@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, linearize
 from ctxval.core.trajectory import Transitions
 from ctxval.models.correction import Correction
@@ -16,12 +16,10 @@ Linearised = Literal["corrected", "model"]
 """Whose Jacobian controllers are designed with."""
 
 
-class Corrected:
+class Corrected(ShortRepr):
     """The model ``M'(x, u) = M(x, u) + r(x, u)`` of a model M and a correction r.
 
     Args:
-        model: the model M.
-        correction: the correction r.
         linearised: ``"corrected"`` for the Jacobian of M', or ``"model"`` for that of M. With the second one, a
             synthesizer that linearises once, such as LQR, designs nearly the controllers that it designed on M: the
             Jacobian of M' at one point may say less of the tasks than a linear model that was fitted to all of them.
@@ -54,19 +52,14 @@ class Corrected:
         n = x.shape[-1]
         return A + own[..., :n], B + own[..., n:]
 
-    def __repr__(self) -> str:
-        learned = None if self.data is None else len(self.data)
-        return call(self, self.model, self.correction, linearised=self.linearised, transitions=learned)
 
-
-class Refined:
+class Refined(ShortRepr):
     """A model that was learned again from executions, with all transitions that are known, and the model before.
 
     The transitions are coverage for what is learned next. A residual of the refined model itself would be misleadingly
     small at them. What learns from executions therefore takes the residual of the model before.
 
     Args:
-        model: the refined model.
         data: all transitions that are known, those of the executions of earlier models included.
         before: the model that was refined; of a model that was refined before, the first one.
     """
@@ -85,9 +78,6 @@ class Refined:
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         return self.model.step(x, u)
-
-    def __repr__(self) -> str:
-        return call(self, self.model, transitions=len(self.data))
 
 
 def before_refinement(model: Model) -> Model:

@@ -8,17 +8,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.kernel_maps import KernelSum, matern
 from ctxval.models.scaling import standardised_pairs
 
-_CACHED = 40_000
-"""Number of covariances that are computed together, so that they stay in the processor's cache."""
-
 
 @dataclass(frozen=True, eq=False)
-class Correction:
+class Correction(ShortRepr):
     """The correction ``r(x, u)``: a weighted sum of Matern 5/2 covariances with centres, and a linear function.
 
     A pair is standardised, ``z = ((x, u) - shift) / scale``. Outside the box of the recorded pairs, the correction
@@ -34,10 +31,6 @@ class Correction:
         low, high: the box of the recorded pairs, standardised, shapes ``(n + m,)``.
         fade: standardised distances from the box over which the correction fades, shape ``(n + m,)``.
         limit: largest magnitude of the correction of each state, shape ``(n,)``.
-
-    Raises:
-        ShapeError: if the shapes do not fit together.
-        InputError: if a value is not finite, or a scale is not positive.
     """
 
     shift: Array
@@ -66,7 +59,7 @@ class Correction:
                 raise ShapeError(f"{name} of a correction must have shape {shape}, got {value.shape}.")
             if not np.isfinite(value).all():
                 raise InputError(f"{name} of a correction must be finite.")
-        if min(float(one.min()) for one in (self.scale, self.length_scales, self.fade)) <= 0:
+        if min(float(scale.min()) for scale in (self.scale, self.length_scales, self.fade)) <= 0:
             raise InputError("the scales of a correction must be positive.")
 
     @property
@@ -79,9 +72,8 @@ class Correction:
         z = standardised_pairs(x, u, self.shift, self.scale)
         rows = z.reshape(-1, z.shape[-1])
         values = rows @ self.linear[:-1] + self.linear[-1]
-        size = max(1, _CACHED // max(1, len(self.centres)))
-        for first in range(0, len(rows), size):
-            values[first : first + size] += self._kernel_sum.value(rows[first : first + size])
+        for block in self._blocks(len(rows)):
+            values[block] += self._kernel_sum.value(rows[block])
         values = np.clip(values, -self.limit, self.limit) * self._faded(rows)[:, None]
         return np.asarray(values.reshape(*z.shape[:-1], self.states))
 
@@ -89,9 +81,13 @@ class Correction:
         """Return the derivatives by state and input, shape ``(..., n, n + m)``."""
         z = standardised_pairs(x, u, self.shift, self.scale)
         rows = z.reshape(-1, z.shape[-1])
-        size = max(1, _CACHED // max(1, len(self.centres)))
-        parts = [self._jacobian(rows[first : first + size]) for first in range(0, max(1, len(rows)), size)]
+        parts = [self._jacobian(rows[block]) for block in self._blocks(max(1, len(rows)))]
         return np.concatenate(parts).reshape(*z.shape[:-1], self.states, z.shape[-1])
+
+    def _blocks(self, count: int) -> list[slice]:
+        """Return blocks of rows whose 40,000 covariances stay in the processor's cache."""
+        size = max(1, 40_000 // max(1, len(self.centres)))
+        return [slice(first, first + size) for first in range(0, count, size)]
 
     def _jacobian(self, rows: Array) -> Array:
         values, pull_back = self._kernel_sum.linearised(rows)
@@ -125,6 +121,3 @@ class Correction:
     def arrays(self) -> dict[str, Array]:
         """Return all arrays by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def __repr__(self) -> str:
-        return call(self, states=self.states, centres=len(self.centres))

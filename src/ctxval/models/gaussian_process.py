@@ -9,29 +9,21 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
 from ctxval._util.registry import part
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import ShapeError
 from ctxval.gp.cholesky import factorise
 from ctxval.gp.regression import log_likelihood_of_outputs, most_likely
 from ctxval.models.scaling import IncrementScaling
 
-_BLOCK = 2048
-"""Points in one matrix of covariances: enough to be fast, few enough for the cache."""
-_VARIANCE = (1e-2, 1e4)
-"""Bounds of the variance, for standardised increments."""
-_NOISE = (1e-6, 1.0)
-"""Bounds of the noise variance, for standardised increments."""
-_LENGTH_SCALE = (0.1, 100.0)
-"""Bounds of the length-scales, for standardised inputs."""
+_BLOCK = 2048  # points in one matrix of covariances: enough to be fast, few enough for the cache
 
 
 @dataclass(frozen=True, eq=False)
-class SquaredExponential:
+class SquaredExponential(ShortRepr):
     """``k(z, z') = v exp(-1/2 sum_j ((z_j - z'_j) / l_j)^2)``: rigid-body dynamics are smooth.
 
     Attributes:
-        variance: v.
         length_scales: l, shape ``(k,)``.
     """
 
@@ -47,11 +39,9 @@ class SquaredExponential:
         np.minimum(exponent, 0.0, out=exponent)  # rounding may leave a point at a distance from itself
         return np.asarray(self.variance * np.exp(exponent, out=exponent))
 
-    __repr__ = record
-
 
 @part()
-class GaussianProcessModel:
+class GaussianProcessModel(ShortRepr):
     """The posterior mean of Gaussian processes, one for each state's increment, that share a covariance.
 
     Sharing it lets one Cholesky factor and one matrix of covariances serve all states.
@@ -62,10 +52,6 @@ class GaussianProcessModel:
         weights: ``(K + noise I)^-1 Y``, shape ``(M, n)``.
         scaling: of the state-input pair and of the increment.
         data: the transitions that it was learned from, if any.
-
-    Raises:
-        ShapeError: the shapes do not fit together.
-        InputError: a value is not finite.
     """
 
     def __init__(
@@ -99,19 +85,20 @@ class GaussianProcessModel:
         """Condition on recorded transitions, with the most likely hyperparameters (eq. 5.8, summed over the states).
 
         Args:
-            data: the transitions.
             points: how many of them, drawn at random, it is conditioned on; the effort grows with their cube.
-            seed: of the draw.
             iterations: of the search for the hyperparameters, at most.
-
-        Raises:
-            InputError: if the data are not finite.
         """
         scaling = IncrementScaling.of(data)
         rows = np.random.default_rng(seed).permutation(len(data))[:points]
         Z, Y = scaling.inputs(data.x, data.u)[rows], scaling.targets(data)[rows]
         with single_threaded():
-            covariance, noise = _most_likely(Z, Y, iterations)
+            # Bounds of the variance, the noise variance and the length-scales, of standardised pairs and increments.
+            boxes = [(1e-2, 1e4), (1e-6, 1.0), *[(0.1, 100.0)] * Z.shape[1]]
+            bounds = [(float(np.log(low)), float(np.log(high))) for low, high in boxes]
+            start = np.log([1.0, 1e-3, *[3.0] * Z.shape[1]])
+            theta = most_likely(lambda t: log_likelihood(t, Z, Y), start[None], bounds, iterations=iterations)
+            variance, noise, *length_scales = np.exp(theta).tolist()
+            covariance = SquaredExponential(variance, np.array(length_scales))
             return cls.conditioned(covariance, noise, Z, Y, scaling, data)
 
     @classmethod
@@ -124,11 +111,7 @@ class GaussianProcessModel:
         scaling: IncrementScaling,
         data: Transitions | None = None,
     ) -> GaussianProcessModel:
-        """Return the model with these hyperparameters, given standardised pairs ``(M, n + m)``, increments ``(M, n)``.
-
-        Raises:
-            InputError: the covariance matrix is not positive definite.
-        """
+        """Return the model of standardised pairs ``(M, n + m)`` and increments ``(M, n)`` with a known covariance."""
         return cls(covariance, Z, factorise(covariance(Z, Z), noise).solve(Y), scaling, data)
 
     def step(self, x: Array, u: Array) -> Array:
@@ -153,31 +136,11 @@ class GaussianProcessModel:
         blocks = [rows[i : i + _BLOCK] for i in range(0, max(1, len(rows)), _BLOCK)]
         return np.concatenate([self.covariance(block, self.centres) @ columns for block in blocks])
 
-    def __repr__(self) -> str:
-        states = self.weights.shape[1]
-        sizes = {"states": states, "inputs": self.centres.shape[1] - states, "points": len(self.centres)}
-        learned = None if self.data is None else len(self.data)
-        return call(self, self.covariance, **sizes, transitions=learned)
-
-
-def _most_likely(Z: Array, Y: Array, iterations: int) -> tuple[SquaredExponential, float]:
-    """Return the covariance and the noise that make standardised outputs ``(M, n)`` most likely."""
-    boxes = [_VARIANCE, _NOISE, *[_LENGTH_SCALE] * Z.shape[1]]
-    bounds = [(float(np.log(low)), float(np.log(high))) for low, high in boxes]
-    start = np.log([1.0, 1e-3, *[3.0] * Z.shape[1]])
-
-    found = most_likely(lambda theta: log_likelihood(theta, Z, Y), start[None], bounds, iterations=iterations)
-    variance, noise, *length_scales = np.exp(found).tolist()
-    return SquaredExponential(variance, np.array(length_scales)), noise
-
 
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
     """Return ``sum_o log p(Y[:, o] | Z, theta)`` up to a constant, and its gradient (eqs. 5.8 and 5.9).
 
-    Args:
-        theta: logarithms of (variance, noise, length-scales).
-        Z: pairs ``(M, k)``.
-        Y: outputs ``(M, n)`` that share the covariance.
+    The pairs Z are ``(M, k)``, the outputs Y ``(M, n)``; theta has the logarithms of (variance, noise, length-scales).
     """
     variance, noise, *length_scales = np.exp(theta)
     covariance = SquaredExponential(float(variance), np.array(length_scales))

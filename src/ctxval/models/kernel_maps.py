@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array
-from ctxval.models.smooth_maps import PullBack
+from ctxval.models.smooth_maps import PullBack, SmoothMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +38,10 @@ Kernel = Callable[[Array, Array], tuple[Array | float, Slopes]]
 
 
 @dataclass(frozen=True, eq=False)
-class KernelSum:
+class KernelSum(SmoothMap):
     """The map ``sum_i k(z, x_i) w_i``.
 
     Attributes:
-        kernel: k.
         centres: the x_i, shape ``(M, k)``.
         weights: the w_i, shape ``(M, o)``.
     """
@@ -51,32 +50,23 @@ class KernelSum:
     centres: Array
     weights: Array
 
-    constant = False
-
-    def value(self, Z: Array) -> Array:
-        """Return the values ``(N, o)`` at rows ``(N, k)``."""
-        return self._matrix(self.kernel(Z, self.centres)[0], Z) @ self.weights
-
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
+        """Return the values, and what pulls derivatives back to the rows."""
         covariances, slopes = self.kernel(Z, self.centres)
-
-        def pull_back(G: Array) -> Array:
-            return np.asarray(G @ self._derivatives(Z, slopes()))
-
-        return self._matrix(covariances, Z) @ self.weights, pull_back
+        values = self._matrix(covariances, Z) @ self.weights
+        return values, lambda G: np.asarray(G @ self._derivatives(Z, slopes()))
 
     def _derivatives(self, Z: Array, slopes: list[Slope]) -> Array:
         """Return the derivatives ``(N, o, k)``: sums over the centres of ``factor w`` and of ``factor w x``."""
         (count, k), outputs = Z.shape, self.weights.shape[1]
         moments = (self.weights[:, :, None] * self.centres[:, None, :]).reshape(len(self.centres), -1)
         columns = np.concatenate([self.weights, moments], axis=1)
-        found = np.zeros((count, outputs, k))
+        derivatives = np.zeros((count, outputs, k))
         for slope in slopes:
             sums = self._matrix(slope.factor, Z) @ columns
             drawn = sums[:, outputs:].reshape(count, outputs, k)
-            found += (drawn - slope.pull * sums[:, :outputs, None] * Z[:, None, :]) * slope.weight
-        return found
+            derivatives += (drawn - slope.pull * sums[:, :outputs, None] * Z[:, None, :]) * slope.weight
+        return derivatives
 
     def _matrix(self, values: Array | float, Z: Array) -> Array:
         return np.broadcast_to(values, (len(Z), len(self.centres)))

@@ -6,16 +6,15 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
-_LARGEST_CONDITION = 1e8
-"""Largest condition number, half of the digits of a double; beyond it rounding and noise determine the weights."""
+_LARGEST_CONDITION = 1e8  # half of the digits of a double; beyond it rounding and noise determine the weights
 
 
 @part()
-class Linear:
+class Linear(ShortRepr):
     """The model ``x_next = A x + B u + c``.
 
     Args:
@@ -23,10 +22,6 @@ class Linear:
         B: matrix of the inputs, shape ``(n, m)``.
         c: constant term, shape ``(n,)``; zero by default.
         data: the transitions that the model was learned from, if any.
-
-    Raises:
-        ShapeError: if the shapes of A, B and c do not match.
-        InputError: if a value is not finite.
     """
 
     def __init__(self, A: ArrayLike, B: ArrayLike, c: ArrayLike | None = None, data: Transitions | None = None) -> None:
@@ -48,16 +43,7 @@ class Linear:
 
     @classmethod
     def fit(cls, data: Transitions, *, intercept: bool = True) -> Linear:
-        """Fit A, B and c by least squares on recorded transitions.
-
-        Args:
-            data: the recorded transitions.
-            intercept: whether c is fitted; otherwise it is zero.
-
-        Raises:
-            InputError: if the data are not finite, or determine the model not at all or with too large a condition
-                number.
-        """
+        """Fit A, B and c by least squares on recorded transitions; without an intercept, c is zero."""
         n, m = data.x.shape[1], data.u.shape[1]
         if not all(np.isfinite(array).all() for array in (data.x, data.u, data.x_next)):
             raise InputError("a linear model needs finite transitions, got NaN or infinity.")
@@ -74,11 +60,7 @@ class Linear:
         return cls(weights[:n].T, weights[n : n + m].T, weights[n + m] if intercept else None, data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
-
-        Raises:
-            ShapeError: if the shapes do not fit.
-        """
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         try:
             return np.asarray(x @ self.A.T + u @ self.B.T + self.c)
         except ValueError as error:
@@ -90,10 +72,6 @@ class Linear:
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A and B, which are the same for all states and inputs."""
         return self.A, self.B
-
-    def __repr__(self) -> str:
-        learned = None if self.data is None else len(self.data)
-        return call(self, states=len(self.A), inputs=self.B.shape[1], transitions=learned)
 
 
 def _require_identifiable(regressors: Array, n: int, m: int) -> None:

@@ -12,19 +12,17 @@ from ctxval._util.checked import Seconds
 from ctxval._util.extras import require_extra
 from ctxval._util.mjcf import compile_mjcf, is_mjcf_text
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
+from ctxval.core.model import paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
 _SYSID = "params_x_hat.yaml"
 """A file that ``mujoco.sysid.save_results`` writes beside the identified models."""
 
-_WHOLE = 1e-6
-"""Largest difference between a time step and a multiple of the timestep of MuJoCo, as a share of the latter."""
-
 
 @part(files=("mjcf",))
-class MuJoCo:
+class MuJoCo(ShortRepr):
     """An MJCF model as the model M. The state is ``(qpos, qvel)``, and the input is MuJoCo's ``ctrl``.
 
     A step is a function of state and input alone: it starts without activations and without a warm start of the
@@ -35,10 +33,6 @@ class MuJoCo:
             one identified model. Its pickle files are never read.
         dt: length of a step in seconds, a multiple of the model's timestep; the timestep by default.
         data: the transitions that the model was identified from, if they are known.
-
-    Raises:
-        InputError: if MuJoCo is not installed, the model cannot be read or compiled or has activations, or dt is not a
-            multiple of its timestep.
     """
 
     def __init__(self, mjcf: str | Path, *, dt: Seconds | None = None, data: Transitions | None = None) -> None:
@@ -57,11 +51,7 @@ class MuJoCo:
         return float(self._model.opt.timestep) * self.substeps
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
-
-        Raises:
-            ShapeError: if the number of states or inputs differs from the model's.
-        """
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         model, nq = self._model, self._model.nq
         if (x.shape[-1], u.shape[-1]) != (nq + model.nv, model.nu):
             raise ShapeError(
@@ -69,8 +59,7 @@ class MuJoCo:
                 f"got {x.shape[-1]} states and {u.shape[-1]} inputs."
             )
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        states = rows_of(np.broadcast_to(x, (*batch, x.shape[-1])))
-        inputs = rows_of(np.broadcast_to(u, (*batch, u.shape[-1])))
+        states, inputs = map(rows_of, paired(x, u))
         reached = np.full(states.shape, np.nan)
         data = self._mujoco.MjData(model)
         for k in np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1)).tolist():
@@ -88,22 +77,18 @@ class MuJoCo:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ = {**state, "_mujoco": require_extra("mujoco", "mujoco", "models of MuJoCo")}
 
-    def __repr__(self) -> str:
-        sizes = {name: int(getattr(self._model, name)) for name in ("nq", "nv", "nu")}
-        return call(self, **sizes, dt=self.dt, transitions=None if self.data is None else len(self.data))
-
 
 def identified_in(path: Path) -> Path:
     """Return the file of a model: the path itself, or the only identified model in a folder of ``mujoco.sysid``."""
     if not path.is_dir():
         return path
-    found = sorted(path.glob("*.xml"))
-    if not (path / _SYSID).is_file() or not found:
+    models = sorted(path.glob("*.xml"))
+    if not (path / _SYSID).is_file() or not models:
         raise InputError(f"the folder {path} has no result of mujoco.sysid: {_SYSID} and an XML file are needed.")
-    if len(found) > 1:
-        names = ", ".join(one.name for one in found)
+    if len(models) > 1:
+        names = ", ".join(file.name for file in models)
         raise InputError(f"the folder {path} has several identified models, {names}: name one of the files.")
-    return found[0]
+    return models[0]
 
 
 def is_sysid_result(path: Path) -> bool:
@@ -114,9 +99,7 @@ def is_sysid_result(path: Path) -> bool:
 def _substeps(timestep: float, dt: float | None) -> int:
     if dt is None:
         return 1
-    if not isinstance(dt, int | float) or isinstance(dt, bool) or not dt > 0:
-        raise InputError(f"dt must be a positive number of seconds, got {dt!r}.")
     ratio = dt / timestep
-    if round(ratio) < 1 or abs(ratio - round(ratio)) > _WHOLE * max(1.0, ratio):
+    if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * max(1.0, ratio):
         raise InputError(f"dt must be a multiple of the model's timestep, {timestep:g} s, got {dt:g} s.")
     return round(ratio)

@@ -11,13 +11,14 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
-from ctxval._util.representation import call
+from ctxval._util.extras import require_extra
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.scaling import IncrementScaling
 
 
-class FeedforwardReLU:
+class FeedforwardReLU(ShortRepr):
     """A network with ReLU layers and a linear last layer that predicts the increment of the state.
 
     Layer i maps z to ``z @ weights[i] + biases[i]``, in the standardised units of the scaling.
@@ -27,10 +28,6 @@ class FeedforwardReLU:
         biases: one vector for each layer.
         scaling: the scaling of the state-input pair and of the increment.
         data: the transitions that the model was learned from, if any.
-
-    Raises:
-        ShapeError: if the shapes of the layers do not match each other or the scaling.
-        InputError: if a value is not finite.
     """
 
     def __init__(
@@ -57,16 +54,7 @@ class FeedforwardReLU:
     def from_sklearn(
         cls, regressor: Any, scaling: IncrementScaling, data: Transitions | None = None
     ) -> FeedforwardReLU:
-        """Return the network of a fitted ``sklearn.neural_network.MLPRegressor`` as a model that does not need sklearn.
-
-        Args:
-            regressor: the fitted regressor, with ReLU units.
-            scaling: the scaling of the state-input pair and of the increment.
-            data: the transitions that the regressor was fitted on, if known.
-
-        Raises:
-            InputError: if the units of the network are not ReLU.
-        """
+        """Return a fitted ``sklearn.neural_network.MLPRegressor`` as a model that does not need scikit-learn."""
         if regressor.activation != "relu" or regressor.out_activation_ != "identity":
             raise InputError(f"the network must have ReLU units, got {regressor.activation!r}.")
         return cls(regressor.coefs_, regressor.intercepts_, scaling, data)
@@ -85,14 +73,8 @@ class FeedforwardReLU:
         """Train networks on recorded transitions with scikit-learn's MLPRegressor and L-BFGS; return the best one.
 
         Args:
-            data: the recorded transitions.
             hidden: number of units in each hidden layer.
-            seed: seed of the initial weights.
             restarts: number of networks to train; the one with the smallest loss on the data is returned.
-            iterations: largest number of iterations of one training.
-
-        Raises:
-            InputError: if scikit-learn is not installed, or the data are not finite.
         """
         scaling = IncrementScaling.of(data)
         seeds = np.random.SeedSequence(seed).generate_state(restarts)
@@ -116,20 +98,10 @@ class FeedforwardReLU:
             z = np.maximum(before, 0.0)
         return self.scaling.jacobian(np.swapaxes(gradient @ self.weights[-1], -1, -2))
 
-    def __repr__(self) -> str:
-        states, hidden = len(self.scaling.shift_out), tuple(bias.size for bias in self.biases[:-1])
-        sizes = {"states": states, "inputs": len(self.scaling.shift_in) - states, "hidden": hidden}
-        return call(self, **sizes, transitions=None if self.data is None else len(self.data))
-
 
 def _trained(data: Transitions, scaling: IncrementScaling, hidden: tuple[int, ...], seed: int, iterations: int) -> Any:
     """Return a fitted MLPRegressor."""
-    try:
-        from sklearn.exceptions import ConvergenceWarning
-        from sklearn.neural_network import MLPRegressor
-    except ImportError as error:
-        raise InputError('scikit-learn is not installed: pip install "ctxval[cases]".') from error
-    regressor = MLPRegressor(
+    regressor = require_extra("sklearn.neural_network", "cases", "learned networks").MLPRegressor(
         hidden_layer_sizes=hidden,
         solver="lbfgs",
         alpha=1e-6,  # almost no penalty, because so few weights do not overfit thousands of transitions
@@ -138,5 +110,6 @@ def _trained(data: Transitions, scaling: IncrementScaling, hidden: tuple[int, ..
         random_state=seed,
     )
     with single_threaded(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # stopping at the limit of iterations is intended
+        ignored = require_extra("sklearn.exceptions", "cases", "learned networks").ConvergenceWarning
+        warnings.simplefilter("ignore", ignored)  # stopping at the limit of iterations is intended
         return regressor.fit(scaling.inputs(data.x, data.u), scaling.targets(data))

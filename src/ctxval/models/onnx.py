@@ -10,14 +10,14 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.onnx_network import OnnxNetwork
 from ctxval._util.registry import part
-from ctxval._util.representation import call
-from ctxval.core.model import central_differences
+from ctxval._util.representation import ShortRepr
+from ctxval.core.model import central_differences, paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
 
 @part(files=("source",))
-class Onnx:
+class Onnx(ShortRepr):
     """A network from an ONNX file as a model; any toolbox may have written the file.
 
     The network takes the state and the input as two inputs in this order, or as one input with the state first. It
@@ -30,9 +30,6 @@ class Onnx:
         source: the file, or its bytes.
         increments: whether the network returns ``x_next - x`` instead of ``x_next``.
         data: the transitions that the network was learned from, if they are known.
-
-    Raises:
-        InputError: if onnxruntime is not installed, or the file is not a network with one or two inputs.
     """
 
     def __init__(
@@ -47,12 +44,9 @@ class Onnx:
             )
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
-
-        Raises:
-            ShapeError: if the numbers of states or inputs differ from the network's.
-        """
-        output = self.network(*self._arguments(x, u))
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
+        pair = (x, u) if len(self.network.widths) == 2 else (np.concatenate(paired(x, u), axis=-1),)
+        output = self.network(*pair)
         if output.shape[-1] != x.shape[-1]:
             raise ShapeError(
                 f"the network must return as many states as it takes, {x.shape[-1]}, got {output.shape[-1]}."
@@ -61,21 +55,8 @@ class Onnx:
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A ``(..., n, n)`` and B ``(..., n, m)`` by central differences that suit the network's precision."""
-        return central_differences(self.step, *_paired(x, u), self.network.precision)
+        return central_differences(self.step, *paired(x, u), self.network.precision)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this model in a store."""
         return {**self.network.describe(), "increments": self.increments}
-
-    def _arguments(self, x: Array, u: Array) -> tuple[Array, ...]:
-        if len(self.network.widths) == 2:
-            return x, u
-        return (np.concatenate(_paired(x, u), axis=-1),)
-
-    def __repr__(self) -> str:
-        return call(self, self.network, increments=self.increments)
-
-
-def _paired(x: Array, u: Array) -> tuple[Array, Array]:
-    batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-    return np.broadcast_to(x, (*batch, x.shape[-1])), np.broadcast_to(u, (*batch, u.shape[-1]))

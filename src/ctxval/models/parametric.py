@@ -8,7 +8,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, as_finite
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Function
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
@@ -17,7 +17,7 @@ ParametricStep = Callable[[Array, Array, Array], Array]
 
 
 @part(functions={"step": "(x, u, theta) -> x_next"})
-class Parametric:
+class Parametric(ShortRepr):
     """A function ``(x, u, theta) -> x_next`` with the values of its parameters theta as a model.
 
     Args:
@@ -26,9 +26,6 @@ class Parametric:
         vectorized: True if ``step`` takes whole batches ``(..., n)`` and ``(..., m)``.
         dt: length of a step in seconds, if it is known.
         data: the transitions that the parameters were learned from, if any.
-
-    Raises:
-        InputError: if there is no parameter, or a value is not finite.
     """
 
     def __init__(
@@ -53,6 +50,3 @@ class Parametric:
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         return self._step.step(x, u)
-
-    def __repr__(self) -> str:
-        return call(self, self.function, theta=self.theta, transitions=None if self.data is None else len(self.data))

@@ -38,9 +38,9 @@ def _name(part: Any) -> str:
     return kind.__name__ if kind.__module__.startswith("sklearn.") else ""
 
 
-def _chained(*parts: SmoothMap | None) -> SmoothMap | None:
+def _composed(kind: type[Chain | SideBySide], *parts: SmoothMap | None) -> SmoothMap | None:
     known = [part for part in parts if part is not None]
-    return Chain(known) if len(known) == len(parts) else None
+    return kind(known) if len(known) == len(parts) else None
 
 
 # Regressors
@@ -92,19 +92,19 @@ def _ridge_kernel(regressor: Any, features: int) -> Kernel | None:
 
 
 def _several_outputs(regressor: Any) -> SmoothMap | None:
-    parts = [smooth_map(part) for part in regressor.estimators_]
-    known = [part for part in parts if part is not None]
-    return SideBySide(known) if len(known) == len(parts) else None
+    return _composed(SideBySide, *map(smooth_map, regressor.estimators_))
 
 
 def _pipeline(regressor: Any) -> SmoothMap | None:
     *before, (_, last) = regressor.steps
     used = [part for _, part in before if part is not None and part != "passthrough"]
-    return _chained(*(_transformer(part) for part in used), smooth_map(last))
+    return _composed(Chain, *map(_transformer, used), smooth_map(last))
 
 
 def _transformed_target(regressor: Any) -> SmoothMap | None:
-    return _chained(smooth_map(regressor.regressor_), _inverse_transformer(regressor.transformer_))
+    forward = _scaler(regressor.transformer_)
+    inverse = None if forward is None else Scaled(1.0 / forward.scale, -forward.shift / forward.scale)
+    return _composed(Chain, smooth_map(regressor.regressor_), inverse)
 
 
 def _columns(weights: Array) -> Array:
@@ -153,12 +153,6 @@ def _scaler(part: Any) -> Scaled | None:
 def _centred(centre: Array | None, scale: Array | None) -> Scaled:
     factor = 1.0 if scale is None else 1.0 / scale
     return Scaled(factor, 0.0 if centre is None else -centre * factor)
-
-
-def _inverse_transformer(part: Any) -> SmoothMap | None:
-    """Return the inverse of a transformer of targets as a map; None if it is not known."""
-    forward = _scaler(part)
-    return None if forward is None else Scaled(1.0 / forward.scale, -forward.shift / forward.scale)
 
 
 # Kernels of Gaussian processes

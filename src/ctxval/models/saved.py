@@ -27,10 +27,7 @@ from ctxval.models.scaling import IncrementScaling
 _FORMAT = "ctxval model"
 _SCALING = ("shift_in", "scale_in", "shift_out", "scale_out")
 _DATA = ("x", "u", "x_next")
-_MOST_LAYERS = 100
-
-_CORRECTED = "corrected_"
-"""Before the names of the arrays of the model that a correction belongs to."""
+_CORRECTED = "corrected_"  # before the names of the arrays of the model that a correction belongs to
 
 SavedModel = Linear | FeedforwardReLU | GaussianProcessModel | Corrected
 """The models that can be written to a file."""
@@ -43,12 +40,8 @@ def write_model(path: str | Path, model: Model, note: dict[str, Any] | None = No
     that it is given.
 
     Args:
-        path: the file.
         model: a ``Linear``, ``FeedforwardReLU``, ``GaussianProcessModel`` or ``Corrected``, perhaps ``Refined``.
         note: plain values that are kept in the file, for :func:`read_note`.
-
-    Raises:
-        InputError: if the model is another one, or the file cannot be written.
     """
     inner = model.model if isinstance(model, Refined) else model
     about, arrays = _contents(inner)
@@ -107,12 +100,6 @@ def read_model(source: str | Path) -> SavedModel:
     """Return a model from an NPZ file that ``write_model`` or ``ctxval fit`` wrote; nothing in it is ever run.
 
     An NPZ file with the matrices ``A`` and ``B``, and perhaps ``c``, is a linear model.
-
-    Args:
-        source: the file.
-
-    Raises:
-        InputError: if the file is not a model, or is damaged.
     """
     return read_refined(source, None)
 
@@ -121,11 +108,7 @@ def read_refined(source: str | Path, before: Model | None) -> SavedModel:
     """Return a model from a file, as :func:`read_model` does; a correction alone is added to the model before.
 
     Args:
-        source: the file.
         before: the model that was refined; None if it is not known.
-
-    Raises:
-        InputError: if the file is not a model, is damaged, or has a correction alone of a model that is not known.
     """
     try:
         arrays = Archive(read_bytes(source))
@@ -133,8 +116,8 @@ def read_refined(source: str | Path, before: Model | None) -> SavedModel:
         data = stored_transitions(arrays)
         if about["kind"] != "Corrected":
             return _plain_model(arrays, about["kind"], data)
-        own = about.get("corrects")
-        corrected = before if own is None else _plain_model(_Prefixed(arrays), own, None)
+        kind = about.get("corrects")
+        corrected = before if kind is None else _plain_model(arrays, kind, None, _CORRECTED)
         if corrected is None:
             raise InputError("it has a correction alone, without the model that is corrected: use read_refined")
         linearised = about.get("linearised")
@@ -149,35 +132,24 @@ def read_refined(source: str | Path, before: Model | None) -> SavedModel:
         ) from error
 
 
-class _Prefixed:
-    """The arrays of the model that a correction belongs to."""
-
-    def __init__(self, arrays: Archive) -> None:
-        self._arrays = arrays
-        self.names = tuple(name.removeprefix(_CORRECTED) for name in arrays.names if name.startswith(_CORRECTED))
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.names
-
-    def numbers(self, name: str) -> Array:
-        return self._arrays.numbers(_CORRECTED + name)
-
-
 _PLAIN = (Linear, FeedforwardReLU, GaussianProcessModel)
 
 
-def _plain_model(arrays: Archive | _Prefixed, kind: str, data: Transitions | None) -> SavedModel:
+def _plain_model(arrays: Archive, kind: str, data: Transitions | None, prefix: str = "") -> SavedModel:
+    """Return a model whose arrays have a prefix before their names."""
+
+    def numbers(name: str) -> Array:
+        return arrays.numbers(prefix + name)
+
     if kind == "Linear":
-        c = arrays.numbers("c") if "c" in arrays else None
-        return Linear(arrays.numbers("A"), arrays.numbers("B"), c, data)
-    scaling = IncrementScaling(*(arrays.numbers(name) for name in _SCALING))
+        return Linear(numbers("A"), numbers("B"), numbers("c") if f"{prefix}c" in arrays else None, data)
+    scaling = IncrementScaling(*map(numbers, _SCALING))
     if kind == "FeedforwardReLU":
-        count = sum(name.startswith("weights_") for name in arrays.names)
-        layers = range(min(count, _MOST_LAYERS))
-        weights, biases = ([arrays.numbers(f"{name}_{i}") for i in layers] for name in ("weights", "biases"))
+        layers = range(min(100, sum(name.startswith(f"{prefix}weights_") for name in arrays.names)))
+        weights, biases = ([numbers(f"{name}_{i}") for i in layers] for name in ("weights", "biases"))
         return FeedforwardReLU(weights, biases, scaling, data)
-    covariance = SquaredExponential(float(arrays.numbers("variance")), arrays.numbers("length_scales"))
-    return GaussianProcessModel(covariance, arrays.numbers("centres"), arrays.numbers("weights"), scaling, data)
+    covariance = SquaredExponential(float(numbers("variance")), numbers("length_scales"))
+    return GaussianProcessModel(covariance, numbers("centres"), numbers("weights"), scaling, data)
 
 
 def _about(arrays: Archive) -> dict[str, Any]:
@@ -218,5 +190,5 @@ def _arrays(model: Model) -> dict[str, Any]:
     if isinstance(model, FeedforwardReLU):
         layers = {f"weights_{i}": weight for i, weight in enumerate(model.weights)}
         return scaling | layers | {f"biases_{i}": bias for i, bias in enumerate(model.biases)}
-    found = {"variance": model.covariance.variance, "length_scales": model.covariance.length_scales}
-    return scaling | found | {"centres": model.centres, "weights": model.weights}
+    covariance = {"variance": model.covariance.variance, "length_scales": model.covariance.length_scales}
+    return scaling | covariance | {"centres": model.centres, "weights": model.weights}

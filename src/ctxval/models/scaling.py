@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
 
 @dataclass(frozen=True, eq=False)
-class IncrementScaling:
+class IncrementScaling(ShortRepr):
     """The model ``x_next = x + shift_out + scale_out * f(((x, u) - shift_in) / scale_in)`` around a regressor f.
 
     Attributes:
@@ -28,11 +28,7 @@ class IncrementScaling:
 
     @classmethod
     def of(cls, data: Transitions) -> IncrementScaling:
-        """Return the scaling that gives recorded transitions zero mean and unit variance.
-
-        Raises:
-            InputError: if there are no data, or they are not finite.
-        """
+        """Return the scaling that gives recorded transitions zero mean and unit variance."""
         if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
             raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
         pairs, increments = np.concatenate([data.x, data.u], axis=1), data.x_next - data.x
@@ -57,8 +53,6 @@ class IncrementScaling:
         whole = self.scale_out[:, None] * gradient / self.scale_in
         whole[..., :n] += np.eye(n)
         return whole[..., :n], whole[..., n:]
-
-    __repr__ = record
 
 
 def standardised_pairs(x: Array, u: Array, shift: Array, scale: Array) -> Array:

@@ -7,23 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array, Mask, rows_of
 from ctxval._util.registry import part
-from ctxval._util.representation import call, name_of
-from ctxval.core.model import central_differences
+from ctxval._util.representation import ShortRepr
+from ctxval.core.model import central_differences, paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.regressors import smooth_map
-from ctxval.models.smooth_maps import SmoothMap, jacobian
+from ctxval.models.smooth_maps import SmoothMap
 
-_BLOCK = 1024
-"""Number of rows in one call of a formula: enough to be fast, few enough for the cache."""
-_AGREEMENT = 1e-4
-"""Largest relative difference of a formula from what the regressor predicts."""
+_BLOCK = 1024  # rows in one call of a formula: enough to be fast, few enough for the cache
 
 
 @part()
-class ScikitLearn:
+class ScikitLearn(ShortRepr):
     """A fitted scikit-learn regressor as a model: a pipeline, a forest, ridge regression, a Gaussian process.
 
     Its features are the state, then the input. Networks, Gaussian processes, kernel ridge regression, linear models,
@@ -35,9 +32,6 @@ class ScikitLearn:
         regressor: the fitted regressor, whose ``predict`` maps features ``(N, n + m)`` to ``(N, n)``.
         increments: whether the regressor predicts ``x_next - x`` instead of ``x_next``.
         data: the transitions that the regressor was fitted on, if any.
-
-    Raises:
-        InputError: if the value is not a regressor, or is not fitted.
     """
 
     def __init__(self, regressor: Any, *, increments: bool = True, data: Transitions | None = None) -> None:
@@ -52,11 +46,7 @@ class ScikitLearn:
 
     @classmethod
     def fit(cls, regressor: Any, data: Transitions, *, increments: bool = True) -> ScikitLearn:
-        """Fit a regressor on recorded transitions. The regressor itself is fitted, not a copy.
-
-        Raises:
-            InputError: if there are no data, they are not finite, or the value is not a regressor.
-        """
+        """Fit a regressor on recorded transitions. The regressor itself is fitted, not a copy."""
         if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
             raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
         if not callable(getattr(regressor, "fit", None)):
@@ -67,11 +57,7 @@ class ScikitLearn:
         return cls(regressor, increments=increments, data=data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
-
-        Raises:
-            ShapeError: if the regressor was fitted on other numbers of states and inputs.
-        """
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         self._require_features(x, u)
         n = x.shape[-1]
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
@@ -81,11 +67,7 @@ class ScikitLearn:
         return x + output if self.increments else output
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return A ``(..., n, n)`` and B ``(..., n, m)``, without batch axes if the model is linear.
-
-        Raises:
-            ShapeError: if the regressor was fitted on other numbers of states and inputs.
-        """
+        """Return A ``(..., n, n)`` and B ``(..., n, m)``, without batch axes if the model is linear."""
         self._require_features(x, u)
         formula = self._formula()
         if formula is None:
@@ -94,7 +76,7 @@ class ScikitLearn:
         rows = _pairs(x, u)
         if formula.constant:
             rows, batch = np.zeros((1, self.features)), ()
-        whole = np.concatenate([jacobian(formula, block) for block in _blocks(rows)])
+        whole = np.concatenate([formula.jacobian(block) for block in _blocks(rows)])
         _require_states(whole, n)
         whole = whole.reshape(*batch, *whole.shape[1:])
         A, B = whole[..., :n], whole[..., n:]
@@ -111,24 +93,17 @@ class ScikitLearn:
         The formula gives what ``predict`` gives, without its checks, which take longer than the formula on few rows.
         """
         finite: Mask = np.asarray(np.isfinite(rows).all(axis=-1, keepdims=True))
-        if finite.all():
-            return self._predicted_finite(rows)
-        return np.where(finite, self._predicted_finite(np.where(finite, rows, 0.0)), np.nan)
-
-    def _predicted_finite(self, rows: Array) -> Array:
+        complete = rows if finite.all() else np.where(finite, rows, 0.0)
         formula = self._formula()
         if formula is None:
-            return _as_columns(self.regressor.predict(rows))
-        return np.concatenate([formula.value(block) for block in _blocks(rows)])
+            outputs = _as_columns(self.regressor.predict(complete))
+        else:
+            outputs = np.concatenate([formula.value(block) for block in _blocks(complete)])
+        return outputs if finite.all() else np.where(finite, outputs, np.nan)
 
     def _formula(self) -> SmoothMap | None:
         # It is read again each time, because a regressor may be fitted again.
         return smooth_map(self.regressor) if self._known else None
-
-    def __repr__(self) -> str:
-        learned = None if self.data is None else len(self.data)
-        regressor = name_of(type(self.regressor))
-        return call(self, regressor, features=self.features, increments=self.increments, transitions=learned)
 
 
 def _require_states(outputs: Array, n: int) -> None:
@@ -138,10 +113,7 @@ def _require_states(outputs: Array, n: int) -> None:
 
 def _pairs(x: Array, u: Array) -> Array:
     """Return states and inputs side by side, shape ``(N, n + m)``."""
-    n = x.shape[-1]
-    pairs = np.empty((*np.broadcast_shapes(x.shape[:-1], u.shape[:-1]), n + u.shape[-1]))
-    pairs[..., :n], pairs[..., n:] = x, u
-    return pairs.reshape(-1, pairs.shape[-1])
+    return rows_of(np.concatenate(paired(x, u), axis=-1))
 
 
 def _blocks(rows: Array) -> list[Array]:
@@ -164,6 +136,6 @@ def _predicts_the_same(regressor: Any, formula: SmoothMap | None, features: int)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of feature names
         predicted = _as_columns(regressor.predict(rows))
-    found = formula.value(rows)
+    values = formula.value(rows)
     scale = float(np.abs(predicted).max())
-    return found.shape == predicted.shape and np.allclose(found, predicted, rtol=_AGREEMENT, atol=_AGREEMENT * scale)
+    return values.shape == predicted.shape and np.allclose(values, predicted, rtol=1e-4, atol=1e-4 * scale)

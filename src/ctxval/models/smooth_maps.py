@@ -5,9 +5,9 @@ Derivatives are pulled back from the outputs to the inputs (reverse mode): a mod
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.special import expit
@@ -18,29 +18,31 @@ PullBack = Callable[[Array], Array]
 """Maps derivatives by the values of a map, ``(N, p, o)``, to derivatives by its rows, ``(N, p, k)``."""
 
 
-class SmoothMap(Protocol):
-    """A function from rows ``(N, k)`` to values ``(N, o)``."""
+class SmoothMap(ABC):
+    """A function from rows ``(N, k)`` to values ``(N, o)``; its derivative is the same everywhere if it is constant."""
 
     @property
     def constant(self) -> bool:
         """Whether the derivative is the same everywhere."""
+        return False
 
-    def value(self, Z: Array) -> Array:
-        """Return the values ``(N, o)`` at rows ``(N, k)``."""
-
+    @abstractmethod
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
         """Return the values ``(N, o)`` at rows ``(N, k)``, and what pulls derivatives back to the rows."""
 
+    def value(self, Z: Array) -> Array:
+        """Return the values ``(N, o)`` at rows ``(N, k)``."""
+        return self.linearised(Z)[0]
 
-def jacobian(smooth: SmoothMap, Z: Array) -> Array:
-    """Return the derivatives ``(N, o, k)`` of a map at rows ``(N, k)``."""
-    values, pull_back = smooth.linearised(Z)
-    count, outputs = values.shape
-    return pull_back(np.broadcast_to(np.eye(outputs), (count, outputs, outputs)))
+    def jacobian(self, Z: Array) -> Array:
+        """Return the derivatives ``(N, o, k)`` at rows ``(N, k)``."""
+        values, pull_back = self.linearised(Z)
+        count, outputs = values.shape
+        return pull_back(np.broadcast_to(np.eye(outputs), (count, outputs, outputs)))
 
 
 @dataclass(frozen=True, eq=False)
-class Affine:
+class Affine(SmoothMap):
     """The map ``z W + b``, with W of shape ``(k, o)`` and b of shape ``(o,)``."""
 
     W: Array
@@ -48,17 +50,13 @@ class Affine:
 
     constant = True
 
-    def value(self, Z: Array) -> Array:
-        """Return the values ``(N, o)`` at rows ``(N, k)``."""
-        return np.asarray(Z @ self.W + self.b)
-
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
-        return self.value(Z), lambda G: np.asarray(G @ self.W.T)
+        """Return the values, and G W'."""
+        return np.asarray(Z @ self.W + self.b), lambda G: np.asarray(G @ self.W.T)
 
 
 @dataclass(frozen=True, eq=False)
-class Scaled:
+class Scaled(SmoothMap):
     """The map ``scale * z + shift`` of each column; both are numbers, or have shape ``(k,)``."""
 
     scale: Array | float
@@ -66,17 +64,13 @@ class Scaled:
 
     constant = True
 
-    def value(self, Z: Array) -> Array:
-        """Return the values ``(N, o)`` at rows ``(N, k)``."""
-        return np.asarray(self.scale * Z + self.shift)
-
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
-        return self.value(Z), lambda G: np.asarray(G * self.scale)
+        """Return the values, and G times the scale."""
+        return np.asarray(self.scale * Z + self.shift), lambda G: np.asarray(G * self.scale)
 
 
 @dataclass(frozen=True, eq=False)
-class Monomials:
+class Monomials(SmoothMap):
     """The products of powers of the columns, such as those of polynomial features.
 
     Attributes:
@@ -90,12 +84,8 @@ class Monomials:
         """Whether the derivative is the same everywhere."""
         return bool((self.powers.sum(axis=1) <= 1).all())
 
-    def value(self, Z: Array) -> Array:
-        """Return the values ``(N, o)`` at rows ``(N, k)``."""
-        return self._products(self._table(Z), self.powers)
-
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
+        """Return the values, and what pulls derivatives back to the rows."""
         table = self._table(Z)
 
         def pull_back(G: Array) -> Array:
@@ -118,10 +108,10 @@ class Monomials:
         return table
 
     def _products(self, table: Array, powers: Array) -> Array:
-        found = np.ones((table.shape[1], len(powers)), dtype=table.dtype)
+        products = np.ones((table.shape[1], len(powers)), dtype=table.dtype)
         for j in np.flatnonzero(powers.any(axis=0)):
-            found *= table[powers[:, j], :, j].T
-        return found
+            products *= table[powers[:, j], :, j].T
+        return products
 
 
 Activation = tuple[Callable[[Array], Array], Callable[[Array], Array]]
@@ -137,7 +127,7 @@ ACTIVATIONS: dict[str, Activation] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
+class Network(SmoothMap):
     """A feedforward network with a linear last layer.
 
     Attributes:
@@ -155,14 +145,13 @@ class Network:
         """Whether the derivative is the same everywhere."""
         return self.activation == "identity" or len(self.weights) == 1
 
-    def value(self, Z: Array) -> Array:
-        """Return the values ``(N, o)`` at rows ``(N, k)``."""
-        return self._layers(Z)[-1]
-
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
-        *hidden, output = self._layers(Z)
-        slope = ACTIVATIONS[self.activation][1]
+        """Return the values, and what pulls derivatives back to the rows."""
+        function, slope = ACTIVATIONS[self.activation]
+        hidden: list[Array] = []
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            Z = function(Z @ weight + bias)
+            hidden.append(Z)
 
         def pull_back(G: Array) -> Array:
             G = G @ self.weights[-1].T
@@ -172,19 +161,11 @@ class Network:
                 G = (G.reshape(-1, G.shape[-1]) @ weight.T).reshape(*G.shape[:2], -1)
             return G
 
-        return output, pull_back
-
-    def _layers(self, Z: Array) -> list[Array]:
-        """Return the units of each hidden layer, and the output."""
-        function, found = ACTIVATIONS[self.activation][0], []
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            Z = function(Z @ weight + bias)
-            found.append(Z)
-        return [*found, Z @ self.weights[-1] + self.biases[-1]]
+        return Z @ self.weights[-1] + self.biases[-1], pull_back
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class Chain(SmoothMap):
     """Several maps, one after the other."""
 
     parts: Sequence[SmoothMap]
@@ -194,14 +175,8 @@ class Chain:
         """Whether the derivative is the same everywhere."""
         return all(part.constant for part in self.parts)
 
-    def value(self, Z: Array) -> Array:
-        """Return the values ``(N, o)`` at rows ``(N, k)``."""
-        for part in self.parts:
-            Z = part.value(Z)
-        return Z
-
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
+        """Return the values, and what pulls derivatives back to the rows."""
         pulls: list[PullBack] = []
         for part in self.parts:
             Z, pull = part.linearised(Z)
@@ -216,7 +191,7 @@ class Chain:
 
 
 @dataclass(frozen=True, eq=False)
-class SideBySide:
+class SideBySide(SmoothMap):
     """Several maps of the same rows, whose values are joined."""
 
     parts: Sequence[SmoothMap]
@@ -226,17 +201,13 @@ class SideBySide:
         """Whether the derivative is the same everywhere."""
         return all(part.constant for part in self.parts)
 
-    def value(self, Z: Array) -> Array:
-        """Return the values ``(N, o)`` at rows ``(N, k)``."""
-        return np.concatenate([part.value(Z) for part in self.parts], axis=1)
-
     def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values at rows ``(N, k)``, and what pulls derivatives back to the rows."""
-        found = [part.linearised(Z) for part in self.parts]
-        ends = np.cumsum([values.shape[1] for values, _ in found])
+        """Return the values, and what pulls derivatives back to the rows."""
+        values, pulls = zip(*(part.linearised(Z) for part in self.parts), strict=True)
+        ends = np.cumsum([part.shape[1] for part in values])
 
         def pull_back(G: Array) -> Array:
             pieces = np.split(G, ends[:-1], axis=2)
-            return np.asarray(np.sum([pull(piece) for (_, pull), piece in zip(found, pieces, strict=True)], axis=0))
+            return np.asarray(np.sum([pull(piece) for pull, piece in zip(pulls, pieces, strict=True)], axis=0))
 
-        return np.concatenate([values for values, _ in found], axis=1), pull_back
+        return np.concatenate(values, axis=1), pull_back

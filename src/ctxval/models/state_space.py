@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, as_finite
+from ctxval._util.arrays import as_finite
 from ctxval._util.checked import Seconds
 from ctxval._util.registry import part
 from ctxval.errors import InputError, ShapeError
@@ -23,11 +23,6 @@ def state_space(system: Any, dt: Seconds) -> Linear:
     Args:
         system: the system, with A, B and its own dt: 0 or None for a continuous system, True for a discrete system
             with any time step.
-        dt: length of a step of the tasks, seconds.
-
-    Raises:
-        InputError: if the value is not such a system, or a discrete system with another time step.
-        ShapeError: if the shapes of A and B do not match.
     """
     if not all(hasattr(system, name) for name in ("A", "B")):
         raise InputError(f"a state-space model must have A and B, got {system!r}.")
@@ -35,19 +30,13 @@ def state_space(system: Any, dt: Seconds) -> Linear:
     if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
         raise ShapeError(f"a state-space model needs A (n, n) and B (n, m), got {A.shape} and {B.shape}.")
     own = getattr(system, "dt", None)
-    if own is True:
-        return Linear(A, B)
     if not own:
-        return Linear(*_held(A, B, dt))
-    if not np.isclose(own, dt, rtol=1e-9, atol=0):
+        from scipy.linalg import expm
+
+        # For an input that is held over dt: the exponential of [[A, B], [0, 0]] dt.
+        n, m = B.shape
+        whole = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
+        return Linear(whole[:n, :n], whole[:n, n:])
+    if own is not True and not np.isclose(own, dt, rtol=1e-9, atol=0):
         raise InputError(f"dt must be that of the discrete system, {own:g} s, got {dt:g} s.")
     return Linear(A, B)
-
-
-def _held(A: Array, B: Array, dt: Seconds) -> tuple[Array, Array]:
-    """Discretise ``dx/dt = A x + B u`` for an input held over dt: the exponential of [[A, B], [0, 0]] dt."""
-    from scipy.linalg import expm
-
-    n, m = B.shape
-    whole = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
-    return whole[:n, :n], whole[:n, n:]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.representation import Shown, call
+from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import aligned
 from ctxval.refinement.held_out import HeldOut
 
@@ -28,7 +28,7 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class ResidualRegion:
+class ResidualRegion(ShortRepr):
     """The magnitude of the residual in one region.
 
     Attributes:
@@ -44,12 +44,9 @@ class ResidualRegion:
     quantile: Array
     largest: Array
 
-    def __repr__(self) -> str:
-        return call(self, steps=self.steps, quantile=self.quantile.tolist(), largest=self.largest.tolist())
-
 
 @dataclass(frozen=True, eq=False)
-class MeasuredResidual:
+class MeasuredResidual(ShortRepr):
     """The residual ``S(x, u) - M'(x, u)`` of one step, measured on transitions that M' was not learned from.
 
     It is measured and not guaranteed: another state or input may have a larger one.
@@ -118,9 +115,6 @@ class MeasuredResidual:
             "regions": [plain(one) for one in self.regions],
             "guaranteed": False,
         }
-
-    def __repr__(self) -> str:
-        return call(self, Shown(f"{self.whole.steps} steps"), regions=len(self.regions), largest=self.whole.largest)
 
 
 def measure_residual(found: HeldOut, states: dict[str, str], inputs: dict[str, str]) -> MeasuredResidual:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.errors import CtxvalError
@@ -16,7 +16,7 @@ from ctxval.refinement.records import Records
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOut(ShortRepr):
     """One-step errors ``S(x, u) - M(x, u)`` on N transitions that the model was not learned from.
 
     Attributes:
@@ -63,9 +63,6 @@ class HeldOut:
         last = int(self.groups.max(initial=-1))
         parts = [_compared(one.transitions(), model, before, last + 1 + k) for k, one in enumerate(executed)]
         return _joined([self, *parts])
-
-    def __repr__(self) -> str:
-        return call(self, len(self.errors), rms=self.rms.tolist(), before=self.rms_before.tolist())
 
 
 def held_out(learn: Callable[[Records], Model], before: Model, records: Records) -> HeldOut:

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ctxval._util.arrays import Mask, single_threaded
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import reason_of
 from ctxval.core.model import Model, Step, as_model
 from ctxval.core.trajectory import Transitions
@@ -43,7 +43,7 @@ NAMES = ("residual", *get_args(RefitKind), "parameters", "fit")
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
+class Learned(ShortRepr):
     """A model that was learned from records.
 
     Attributes:
@@ -57,9 +57,6 @@ class Learned:
     errors: HeldOut
     notes: tuple[str, ...] = ()
     parameters: tuple[FittedParameter, ...] = ()
-
-    def __repr__(self) -> str:
-        return call(self, self.model, self.errors)
 
 
 class Method(ABC):
@@ -88,7 +85,7 @@ class Method(ABC):
 
 
 @dataclass(frozen=True)
-class ResidualCorrection(Method):
+class ResidualCorrection(ShortRepr, Method):
     """The first model with a correction: the mean of Gaussian processes of its residual.
 
     A state is corrected only if this lowers the error on executions that are held out. Outside the range of the
@@ -127,8 +124,6 @@ class ResidualCorrection(Method):
         found = learn_posterior(model, records.transitions, records.sources, settings=settings)
         return None if found is None else correction_of(found)
 
-    __repr__ = record
-
 
 def correction_of(posterior: DynamicsPosterior) -> Correction:
     """Return a learned residual as a correction, with the box of the records that it was learned from.
@@ -165,7 +160,7 @@ def _uncorrected(better: Mask) -> str:
 
 
 @dataclass(frozen=True)
-class Refit(Method):
+class Refit(ShortRepr, Method):
     """A new model of a kind of :func:`ctxval.fitting.fit`, in place of the first model.
 
     Attributes:
@@ -207,11 +202,9 @@ class Refit(Method):
 
         return Learned(_usable(fitted(records), records), held_out(fitted, model, records))
 
-    __repr__ = record
-
 
 @dataclass(frozen=True, eq=False)
-class ParameterFit(Method):
+class ParameterFit(ShortRepr, Method):
     """New values of the parameters of a user's function ``(x, u, theta) -> x_next``, by least squares.
 
     Attributes:
@@ -251,12 +244,9 @@ class ParameterFit(Method):
         found, parameters = fit_parameters(step, self.bounds, records.transitions, **known)
         return Learned(_usable(found, records), held_out(fitted, model, records), parameters=parameters)
 
-    def __repr__(self) -> str:
-        return call(self, self.step, bounds=dict(self.bounds))
-
 
 @dataclass(frozen=True, eq=False)
-class UserFit(Method):
+class UserFit(ShortRepr, Method):
     """The user's own function ``fit(data) -> model``.
 
     Attributes:
@@ -285,9 +275,6 @@ class UserFit(Method):
             raise InputError(f"the fit failed: {error}") from error
         except (Exception, SystemExit) as error:
             raise InputError(f"the fit failed: {reason_of(error)}.") from error
-
-    def __repr__(self) -> str:
-        return call(self, self.fit)
 
 
 def _usable(model: Model, records: Records) -> Model:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.errors import InputError
@@ -18,7 +18,7 @@ _FOLDS = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Records:
+class Records(ShortRepr):
     """Executions of the system, and transitions that belong to none of them.
 
     Attributes:
@@ -81,9 +81,6 @@ class Records:
 
     def _only(self, group: list[int]) -> Records:
         return replace(self, executed=tuple(self.executed[k] for k in group))
-
-    def __repr__(self) -> str:
-        return call(self, executed=len(self.executed), transitions=len(self.sources))
 
 
 def _rows(data: Transitions, rows: Array | Rows) -> Transitions:

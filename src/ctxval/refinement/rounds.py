@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ctxval._util.describe import describe
-from ctxval._util.representation import Shown, call, counted, line, lines, table
+from ctxval._util.representation import ShortRepr, Shown, call, counted, line, lines, table
 from ctxval._util.texts import aligned
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates.verdict import Answer, Verdict
@@ -21,7 +21,7 @@ from ctxval.refinement.disturbance import MeasuredResidual
 
 
 @dataclass(frozen=True, eq=False)
-class Round:
+class Round(ShortRepr):
     """One model, and what its executions showed.
 
     Attributes:
@@ -101,10 +101,6 @@ class Round:
                 "worst": self.unchanged.worst,
             },
         }
-
-    def __repr__(self) -> str:
-        found = {"executions": self.executions, "worst": self.worst}
-        return call(self, self.number, self.method, **found, verdict=Shown(self.verdict.answer))
 
 
 @dataclass(frozen=True, eq=False)

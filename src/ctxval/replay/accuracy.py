@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.data.recordings import Recordings
 from ctxval.replay.steps import Predictions, RecordedSteps, predicted, root_mean_square
@@ -18,7 +18,7 @@ _BINS = 5
 
 
 @dataclass(frozen=True)
-class StepError:
+class StepError(ShortRepr):
     """The error of one state after a number of steps.
 
     Attributes:
@@ -51,11 +51,9 @@ class StepError:
         """The error as a share of the recorded change; 1 or more means that the model predicts nothing."""
         return self.rms / self.change if self.change > 0 else (0.0 if self.rms == 0 else float("inf"))
 
-    __repr__ = record
-
 
 @dataclass(frozen=True)
-class Region:
+class Region(ShortRepr):
     """The one-step error in a range of one state or input.
 
     Attributes:
@@ -73,7 +71,6 @@ class Region:
     count: int
     error: float
     ratio: float
-    __repr__ = record
 
 
 def step_errors(model: Model, recorded: RecordedSteps, steps: Sequence[int]) -> tuple[StepError, ...]:

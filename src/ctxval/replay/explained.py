@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows, single_threaded
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.learning import PosteriorSettings, learn_posterior
@@ -26,7 +26,7 @@ _RIDGE = 1e-6
 
 
 @dataclass(frozen=True)
-class ResidualShare:
+class ResidualShare(ShortRepr):
     """How much of the one-step residual of a state can be explained, measured on held-out recordings.
 
     Attributes:
@@ -49,7 +49,6 @@ class ResidualShare:
     history: float
     correlation: float
     rest: float
-    __repr__ = record
 
 
 def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[ResidualShare, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import single_threaded
 from ctxval._util.columns import unit_advice
-from ctxval._util.representation import call, counted
+from ctxval._util.representation import ShortRepr, counted
 from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Transitions
 from ctxval.core.validation import Validation
@@ -29,7 +29,7 @@ STEPS = (1, 5, 20, 100)
 
 
 @dataclass(frozen=True)
-class RecordedData:
+class RecordedData(ShortRepr):
     """The recordings that were compared with the model.
 
     Attributes:
@@ -53,12 +53,9 @@ class RecordedData:
     notes: tuple[str, ...]
     seen: int
 
-    def __repr__(self) -> str:
-        return call(self, recordings=self.recordings, steps=self.steps, dt=self.dt, breaks=len(self.breaks))
-
 
 @dataclass(frozen=True, eq=False)
-class ReplayReport:
+class ReplayReport(ShortRepr):
     """What recordings show of a model.
 
     Attributes:
@@ -86,10 +83,6 @@ class ReplayReport:
         for row, error in zip(found["errors"], self.errors, strict=True):
             row["relative"] = plain_numbers(error.relative)
         return found
-
-    def __repr__(self) -> str:
-        worst = max((one.relative for one in self.errors if one.steps == 1), default=float("nan"))
-        return call(self, self.data, largest_relative_error=worst, suggestions=len(self.suggestions))
 
 
 def replay(

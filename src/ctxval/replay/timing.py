@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.replay.steps import RecordedSteps, Windows, stepped
 
@@ -34,7 +34,7 @@ _ALIKE = 1e-9
 
 
 @dataclass(frozen=True)
-class Suggestion:
+class Suggestion(ShortRepr):
     """A change of timing with which the model predicts held-out recordings clearly better.
 
     Attributes:
@@ -50,7 +50,6 @@ class Suggestion:
     ratio: float
     agreeing: float
     sentence: str
-    __repr__ = record
 
 
 def suggestions(model: Model, recorded: RecordedSteps) -> tuple[Suggestion, ...]:

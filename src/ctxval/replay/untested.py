@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.boxes import separated_rows
-from ctxval._util.representation import call, record
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning import DynamicsStudy, LearnedDynamics
@@ -34,7 +34,7 @@ _DIVERGED = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedTask:
+class PredictedTask(ShortRepr):
     """The predicted distance of one task.
 
     Attributes:
@@ -49,11 +49,10 @@ class PredictedTask:
     low: float
     high: float
     resolved: float | None = None
-    __repr__ = record
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedTasks:
+class PredictedTasks(ShortRepr):
     """What recordings predict of the tasks of an experiment. No execution has tested it.
 
     Attributes:
@@ -75,9 +74,6 @@ class PredictedTasks:
     unplanned: float
     beyond: float
     beyond_of: int
-
-    def __repr__(self) -> str:
-        return call(self, median=self.median, upper=self.upper, draws=self.draws)
 
 
 def predicted_tasks(

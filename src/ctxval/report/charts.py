@@ -16,7 +16,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ctxval._util.arrays import Array, ArrayLike
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import at_most
 from ctxval.report.markup import element, number
 
@@ -50,7 +50,7 @@ _MARKS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
-class Axis:
+class Axis(ShortRepr):
     """One axis of a chart.
 
     Attributes:
@@ -97,8 +97,6 @@ class Axis:
         step = max(step, 1.0) if self.whole else step
         first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
         return [float(k * step) for k in np.arange(first, last + 1)][: 4 * count]
-
-    __repr__ = record
 
 
 @dataclass(eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.dynamics import NEAR
 from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
@@ -49,7 +49,7 @@ class Recording:
 
 
 @dataclass(frozen=True, eq=False)
-class ReportContext:
+class ReportContext(ShortRepr):
     """Everything that the sections of a report read.
 
     Attributes:
@@ -242,9 +242,6 @@ class ReportContext:
         with stage("replaying executed tasks", len(numbers), "tasks"):
             found = replay_executed(self.validation, executed, [by_number[number].unit_point for number in numbers])
         return {number: one for number, one in zip(numbers, found, strict=True) if one is not None}
-
-    def __repr__(self) -> str:
-        return call(self, self.name, trials=len(self.trials), verdict=self.verdict)
 
 
 def distance_of(trial: Trial) -> float:

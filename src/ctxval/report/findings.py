@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from ctxval._util.representation import record
+from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import reason_of
 from ctxval.report.context import ReportContext
 
@@ -25,7 +25,7 @@ WORDS: dict[Light, str] = {
 
 
 @dataclass(frozen=True)
-class Finding:
+class Finding(ShortRepr):
     """One thing that the trials show.
 
     Attributes:
@@ -50,8 +50,6 @@ class Finding:
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON."""
         return {"name": self.name, "light": self.light, "text": self.text, "numbers": self.numbers}
-
-    __repr__ = record
 
 
 Question = Callable[[ReportContext], Finding | None]

@@ -12,7 +12,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Rows, as_floats
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
-from ctxval._util.representation import call, options, record
+from ctxval._util.representation import ShortRepr, call, options
 from ctxval.errors import InputError, ShapeError
 from ctxval.gp.ascent import Effort
 from ctxval.gp.surrogate import Surrogate
@@ -44,7 +44,7 @@ class Costs:
 
 
 @dataclass(frozen=True, eq=False)
-class Pending:
+class Pending(ShortRepr):
     """Points that are being evaluated.
 
     Attributes:
@@ -57,7 +57,7 @@ class Pending:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(ShortRepr):
     """A prediction of values at points of the unit cube that have not been evaluated.
 
     Attributes:
@@ -97,9 +97,6 @@ class Prediction:
             return None if other is None else other.with_rows(left_out_of)
 
         return replace(self, left_out=left_out_of(self), otherwise=otherwise)
-
-    def __repr__(self) -> str:
-        return record(self)
 
 
 @runtime_checkable

@@ -14,10 +14,7 @@ from ctxval._util.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
 from ctxval._util.progress import advance, stage
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
 from ctxval.storage import schema
-from ctxval.storage.disks import make_folder, on_network, warn_of_network
-
-_WAIT = 0.02
-"""Seconds between two attempts to take the lock."""
+from ctxval.storage.disks import make_folder, network, warn_of_network
 
 
 class Database:
@@ -26,10 +23,6 @@ class Database:
     Attributes:
         path: the absolute path of the file; None if the tables are in memory.
         name: the name of the store in messages.
-
-    Raises:
-        StoreAccessError: if the file cannot be opened or written.
-        ForeignStoreError: if the file is not a store, or a store of another version.
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
@@ -95,7 +88,9 @@ class Database:
     def _acquired(self, path: Path, wait: float) -> FileLock:
         until = time.monotonic() + wait
         try:
-            lock = self._lock = self._lock or FileLock(_lockable(path))
+            real = path.resolve()
+            itself = LOCKS_FILE_ITSELF and not network(real)
+            lock = self._lock = self._lock or FileLock(real if itself else real.with_name(f"{real.name}.lock"))
             with suppress(LockedError):
                 lock.acquire()
                 return lock
@@ -107,8 +102,8 @@ class Database:
                     except LockedError:
                         if time.monotonic() >= until:
                             raise
-                    time.sleep(_WAIT)
-                    advance(_WAIT)
+                    time.sleep(0.02)
+                    advance(0.02)
         except LockedError as error:
             raise StoreAccessError(f"{self.name} is being run by another process.") from error
         except OSError as error:
@@ -168,23 +163,13 @@ class Database:
         # then undoes the last transaction.
         self._connection.execute("PRAGMA synchronous = EXTRA")
         if new:
-            self._make_tables()
-
-    def _make_tables(self) -> None:
-        with self.transaction():
-            if not schema.is_new(self._connection, self.name):
-                return  # another process has made them
-            self._connection.execute(f"PRAGMA application_id = {schema.APPLICATION}")
-            for statement in schema.TABLES.split(";"):
-                self._connection.execute(statement)
-            self._connection.execute(f"PRAGMA user_version = {schema.VERSION}")
-
-
-def _lockable(path: Path) -> Path:
-    """Return the file to lock for a store: the store by its real path, or a file beside it if that cannot be locked."""
-    real = path.resolve()
-    itself = LOCKS_FILE_ITSELF and not on_network(real)
-    return real if itself else real.with_name(f"{real.name}.lock")
+            with self.transaction():
+                if not schema.is_new(self._connection, self.name):
+                    return  # another process has made them
+                self._connection.execute(f"PRAGMA application_id = {schema.APPLICATION}")
+                for statement in schema.TABLES.split(";"):
+                    self._connection.execute(statement)
+                self._connection.execute(f"PRAGMA user_version = {schema.VERSION}")
 
 
 def now() -> str:

@@ -24,23 +24,19 @@ def file_system(path: Path, mounts: str) -> str:
     return max(holding, default=(0, ""))[1]
 
 
-def _kind_of(path: Path) -> str:
-    try:
-        return file_system(path.absolute(), Path("/proc/mounts").read_text())
-    except (OSError, ValueError):
-        return ""
-
-
-def on_network(path: Path) -> bool:
-    """Return whether a path is on a file system of another machine, as far as this machine knows."""
-    return _kind_of(path) in _NETWORKS
+def network(path: Path) -> str:
+    """Return the file system of another machine that a path is on; empty if it is on none, or if that is not known."""
+    kind = ""
+    with contextlib.suppress(OSError, ValueError):
+        kind = file_system(path.absolute(), Path("/proc/mounts").read_text())
+    return kind if kind in _NETWORKS else ""
 
 
 def warn_of_network(path: Path) -> None:
     """Warn if a store is on a file system of another machine."""
-    if on_network(path):
+    if kind := network(path):
         warnings.warn(
-            f"{path} is on a network file system ({_kind_of(path)}), whose locks and flushes are not reliable; keep "
+            f"{path} is on a network file system ({kind}), whose locks and flushes are not reliable; keep "
             "the store on a disk of this computer.",
             StoreWarning,
             stacklevel=4,

@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, get_args
@@ -25,20 +25,6 @@ from ctxval.storage import schema
 from ctxval.storage.rows import COLUMNS, checksum_of, read_json, read_trajectory, read_trial
 from ctxval.storage.store import Store
 from ctxval.storage.trajectories import Side
-
-_PROBED = 10_000
-"""Number of row numbers to try if the file does not tell how many rows there are."""
-
-_SMALLEST = 16
-"""Smallest size of a row in bytes."""
-
-_JOURNAL_CHECKS = 20
-"""Number of checks whether another process has removed its journal."""
-_CHECK_INTERVAL = 0.05
-"""Seconds between two of these checks."""
-
-_DEPTH = 100
-"""Largest number of nested levels written as JSON; it is larger than the depth that is ever read."""
 
 _TABLES = ("experiment", "settings", "history", "trials", "trajectories")
 
@@ -67,29 +53,27 @@ def recover(path: Path) -> Recovered:
     schema.require_file(path)
     if not path.is_file():
         raise StoreAccessError(f"there is no store at {path}.")
-    found = Recovered()
-    with _played_back(path, found) as readable:
+    recovered = Recovered()
+    with _played_back(path, recovered) as readable:
         try:
             uri = f"file:{quote(str(readable.absolute()))}?mode=ro&immutable=1"
             connection = sqlite3.connect(uri, uri=True, factory=schema.Guarded)
         except sqlite3.Error as error:
             raise StoreAccessError(f"{path} cannot be read: {error}.") from error
-        try:
-            _read(connection, path.stat().st_size, found)
-        finally:
-            connection.close()
-    return found
+        with closing(connection):
+            _read(connection, path.stat().st_size, recovered)
+    return recovered
 
 
 @contextmanager
-def _played_back(path: Path, found: Recovered) -> Iterator[Path]:
+def _played_back(path: Path, recovered: Recovered) -> Iterator[Path]:
     """Yield the file to read: the store, or a copy into which the journal of a dead process was replayed."""
     journals = _left_journals(path)
     if not journals:
         try:
             Store.existing(path).close()
         except CtxvalError as error:
-            found.damaged.append(str(error))
+            recovered.damaged.append(str(error))
         yield path
         return
     with temporary_folder() as folder:
@@ -100,7 +84,7 @@ def _played_back(path: Path, found: Recovered) -> Iterator[Path]:
                 shutil.copyfile(file, f"{copy}{ending}")
             Store.existing(copy).close()
         except (CtxvalError, OSError) as error:
-            found.damaged.append(str(error).replace(str(copy), str(path)))
+            recovered.damaged.append(str(error).replace(str(copy), str(path)))
             copy = path
         yield copy
 
@@ -110,28 +94,30 @@ def _left_journals(path: Path) -> dict[Path, str]:
 
     A journal that disappears during the checks belonged to a process that was writing.
     """
-    for _ in range(_JOURNAL_CHECKS):
+    for _ in range(20):
         journals = schema.beside(path)
         if not journals:
             return {}
-        time.sleep(_CHECK_INTERVAL)
+        time.sleep(0.05)
     real = str(path.resolve())
     return {path: ""} | {journal: str(journal).removeprefix(real) for journal in journals}
 
 
-def _read(connection: sqlite3.Connection, size: int, found: Recovered) -> None:
+def _read(connection: sqlite3.Connection, size: int, recovered: Recovered) -> None:
     try:
         # Without this SQLite refuses a file that is shorter than its header states.
         connection.execute("PRAGMA writable_schema = ON")
         tables = schema.plain_tables(connection, _TABLES)
     except _UNREADABLE as error:
-        found.damaged.append(f"nothing is readable: {error}")
+        recovered.damaged.append(f"nothing is readable: {error}")
         return
-    found.damaged += [f"the table {name} is missing, or is no plain table" for name in _TABLES if name not in tables]
-    reader = _Reader(connection, tables, size, found)
+    recovered.damaged += [
+        f"the table {name} is missing, or is no plain table" for name in _TABLES if name not in tables
+    ]
+    reader = _Reader(connection, tables, size, recovered)
     for table in ("experiment", "settings"):
-        found.about[table] = dict(reader.pairs(table))
-    found.about["history"] = list(reader.history())
+        recovered.about[table] = dict(reader.pairs(table))
+    recovered.about["history"] = list(reader.history())
     for row in reader.rows("trials", [*(name.strip() for name in COLUMNS.split(",")), "checksum"]):
         reader.take_trial(row)
     for row in reader.rows("trajectories", ["trial", "side", "npz", "checksum"]):
@@ -145,7 +131,7 @@ class _Reader:
     connection: sqlite3.Connection
     tables: dict[str, set[str]]
     size: int
-    found: Recovered
+    recovered: Recovered
 
     def pairs(self, table: str) -> Iterator[tuple[str, Any]]:
         for key, value in self.rows(table, ["key", "value"]):
@@ -177,7 +163,8 @@ class _Reader:
             if row is not None:
                 yield row
         for reason, places in unreadable.items():
-            self._note(f"the table {table}, {_rows(places)}: {reason}")
+            several = f"{len(places)} rows from {places[0]} to {places[-1]}"
+            self._note(f"the table {table}, {several if len(places) > 1 else f'row {places[0]}'}: {reason}")
 
     def _places(self, table: str) -> list[int]:
         places: set[int] = set()
@@ -185,22 +172,18 @@ class _Reader:
             places.update(place for (place,) in self.connection.execute(f"SELECT rowid FROM {table} NOT INDEXED"))
         except _UNREADABLE as error:
             self._note(f"the table {table}: {error}")
-            # Rows behind the damage are found by their numbers; the size of the file limits how many there can be.
-            places |= set(range(min(self._last(table) + 1, self.size // _SMALLEST)))
+            # Rows behind the damage are recovered by their numbers; the size of the file limits how many there can be.
+            last = 10_000
+            with suppress(*_UNREADABLE):
+                last = int(self.connection.execute(f"SELECT max(rowid) FROM {table}").fetchone()[0] or 0)
+            places |= set(range(min(last + 1, self.size // 16)))  # a row has at least 16 bytes
         return sorted(places)
-
-    def _last(self, table: str) -> int:
-        try:
-            last = self.connection.execute(f"SELECT max(rowid) FROM {table}").fetchone()[0]
-        except _UNREADABLE:
-            return _PROBED
-        return int(last or 0)
 
     def take_trial(self, row: tuple[Any, ...]) -> None:
         number, *values, checksum = row
         trial = read_trial((number, *values), checksum)
-        if trial is not None and trial.number not in self.found.trials:
-            self.found.trials[trial.number] = trial
+        if trial is not None and trial.number not in self.recovered.trials:
+            self.recovered.trials[trial.number] = trial
         elif trial is not None:
             self._note(f"trial {number} is there more than once, and the first one is taken")
         elif checksum_of((number, *values)) == checksum:
@@ -212,48 +195,38 @@ class _Reader:
         name = f"the {side}'s trajectory of trial {number}"
         if side not in get_args(Side) or not isinstance(number, int):
             self._note(f"{name}: there is no such thing")
-        elif (number, side) in self.found.trajectories:
+        elif (number, side) in self.recovered.trajectories:
             self._note(f"{name} is there more than once, and the first one is taken")
         elif trajectory := read_trajectory(number, side, npz, checksum):
-            self.found.trajectories[number, side] = trajectory
+            self.recovered.trajectories[number, side] = trajectory
         else:
             self._note(f"{name}: its checksum does not fit")
 
     def _note(self, sentence: str) -> None:
-        self.found.damaged.append(shortened(sentence))
+        self.recovered.damaged.append(shortened(sentence))
 
 
-def _rows(places: list[int]) -> str:
-    """Return a name for rows; a damaged page may make thousands of them unreadable."""
-    if len(places) == 1:
-        return f"row {places[0]}"
-    return f"{len(places)} rows from {places[0]} to {places[-1]}"
-
-
-def export(found: Recovered, folder: Path) -> list[Path]:
+def export(recovered: Recovered, folder: Path) -> list[Path]:
     """Write trials.csv, trials.json and a CSV file of each trajectory."""
     try:
         (folder / "trajectories").mkdir(parents=True, exist_ok=True)
         paths = [folder / "trials.csv", folder / "trials.json"]
-        _write_table(paths[0], found)
-        trials = [asdict(trial) | {"unit_point": trial.unit_point.tolist()} for trial in found.trials.values()]
-        content = describe({**found.about, "damaged": found.damaged, "trials": trials}, _DEPTH)
+        rows = [_flat(trial) for trial in recovered.trials.values()]
+        header = list(dict.fromkeys(name for row in rows for name in row))
+        with written_whole(paths[0], text=True) as file:
+            writer = csv.writer(file)
+            writer.writerow([_cell(name) for name in header])
+            writer.writerows([_cell(row.get(name)) for name in header] for row in rows)
+        trials = [asdict(trial) | {"unit_point": trial.unit_point.tolist()} for trial in recovered.trials.values()]
+        # A hundred levels are more than are ever read.
+        content = describe({**recovered.about, "damaged": recovered.damaged, "trials": trials}, 100)
         write_text(paths[1], json.dumps({"made_by": MADE_BY, **content}, indent=1, allow_nan=False))
-        for (number, side), trajectory in found.trajectories.items():
+        for (number, side), trajectory in recovered.trajectories.items():
             paths.append(folder / "trajectories" / f"{number}.{side}.csv")
             trajectory.to_csv(paths[-1])
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {error.strerror}.") from error
     return paths
-
-
-def _write_table(path: Path, found: Recovered) -> None:
-    rows = [_flat(trial) for trial in found.trials.values()]
-    header = list(dict.fromkeys(name for row in rows for name in row))
-    with written_whole(path, text=True) as file:
-        writer = csv.writer(file)
-        writer.writerow([_cell(name) for name in header])
-        writer.writerows([_cell(row.get(name)) for name in header] for row in rows)
 
 
 def _cell(value: Any) -> Any:
@@ -266,11 +239,9 @@ def _flat(trial: Trial) -> dict[str, Any]:
     for name, value in trial.parameters.items():
         entries = {name: value} if not isinstance(value, list) else {f"{name}[{i}]": v for i, v in enumerate(value)}
         parameters |= entries
-    ended = ("distance", "failure", "executed", "attempts", "seconds")
+    first, last = ("number", "origin", "state"), ("distance", "failure", "executed", "attempts", "seconds")
     return {
-        "number": trial.number,
-        "origin": trial.origin,
-        "state": trial.state,
+        **{name: getattr(trial, name) for name in first},
         **parameters,
-        **{name: getattr(trial, name) for name in ended},
+        **{name: getattr(trial, name) for name in last},
     }

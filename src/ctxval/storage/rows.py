@@ -66,11 +66,7 @@ def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial | None:
 
 
 def _count(value: Any) -> bool:
-    return isinstance(value, int) and 0 <= value < _MOST
-
-
-_MOST = 2**53
-"""Counts at or above this are refused as damage."""
+    return isinstance(value, int) and 0 <= value < 2**53
 
 
 def _number(value: Any) -> bool:
@@ -96,12 +92,9 @@ def read_json(text: Any, *, finite: bool = True) -> Any:
         value = json.loads(text, parse_constant=_refuse_constant if finite else None)
     except (ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"the text is not JSON: {error}.") from error
-    if not _shallow(value, _DEEPEST):
-        raise InputError(f"JSON must be nested at most {_DEEPEST} times.")
+    if not _shallow(value, 50):
+        raise InputError("JSON must be nested at most 50 times.")
     return value
-
-
-_DEEPEST = 50
 
 
 def _shallow(value: Any, levels: int) -> bool:
@@ -115,8 +108,7 @@ def _refuse_constant(name: str) -> NoReturn:
     raise InputError(f"{name} is not a number of JSON.")
 
 
-MOST_CHARACTERS = 2**24
-"""Largest number of characters of a key, and of the JSON text of a value."""
+MOST_CHARACTERS = 2**24  # largest number of characters of a key, and of the JSON text of a value
 
 
 def pair_of(key: str, value: Any) -> tuple[str, str]:
@@ -129,12 +121,12 @@ def pair_of(key: str, value: Any) -> tuple[str, str]:
 
 def read_pairs(rows: Iterable[tuple[Any, Any]]) -> dict[str, Any]:
     """Return the rows of a table of keys and JSON values as a dictionary."""
-    found: dict[str, Any] = {}
+    pairs: dict[str, Any] = {}
     for key, value in rows:
-        if not isinstance(key, str) or key in found:
+        if not isinstance(key, str) or key in pairs:
             raise InputError(f"a key must be a text that occurs once, got {key!r}.")
-        found[key] = read_json(value, finite=False)
-    return found
+        pairs[key] = read_json(value, finite=False)
+    return pairs
 
 
 def read_trajectory(number: int, side: str, npz: Any, checksum: Any) -> Trajectory | None:

@@ -11,19 +11,17 @@ import itertools
 import os
 import re
 import sqlite3
-import stat
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from ctxval._util.files import why_not_regular
 from ctxval.errors import ForeignStoreError, StoreAccessError
 
-APPLICATION = 0x63747876
-"""SQLite's application_id of a store, the letters "ctxv"; it marks a file as a store of ctxval."""
+APPLICATION = 0x63747876  # SQLite's application_id of a store, the letters "ctxv"; it marks a file as a store of ctxval
 
-VERSION = 8
-"""SQLite's user_version of a store; it changes with :data:`TABLES`."""
+VERSION = 8  # SQLite's user_version of a store; it changes with :data:`TABLES`
 
 TABLES = """
 CREATE TABLE trials (
@@ -59,14 +57,11 @@ CREATE TABLE computed (key TEXT PRIMARY KEY, digest TEXT NOT NULL, value TEXT NO
 """
 """The statements that make the tables of a store, with which those of a file are compared."""
 
-_EVERY = 10_000
-"""Instructions of SQLite between two checks of their number."""
+_EVERY = 10_000  # instructions of SQLite between two checks of their number
 
-STEPS = 100_000_000
-"""Largest number of SQLite instructions of one statement; reading a trial takes about twenty."""
+STEPS = 100_000_000  # largest number of SQLite instructions of one statement; reading a trial takes about twenty
 
-_OBJECTS = 100
-"""Largest number of tables and indexes that are examined; a store has far fewer."""
+_OBJECTS = 100  # tables and indexes that are examined; a store has far fewer
 
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_SQL_LENGTH: 100_000,
@@ -77,8 +72,6 @@ _LIMITS = {
     sqlite3.SQLITE_LIMIT_ATTACHED: 0,
     sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH: 1,
 }
-
-_JOURNAL_MAGIC = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
 
 _BESIDE = ("-journal", "-wal", "-shm")
 """Endings of the files beside a database that SQLite reads by itself."""
@@ -120,9 +113,16 @@ def require_files(path: Path) -> None:
     for ending in _BESIDE:
         beside = Path(real + ending)
         mode = _mode(beside, follow=False)
-        if mode is not None and not stat.S_ISREG(mode):
-            raise StoreAccessError(f"{path} cannot be read as a store: {beside} is {_kind(mode)}; move it away.")
-    if _names_another(Path(f"{real}-journal")):
+        if mode is not None and (reason := why_not_regular(mode)):
+            what = reason.removeprefix("it ")
+            raise StoreAccessError(f"{path} cannot be read as a store: {beside} {what}; move it away.")
+    names_another = False
+    with suppress(OSError), Path(f"{real}-journal").open("rb") as file:
+        # The end of the journal of a transaction over several databases, which a store never makes.
+        magic = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
+        file.seek(-len(magic), os.SEEK_END)
+        names_another = file.read() == magic
+    if names_another:
         raise ForeignStoreError(
             f"{path} cannot be read as a store: {real}-journal belongs to several databases; move it away."
         )
@@ -135,8 +135,8 @@ def require_file(path: Path) -> None:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise StoreAccessError(f"{path} cannot be read as a store: {reason}.") from error
-    if mode is not None and not stat.S_ISREG(mode):
-        raise StoreAccessError(f"{path} cannot be read as a store: it is {_kind(mode)}.")
+    if mode is not None and (reason := why_not_regular(mode)):
+        raise StoreAccessError(f"{path} cannot be read as a store: {reason}.")
 
 
 def _mode(path: Path, *, follow: bool = True) -> int | None:
@@ -146,32 +146,10 @@ def _mode(path: Path, *, follow: bool = True) -> int | None:
         return None
 
 
-def _kind(mode: int) -> str:
-    kinds = {
-        stat.S_IFDIR: "a folder",
-        stat.S_IFIFO: "a pipe",
-        stat.S_IFSOCK: "a socket",
-        stat.S_IFLNK: "a link",
-        stat.S_IFCHR: "a device",
-        stat.S_IFBLK: "a device",
-    }
-    return kinds.get(stat.S_IFMT(mode), "not a file")
-
-
-def _names_another(journal: Path) -> bool:
-    """Return whether a journal belongs to a transaction over several databases, which a store never makes."""
-    try:
-        with journal.open("rb") as file:
-            file.seek(-len(_JOURNAL_MAGIC), os.SEEK_END)
-            return file.read() == _JOURNAL_MAGIC
-    except OSError:
-        return False
-
-
 def beside(path: Path) -> list[Path]:
     """Return the journals beside a database; another process left them or is writing them."""
     real = os.path.realpath(path)
-    return [found for ending in _BESIDE if (found := Path(real + ending)).is_file()]
+    return [path for path in (Path(real + ending) for ending in _BESIDE) if path.is_file()]
 
 
 @contextmanager
@@ -204,51 +182,41 @@ def is_new(connection: sqlite3.Connection, name: str) -> bool:
 
 def plain_tables(connection: sqlite3.Connection, names: Iterable[str]) -> dict[str, set[str]]:
     """Return the column names of each table that can be read row by row without running anything in the file."""
-    wanted, found = set(names), {}
+    wanted, plain = set(names), {}
     for kind, name, _, definition in itertools.islice(connection.execute(_MASTER), _OBJECTS):
-        if (
-            kind != "table"
-            or name not in wanted
-            or not re.match(r"\s*create\s+table\b", str(definition), re.IGNORECASE)
-        ):
+        ordinary = re.match(r"\s*create\s+table\b", str(definition), re.IGNORECASE)
+        if kind != "table" or name not in wanted or not ordinary:
             continue
-        columns = connection.execute(f"PRAGMA table_xinfo({name})").fetchall()
-        names_ = {str(column[1]).lower() for column in columns}
-        if not any(column[-1] for column in columns) and not names_ & {"rowid", "oid", "_rowid_"}:
-            found[str(name)] = names_
-    return found
+        rows = connection.execute(f"PRAGMA table_xinfo({name})").fetchall()
+        columns = {str(row[1]).lower() for row in rows}
+        if not any(row[-1] for row in rows) and not columns & {"rowid", "oid", "_rowid_"}:
+            plain[str(name)] = columns
+    return plain
 
 
 def difference(connection: sqlite3.Connection, script: str) -> str | None:
     """Return how the tables of a file differ from those that a script makes. Returns None if they agree."""
-    expected, found = _expected(script), {}
+    expected, present = _expected(script), {}
     for place, (kind, name, table, definition) in enumerate(connection.execute(_MASTER)):
         if place == _OBJECTS:
             return f"it has more than {_OBJECTS} tables"
         if (kind, name) not in expected:
-            return f"it has {_article(kind)} {name!r}"
-        found[kind, name] = (table, _bare(definition))
+            return f"it has {'an' if str(kind)[:1] in 'aeiou' else 'a'} {kind} {name!r}"
+        present[kind, name] = (table, _bare(definition))
     for key, what in expected.items():
-        if found.get(key) != what:
-            return f"its {key[0]} {key[1]!r} is {'missing' if key not in found else 'another one'}"
+        if present.get(key) != what:
+            return f"its {key[0]} {key[1]!r} is {'missing' if key not in present else 'another one'}"
     return None
 
 
 _MASTER = "SELECT type, name, tbl_name, sql FROM sqlite_master"
 
 
-def _article(kind: object) -> str:
-    return f"{'an' if str(kind)[:1] in 'aeiou' else 'a'} {kind}"
-
-
 @functools.cache
 def _expected(script: str) -> dict[tuple[str, str], tuple[str, str]]:
-    connection = sqlite3.connect(":memory:", isolation_level=None)
-    try:
+    with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
         connection.executescript(script)
         rows = connection.execute(_MASTER).fetchall()
-    finally:
-        connection.close()
     return {(kind, name): (table, _bare(definition)) for kind, name, table, definition in rows}
 
 

@@ -54,19 +54,13 @@ class Store:
     def __init__(self, path: str | Path | None = None) -> None:
         self._database = self._opened(path)
         self._trajectories = StoredTrajectories(self._database)
+        self.path: Path | None = self._database.path
+        """The absolute path of the file; None if the trials are in memory."""
+        self.name = self._database.name
+        """The name of the store in messages."""
 
     def _opened(self, path: str | Path | None) -> Database:
         return Database(path)
-
-    @property
-    def path(self) -> Path | None:
-        """The absolute path of the file; None if the trials are in memory."""
-        return self._database.path
-
-    @property
-    def name(self) -> str:
-        """The name of the store in messages."""
-        return self._database.name
 
     @classmethod
     def existing(cls, path: str | Path) -> Store:
@@ -182,14 +176,8 @@ class Store:
     ) -> bool:
         """Store trials with new distances, and the description of the new distance, in one transaction.
 
-        Args:
-            trials: the trials with their new distances.
-            description: the description of the experiment with the new distance.
-            change: the entry for the history, with the previous distances.
-            seen: the :meth:`signature` of the store when the trials were read.
-
-        Returns:
-            False if the store has changed since then, so that nothing is stored; True otherwise.
+        Returns False, and stores nothing, if the :meth:`signature` of the store is not the one that was seen when the
+        trials were read. The change, for the history, has the previous distances.
         """
         with self._database.transaction():
             if self.signature() != seen:
@@ -245,15 +233,10 @@ class Store:
         )
 
     def begin_attempt(self, trial: Trial, *, changes: int | None = None) -> None:
-        """Record one more attempt to execute a trial, before the execution starts.
-
-        Args:
-            trial: the trial, with this attempt counted.
-            changes: the number of changes that the campaign knows; None skips the check.
+        """Record one more attempt, which the trial counts, before the execution starts.
 
         Raises:
-            InputError: if the trial is no longer open.
-            StoreMismatchError: if the store has another number of changes.
+            StoreMismatchError: if the store has another number of changes than ``changes``; None skips the check.
         """
         with self._database.transaction():
             self._require_unchanged(changes)
@@ -265,10 +248,9 @@ class Store:
                 raise self._not_open(trial.number)
 
     def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
-        """Store the result of an open trial.
+        """Store the result of an open trial; of two results for one trial, the first is stored.
 
         Raises:
-            InputError: if the trial is not open; of two results for one trial, the first is stored.
             StoreMismatchError: if the store has another number of changes than ``changes``.
         """
         with self._database.transaction():
@@ -312,14 +294,14 @@ class Store:
 
     def trials(self) -> list[Trial]:
         """Return all trials in their order. Raises a :class:`ForeignStoreError` if one is damaged."""
-        found: list[Trial] = []
+        trials: list[Trial] = []
         with self._database.rows(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number") as cursor:
             for *row, checksum in cursor:
                 trial = read_trial(tuple(row), checksum)
-                if trial is None or not rows.follows(trial, found):
-                    raise self._database.damaged(f"its trial {len(found)} cannot be read")
-                found.append(trial)
-        return found
+                if trial is None or not rows.follows(trial, trials):
+                    raise self._database.damaged(f"its trial {len(trials)} cannot be read")
+                trials.append(trial)
+        return trials
 
     def signature(self) -> tuple[int, int, int]:
         """Return the numbers of trials, of open trials and of changes, to notice what another process has changed."""
@@ -331,13 +313,13 @@ class Store:
 
     def digest(self) -> str:
         """Return a digest of all that results follow from: trials, trajectories, the experiment, and this version."""
-        found = hashlib.sha256(VERSION.encode())
+        digest = hashlib.sha256(VERSION.encode())
         with self._database.snapshot():
             for query in _CONTENT:
                 with self._database.rows(query) as content:
                     for row in content:
-                        found.update(repr(row).encode())
-        return found.hexdigest()
+                        digest.update(repr(row).encode())
+        return digest.hexdigest()
 
     def computed(self, key: str) -> Any:
         """Return what was computed from the present content and kept under a key; None if nothing was."""
@@ -359,25 +341,17 @@ class Store:
     def trajectory(self, number: int, side: Side) -> Trajectory | None:
         """Return a stored trajectory of a trial, whose arrays may be changed. Returns None if there is none.
 
-        Args:
-            number: the number of the trial.
-            side: ``"model"`` or ``"system"``.
-
         Raises:
             ForeignStoreError: if the trajectory is damaged.
         """
-        found = self.trajectories([number], side).get(number)
+        trajectory = self.trajectories([number], side).get(number)
         # Some distances change the arrays that they are given.
-        return None if found is None else found.copy()
+        return None if trajectory is None else trajectory.copy()
 
     def trajectories(self, numbers: Iterable[int], side: Side) -> dict[int, Trajectory]:
         """Return stored trajectories by the numbers of their trials; a trial without one is left out.
 
         Those of the system are kept in memory, up to 512 MiB, so that they are read once. Their arrays are read-only.
-
-        Args:
-            numbers: the numbers of the trials.
-            side: ``"model"`` or ``"system"``.
 
         Raises:
             ForeignStoreError: if a trajectory is damaged.

@@ -11,8 +11,7 @@ from ctxval.storage.rows import checksum_of, read_trajectory
 
 Side = Literal["model", "system"]
 
-MEMORY = 512 * 2**20
-"""Largest number of bytes of the trajectories that are kept in memory."""
+MEMORY = 512 * 2**20  # largest number of bytes of the trajectories that are kept in memory
 
 
 class StoredTrajectories:
@@ -21,10 +20,6 @@ class StoredTrajectories:
     The system's trajectories are read again for each choice of a task, so they are kept in memory after the first
     time. A stored trajectory does not change. If another connection has written to the file nevertheless, the
     checksums in the file show which ones are read again.
-
-    Args:
-        database: the file of the store.
-        memory: largest number of bytes of the trajectories in memory; further ones are read each time.
     """
 
     def __init__(self, database: Database, memory: int = MEMORY) -> None:
@@ -36,8 +31,8 @@ class StoredTrajectories:
     def read(self, numbers: Iterable[int], side: Side) -> dict[int, Trajectory]:
         """Return the stored trajectories of trials by the trials' numbers; a trial without one is left out."""
         if side == "model":
-            found = ((number, self._read(number, side)) for number in numbers)
-            return {number: one[1] for number, one in found if one is not None}
+            rows = ((number, self._read(number, side)) for number in numbers)
+            return {number: row[1] for number, row in rows if row is not None}
         self._forget_changed()
         of_system = ((number, self._of_system(number)) for number in numbers)
         return {number: trajectory for number, trajectory in of_system if trajectory is not None}
@@ -63,21 +58,17 @@ class StoredTrajectories:
             return None
         if number in self._kept:
             return self._kept[number][1]
-        found = self._read(number, "system")
-        if found is None:
+        row = self._read(number, "system")
+        if row is None:
             self._missing.add(number)
             return None
-        self._keep(number, *found)
-        return found[1]
-
-    def _keep(self, number: int, checksum: int, trajectory: Trajectory) -> None:
-        size = _size(trajectory)
-        if size > self._left:
-            return  # to drop an older one instead would not help: all are read in turn
-        for array in (trajectory.times, trajectory.states, trajectory.inputs):
-            array.setflags(write=False)
-        self._left -= size
-        self._kept[number] = checksum, trajectory
+        trajectory = row[1]
+        if (size := _size(trajectory)) <= self._left:  # to drop an older one would not help: all are read in turn
+            for array in (trajectory.times, trajectory.states, trajectory.inputs):
+                array.setflags(write=False)
+            self._left -= size
+            self._kept[number] = row
+        return trajectory
 
     def _forget_changed(self) -> None:
         """Forget what another connection may have changed in the file."""
@@ -104,10 +95,10 @@ class StoredTrajectories:
             )
         if row is None and not hidden:
             return None
-        found = None if row is None else read_trajectory(number, side, *row)
-        if found is None:
+        trajectory = None if row is None else read_trajectory(number, side, *row)
+        if trajectory is None:
             raise self._database.damaged(f"the {side}'s trajectory of its trial {number} cannot be read")
-        return int(row[1]), found
+        return int(row[1]), trajectory
 
 
 def _size(trajectory: Trajectory) -> int:

@@ -27,9 +27,6 @@ def run_episode(advance: Advance, controller: Controller, task: Task, inputs: in
 
     Args:
         advance: function that applies an input ``(m,)`` for one step and returns the next state ``(n,)`` and a reason.
-        controller: the controller for this task.
-        task: one task, not a batch.
-        inputs: the number of inputs m.
     """
     x = np.array(task.initial_state)
     states, applied = np.full((task.horizon + 1, len(x)), np.nan), np.full((task.horizon, inputs), np.nan)

@@ -17,9 +17,10 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import Seconds
+from ctxval._util.extras import require_extra
 from ctxval._util.files import require_regular_file
 from ctxval._util.registry import part
-from ctxval._util.representation import call, options
+from ctxval._util.representation import ShortRepr
 from ctxval._util.temporary import TemporaryFolder
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
@@ -32,7 +33,7 @@ _PROGRAM = Path(__file__).with_name("fmu_process.py")
 
 
 @part(runs_code=True, files=("path",))
-class FMU:
+class FMU(ShortRepr):
     """An FMU for co-simulation, FMI 2 or 3, as the true system.
 
     Every execution has its own instance: parameters and the initial state are set as start values, inputs are held
@@ -41,17 +42,12 @@ class FMU:
 
     Args:
         path: the ``.fmu`` file.
-        states: names of the variables that make up the state; they are real numbers.
-        inputs: names of the input variables; they are real numbers.
+        states, inputs: names of the variables that make up the state, and of the inputs; all are real numbers.
         start: the variable whose start value sets a state, by the name of the state; by default the state's own
             variable.
         parameters: values of other variables, set before the initialisation.
         step: the communication step size in seconds, of which a task's dt must be a whole multiple; by default it is
             the task's dt.
-
-    Raises:
-        InputError: if FMPy is not installed, or the file is not an FMU that can be used.
-        UnknownNameError: if the FMU has no variable of a given name.
     """
 
     def __init__(
@@ -113,12 +109,13 @@ class FMU:
         """Run the closed loop from the task's initial state over its horizon.
 
         Raises:
-            InputError: if the task's dt is not a multiple of the step, or the initial state cannot be set.
-            ShapeError: if the number of states or inputs differs from the number of names.
             ExecutionError: if the FMU refuses to start, or crashes when it starts.
         """
         require_one(task)
-        substeps = self._substeps(task)
+        ratio = 1.0 if self.step is None else task.dt / self.step
+        if ratio < 0.5 or not np.isclose(ratio, round(ratio), rtol=1e-9, atol=0):
+            raise InputError(f"the task's dt must be a whole multiple of the step {self.step:g} s, got {task.dt:g} s.")
+        substeps = round(ratio)
         with self._process() as process:
             state = process.ask("begin", task.initial_state.tolist(), task.dt / substeps, substeps)
             require_started(task, np.array(state))
@@ -127,12 +124,6 @@ class FMU:
             with contextlib.suppress(_CrashError):  # the execution is over
                 process.ask("free")
             return trajectory
-
-    def _substeps(self, task: Task) -> int:
-        ratio = 1.0 if self.step is None else task.dt / self.step
-        if ratio < 0.5 or not np.isclose(ratio, round(ratio), rtol=1e-9, atol=0):
-            raise InputError(f"the task's dt must be a whole multiple of the step {self.step:g} s, got {task.dt:g} s.")
-        return round(ratio)
 
     @contextlib.contextmanager
     def _process(self) -> Iterator[_Process]:
@@ -160,20 +151,13 @@ class FMU:
         vars(self).update(state)
         self._open()
 
-    def __repr__(self) -> str:
-        return call(self, self.path.name, **{key: value for key, value in options(self).items() if key != "path"})
-
 
 class _CrashError(ExecutionError):
     """The FMU has crashed its process."""
 
 
 class _Process:
-    """The process that runs an FMU; see :mod:`ctxval.systems.fmu_process`.
-
-    Attributes:
-        sound: whether the process can be used again.
-    """
+    """The process that runs an FMU (:mod:`ctxval.systems.fmu_process`); if it is sound, it can be used again."""
 
     def __init__(self, setup: Mapping[str, Any]) -> None:
         path = os.pathsep.join(entry for entry in sys.path if entry)
@@ -239,10 +223,7 @@ def _clean(idle: dict[int, list[_Process]], unpacked: TemporaryFolder, owner: in
 
 def _unpacked(path: Path) -> tuple[Any, TemporaryFolder]:
     """Return the model description and a new folder with the FMU's content."""
-    try:
-        import fmpy
-    except ImportError as error:
-        raise InputError('FMPy is not installed: pip install "ctxval[fmu]".') from error
+    fmpy = require_extra("fmpy", "fmu", "FMUs")
     try:
         require_regular_file(path)
         description = fmpy.read_model_description(str(path))

@@ -15,9 +15,6 @@ import time
 from collections.abc import Callable
 from typing import IO, Any
 
-_POLL = 0.5
-"""Seconds between two checks whether the campaign's process still runs."""
-
 
 class Refused(Exception):  # noqa: N818
     """The FMU refused a request; ``input_is_wrong`` tells whether the user's input is the cause."""
@@ -30,12 +27,7 @@ class Refused(Exception):  # noqa: N818
 class Unit:
     """An unpacked FMU with one instance at a time; it hides the different names of FMI 2 and 3.
 
-    Args:
-        folder: the folder of the unpacked files.
-        name: the name of the FMU's file.
-        states, inputs: value references of the states and inputs.
-        start: names of the variables whose start values set the state.
-        parameters: values of parameters by name.
+    States and inputs are value references; ``start`` are names of the variables whose start values set the state.
     """
 
     def __init__(
@@ -87,8 +79,10 @@ class Unit:
 
     def _initialise(self) -> None:
         try:
+            enumeration = "Int64" if hasattr(self.fmu, "setInt64") else "Integer"
             for variable, value in self.parameters:
-                _set_parameter(self.fmu, variable, value)
+                kind = enumeration if variable.type == "Enumeration" else variable.type
+                getattr(self.fmu, f"set{kind}")([variable.valueReference], [value])
             if not self.is_fmi3:
                 self.fmu.setupExperiment(startTime=0.0)
             self.fmu.enterInitializationMode()
@@ -128,12 +122,6 @@ class Unit:
             fmu.freeInstance()
 
 
-def _set_parameter(fmu: Any, variable: Any, value: Any) -> None:
-    enumeration = "Int64" if hasattr(fmu, "setInt64") else "Integer"
-    kind = enumeration if variable.type == "Enumeration" else variable.type
-    getattr(fmu, f"set{kind}")([variable.valueReference], [value])
-
-
 def serve(requests: IO[str], answers: IO[str]) -> None:
     """Answer each request, until there are no more."""
     unit = Unit(**json.loads(requests.readline()))
@@ -151,7 +139,7 @@ def serve(requests: IO[str], answers: IO[str]) -> None:
 def _watch(parent: int) -> None:
     """End this process when the campaign's process ends, even during a step that does not end."""
     while os.getppid() == parent:
-        time.sleep(_POLL)
+        time.sleep(0.5)
     os._exit(1)
 
 

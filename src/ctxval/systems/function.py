@@ -7,7 +7,7 @@ from typing import Any
 
 from ctxval._util.arrays import as_floats
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -15,7 +15,7 @@ from ctxval.errors import ExecutionError, InputError
 
 
 @part(functions={"execute": "(controller, task) -> trajectory"})
-class Function:
+class Function(ShortRepr):
     """A plain function ``(controller, task) -> trajectory`` as the true system: a robot's own driver, a simulator.
 
     For a function of one step, ``(x, u) -> x_next``, use a :class:`Simulated` system.
@@ -24,9 +24,6 @@ class Function:
         execute: function that runs the closed loop. It returns a trajectory, or the states ``(H + 1, n)`` and the
             inputs ``(H, m)``. If it raises an exception, the execution has failed for that reason.
         batched: whether the function takes a batch of tasks, and returns ``(..., H + 1, n)`` and ``(..., H, m)``.
-
-    Raises:
-        InputError: if ``execute`` is not a function.
     """
 
     def __init__(self, execute: Callable[[Controller, Task], Any], *, batched: bool = False) -> None:
@@ -52,6 +49,3 @@ class Function:
                 f"the system's function must return a Trajectory, or states (H + 1, n) and inputs (H, m) with "
                 f"H = {task.horizon}: {error}"
             ) from error
-
-    def __repr__(self) -> str:
-        return call(self, self.function, batched=self.batched)

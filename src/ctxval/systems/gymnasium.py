@@ -11,8 +11,9 @@ import numpy as np
 
 from ctxval._util.arrays import Array, as_floats
 from ctxval._util.checked import NonNegativeInt, Seconds
+from ctxval._util.extras import require_extra
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -24,7 +25,7 @@ StateSetter = Callable[[Any, Array], None]
 
 
 @part(runs_code=True, functions={"get_state": "environment -> x", "set_state": "(environment, x)"})
-class Gymnasium:
+class Gymnasium(ShortRepr):
     """A gymnasium environment with continuous actions as the true system.
 
     An execution resets the environment with its seed, sets the task's initial state and runs the closed loop. MuJoCo
@@ -47,9 +48,6 @@ class Gymnasium:
         seed: seed of every reset, so that executions are repeatable; None takes another one each time.
         ignore_termination: continue although the environment reports the end of the episode.
         options: further arguments for ``gymnasium.make`` or for the function, such as ``max_episode_steps=-1``.
-
-    Raises:
-        InputError: if gymnasium is not installed, or the environment cannot be made or used.
     """
 
     def __init__(
@@ -65,18 +63,29 @@ class Gymnasium:
     ) -> None:
         self.environment = environment
         self.options = options
-        # Environments may be made again after the current folder has changed.
-        self._files = {name: os.path.abspath(value) for name, value in options.items() if _is_relative_file(value)}
+        # Environments may be made again after the current folder has changed; other names stand for gymnasium's models.
+        self._files = {
+            name: os.path.abspath(value)
+            for name, value in options.items()
+            if isinstance(value, str) and value.startswith(("./", "../")) and os.path.exists(value)
+        }
         self.get_state, self.set_state = get_state, set_state
         self.seed = seed
         self.ignore_termination = ignore_termination
         first = self._made()
         self._idle = [first]  # each execution takes its own, so that threads do not share one
-        self.inputs = _action_size(first)
+        space = first.action_space
+        if not np.issubdtype(space.dtype or object, np.floating) or not space.shape:
+            raise InputError(f"the environment must have continuous actions, a Box, got {space}.")
+        self.inputs = int(np.prod(space.shape))
         self.dt = _time_step(first, dt)
-        if (get_state is None or set_state is None) and not _is_mujoco(first.unwrapped):
+        bare = first.unwrapped
+        is_mujoco = (
+            hasattr(bare, "set_state") and hasattr(bare, "model") and hasattr(getattr(bare, "data", None), "qpos")
+        )
+        if (get_state is None or set_state is None) and not is_mujoco:
             raise InputError(
-                f"{first.unwrapped} has no MuJoCo state; give the functions get_state(environment) -> x and "
+                f"{bare} has no MuJoCo state; give the functions get_state(environment) -> x and "
                 "set_state(environment, x)."
             )
 
@@ -94,12 +103,7 @@ class Gymnasium:
         return state
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run the closed loop from the task's initial state over its horizon.
-
-        Raises:
-            InputError: if the task's dt is not the environment's, or its initial state cannot be set.
-            ShapeError: if the number of states or inputs differs from the environment's.
-        """
+        """Run the closed loop from the task's initial state over its horizon."""
         require_one(task)
         require_time_step(task, self.dt, "that of the environment")
         environment = self._idle.pop() if self._idle else self._made()
@@ -119,10 +123,7 @@ class Gymnasium:
             self._idle.pop().close()
 
     def _made(self) -> Any:
-        try:
-            import gymnasium
-        except ImportError as error:
-            raise InputError('gymnasium is not installed: pip install "ctxval[mujoco]".') from error
+        gymnasium = require_extra("gymnasium", "mujoco", "environments")
         if not isinstance(self.environment, str):
             return self.environment(**{**self.options, **self._files})
         try:
@@ -138,7 +139,12 @@ class Gymnasium:
         if self.set_state is not None:
             self.set_state(bare, x)
         else:
-            _set_mujoco_state(bare, x)
+            nq, nv = len(bare.data.qpos), len(bare.data.qvel)
+            if len(x) < nq + nv:
+                raise ShapeError(
+                    f"the task must have at least {nq + nv} states, {nq} qpos and {nv} qvel, got {len(x)}."
+                )
+            bare.set_state(x[:nq], x[nq : nq + nv])
         require_started(task, self._read(bare))
 
     def _read(self, bare: Any) -> Array:
@@ -161,32 +167,6 @@ class Gymnasium:
     def __getstate__(self) -> dict[str, Any]:
         # Environments cannot be pickled; another process makes its own.
         return {**vars(self), "_idle": []}
-
-    def __repr__(self) -> str:
-        return call(self, self.environment, **self.options, inputs=self.inputs, dt=self.dt, seed=self.seed)
-
-
-def _is_relative_file(value: object) -> bool:
-    """Return whether an option is the relative path of a file; other names stand for models of gymnasium itself."""
-    return isinstance(value, str) and value.startswith(("./", "../")) and os.path.exists(value)
-
-
-def _is_mujoco(bare: Any) -> bool:
-    return all(hasattr(bare, name) for name in ("set_state", "data", "model")) and hasattr(bare.data, "qpos")
-
-
-def _set_mujoco_state(bare: Any, x: Array) -> None:
-    nq, nv = len(bare.data.qpos), len(bare.data.qvel)
-    if len(x) < nq + nv:
-        raise ShapeError(f"the task must have at least {nq + nv} states, {nq} qpos and {nv} qvel, got {len(x)}.")
-    bare.set_state(x[:nq], x[nq : nq + nv])
-
-
-def _action_size(environment: Any) -> int:
-    space = environment.action_space
-    if not np.issubdtype(space.dtype or object, np.floating) or not space.shape:
-        raise InputError(f"the environment must have continuous actions, a Box, got {space}.")
-    return int(np.prod(space.shape))
 
 
 def _time_step(environment: Any, given: float | None) -> float:

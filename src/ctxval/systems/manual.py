@@ -7,7 +7,7 @@ from typing import NoReturn
 
 from ctxval._util.checked import Seconds
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.labels import require_names
 from ctxval.core.task import Task
@@ -15,15 +15,11 @@ from ctxval.errors import ExecutionError, InputError
 
 
 @part()
-class Manual:
+class Manual(ShortRepr):
     """A system whose tasks people execute: get a task with ``campaign.ask()``, report it with ``campaign.tell()``.
 
     Attributes:
         states, inputs: names of the components with their units, for files.
-        dt: length of a step, seconds.
-
-    Raises:
-        InputError: if there is no state, or a name or a unit is not a text.
     """
 
     manual = True
@@ -48,6 +44,3 @@ class Manual:
             "a manual system is executed by people; get a task with campaign.ask() and report its result with "
             "campaign.tell() instead of campaign.run()."
         )
-
-    def __repr__(self) -> str:
-        return call(self, states=self.states, inputs=self.inputs, dt=self.dt)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require
 from ctxval._util.checked import PositiveInt
 from ctxval._util.mjcf import compile_mjcf
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
@@ -24,7 +24,7 @@ _SAME_POSITION = 1e-6
 
 
 @part(files=("mjcf",))
-class MuJoCo:
+class MuJoCo(ShortRepr):
     """An MJCF model as the true system, with feedback, for whole batches of closed loops at once.
 
     The state is ``(qpos, qvel)``, followed by the selected coordinates of each selected site. An execution starts from
@@ -41,10 +41,6 @@ class MuJoCo:
         sites: names of sites whose positions are part of the state, such as an end effector.
         axes: world coordinates of the sites that are part of the state, letters of ``"xyz"``.
         threads: number of threads for a batch (MuJoCo 4 or later); the results do not depend on it.
-
-    Raises:
-        InputError: if MuJoCo is not installed, the model cannot be read or compiled, or a value cannot be used.
-        UnknownNameError: if the model has no site of a given name.
     """
 
     batched = True
@@ -75,15 +71,7 @@ class MuJoCo:
         return {"mjcf": self._digest, "substeps": self.substeps, "sites": self.sites, "axes": self.axes}
 
     def state(self, qpos: ArrayLike, qvel: ArrayLike | None = None) -> Array:
-        """Return the complete states for configurations and velocities.
-
-        Args:
-            qpos: the configurations, shape ``(..., nq)``.
-            qvel: the velocities, shape ``(..., nv)``; zero by default.
-
-        Raises:
-            InputError: if a value is not a finite number, or has the wrong shape.
-        """
+        """Return the complete states for configurations ``(..., nq)`` and velocities ``(..., nv)``, zero by default."""
         positions = require_shape("qpos", as_finite("qpos", qpos), (self._model.nq,))
         velocities = np.zeros(self._model.nv) if qvel is None else as_finite("qvel", qvel)
         require_shape("qvel", velocities, (self._model.nv,))
@@ -95,13 +83,7 @@ class MuJoCo:
         return self._observed(simulations).reshape(*batch, -1)
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run the closed loop from the task's initial state over its horizon.
-
-        Raises:
-            InputError: if the task's dt is not that of a control step, or the positions of sites in its initial state
-                do not belong to its qpos.
-            ShapeError: if the number of states or inputs differs from the model's.
-        """
+        """Run the closed loop from the task's initial state over its horizon."""
         if not np.isclose(task.dt, self.dt, rtol=1e-9, atol=0):
             raise InputError(
                 f"the task's dt must be the model's timestep times substeps, "
@@ -112,7 +94,7 @@ class MuJoCo:
         ended = execution.failure or trajectory.ended
         return Trajectory(trajectory.times, trajectory.states, trajectory.inputs, ended)
 
-    def _started(self, task: Task) -> _Simulations:
+    def _started(self, task: Task) -> _Batch | _Loop:
         """Return one simulation for each task, in its initial state."""
         nq, nv, sites = self._model.nq, self._model.nv, self._coordinates[0].size * self._coordinates[1].size
         states = task.initial_state.reshape(-1, task.initial_state.shape[-1])
@@ -127,7 +109,7 @@ class MuJoCo:
             self._require_located(states, simulations)
         return simulations
 
-    def _require_located(self, states: Array, simulations: _Simulations) -> None:
+    def _require_located(self, states: Array, simulations: _Batch | _Loop) -> None:
         simulations.locate()
         given, actual = (array[:, self._model.nq + self._model.nv :] for array in (states, self._observed(simulations)))
         misses = np.abs(given - actual).max(axis=1)
@@ -138,20 +120,16 @@ class MuJoCo:
                 f"got {given[worst].tolist()}; state(qpos, qvel) returns the whole state."
             )
 
-    def _observed(self, simulations: _Simulations) -> Array:
+    def _observed(self, simulations: _Batch | _Loop) -> Array:
         sites, axes = self._coordinates
         positions = simulations.site_positions[:, sites, axes]
         return np.concatenate([simulations.qpos, simulations.qvel, positions.reshape(len(positions), -1)], axis=1)
-
-    def __repr__(self) -> str:
-        sizes = {name: int(getattr(self._model, name)) for name in ("nq", "nv", "nu")}
-        return call(self, **sizes, dt=self.dt, substeps=self.substeps, sites=self.sites or None, threads=self.threads)
 
 
 class _Execution:
     """The simulations of a batch of tasks as a step function; it keeps their state between steps."""
 
-    def __init__(self, system: MuJoCo, simulations: _Simulations) -> None:
+    def __init__(self, system: MuJoCo, simulations: _Batch | _Loop) -> None:
         self.system, self.simulations = system, simulations
         self.healthy: Mask = np.ones(len(simulations.qpos), dtype=bool)
         self.steps = 0
@@ -183,26 +161,11 @@ class _Execution:
             self.healthy &= ~failed
 
 
-class _Simulations(Protocol):
-    """Simulations of one model, one in each row: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``."""
-
-    qpos: Array
-    qvel: Array
-    ctrl: Array
-    site_positions: Array  # (N, nsite, 3)
-
-    @property
-    def warnings(self) -> Rows:
-        """The number of MuJoCo's warnings, by simulation and kind of warning."""
-
-    def locate(self) -> None:
-        """Compute the sites' positions."""
-
-    def advance(self, substeps: int, rows: Mask, *, locate: bool) -> None:
-        """Step the simulations in these rows, and compute their sites' positions if wanted."""
+# Simulations of one model, one in each row: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``, and the positions of
+# sites ``(N, nsite, 3)``, which are computed if they are wanted. Warnings are counted by simulation and by kind.
 
 
-def _simulations(model: Any, count: int, threads: int) -> _Simulations:
+def _simulations(model: Any, count: int, threads: int) -> _Batch | _Loop:
     try:
         return _Batch(model, count, threads)
     except ImportError:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ctxval._util.checked import TimeLimit
 from ctxval._util.registry import part
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval._util.temporary import temporary_folder
 from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
@@ -28,15 +28,9 @@ from ctxval.errors import CtxvalError, ExecutionError, InputError
 from ctxval.systems.episode import require_one
 from ctxval.systems.supervised import run_supervised
 
-_TIMES = 0.01
-"""Largest difference between the times of a trajectory and those of its task, in steps."""
-
-_TAIL = 4096
-"""Number of bytes at the end of stderr that are searched for its last line."""
-
 
 @part(runs_code=True, folder="folder")
-class Subprocess:
+class Subprocess(ShortRepr):
     """A command that executes one task, as the true system.
 
     Every execution has a new folder with ``task.json`` and the controller as ``controller.json`` and
@@ -56,9 +50,6 @@ class Subprocess:
         keep: a folder in which the folders of all executions are kept, to examine failures.
         folder: folder in which the files that the command names are searched first; by default, and if they are not
             there, the current folder is used.
-
-    Raises:
-        InputError: if the program does not exist.
     """
 
     def __init__(
@@ -97,7 +88,6 @@ class Subprocess:
         """Run the command on one task.
 
         Raises:
-            InputError: if the controller cannot be written to a file.
             ExecutionError: if the command fails, takes too long, or writes no trajectory of this task.
         """
         require_one(task)
@@ -118,10 +108,6 @@ class Subprocess:
             return
         with temporary_folder() as folder:
             yield folder
-
-    def __repr__(self) -> str:
-        names = {"states": self.states, "inputs": self.inputs}
-        return call(self, shlex.join(self.command), timeout=self.timeout, **names, keep=self.keep)
 
 
 def _located(command: Sequence[str], folder: Path) -> list[str]:
@@ -153,7 +139,7 @@ def signal_name(number: int) -> str:
 
 def _last_line(file: IO[bytes]) -> str:
     """Return the last line of an open file; it is not opened again, because its name may now stand for another file."""
-    file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
+    file.seek(max(0, file.seek(0, os.SEEK_END) - 4096))
     lines = [line.strip() for line in file.read().decode("utf-8", "replace").splitlines() if line.strip()]
     return lines[-1][:300] if lines else ""
 
@@ -181,7 +167,7 @@ def _of_task(trajectory: Trajectory, task: Task) -> Trajectory:
             f"got {trajectory.states.shape}"
         )
     misses = np.abs(trajectory.times - trajectory.times[0] - task.times)
-    if not (misses <= _TIMES * task.dt).all():
+    if not (misses <= 0.01 * task.dt).all():
         worst = int(np.argmax(np.where(np.isnan(misses), np.inf, misses)))
         raise ExecutionError(
             f"the command's trajectory must have steps of {task.dt:g} s: time {worst} must be {task.times[worst]:g} s "

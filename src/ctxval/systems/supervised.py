@@ -20,11 +20,7 @@ from ctxval.errors import ExecutionError
 
 _PROGRAM = Path(__file__).absolute().with_name("supervisor.py")
 
-_GRACE_PERIOD = 10.0
-"""Seconds that a supervisor has to end its command before it is killed itself."""
-
-_LONGEST = 3600.0
-"""Largest timeout of one system call in seconds; the operating system does not take a timeout of years."""
+_GRACE_PERIOD = 10.0  # seconds that a supervisor has to end its command before it is killed itself
 
 
 def run_supervised(
@@ -74,7 +70,7 @@ def _readable(stdout: IO[bytes], timeout: float) -> bool:
     with selectors.DefaultSelector() as selector:
         selector.register(stdout, selectors.EVENT_READ)
         while (left := deadline - time.monotonic()) > 0:
-            if selector.select(min(left, _LONGEST)):
+            if selector.select(min(left, 3600.0)):  # the operating system does not take a timeout of years
                 return True
     return False
 

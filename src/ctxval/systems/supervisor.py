@@ -27,15 +27,6 @@ if TYPE_CHECKING:
 _LINUX = sys.platform.startswith("linux")
 _PR_SET_CHILD_SUBREAPER = 36
 
-_POLL = 0.5
-"""Seconds between two checks whether the campaign still runs; a fork of it may hold our stdin open."""
-
-_WAIT = 0.005
-"""Seconds between two checks whether the killed processes have ended."""
-
-_ATTEMPTS = 200
-"""Number of attempts if only processes are left that cannot be killed because they belong to another user."""
-
 
 def main() -> None:
     """Run the command, until it ends or must be ended."""
@@ -54,7 +45,8 @@ def main() -> None:
     _say(str(child))
     statuses: dict[int, int] = {}
     while not _reap(statuses) and child not in statuses and os.getppid() == int(parent):
-        if 0 in (ready := select.select([0, woken], [], [], _POLL)[0]):
+        # A fork of the campaign may hold our stdin open, so its process is looked at, too.
+        if 0 in (ready := select.select([0, woken], [], [], 0.5)[0]):
             break
         if ready:
             os.read(woken, 4096)
@@ -95,18 +87,18 @@ def _reap(statuses: dict[int, int]) -> bool:
 def _end(child: int, statuses: dict[int, int]) -> None:
     """Kill all descendants repeatedly, because the children of a killed process become children of this one."""
     spared: set[int] = set()
-    attempts = _ATTEMPTS
+    attempts = 200  # if only processes are left that cannot be killed because they belong to another user
     while not _reap(statuses) and attempts:
-        found = _descendants(os.getpid()) if _LINUX else {-child}
-        attempts -= found <= spared
-        for pid in found:
+        left = _descendants(os.getpid()) if _LINUX else {-child}
+        attempts -= left <= spared
+        for pid in left:
             try:
                 os.kill(pid, signal.SIGKILL)
             except ProcessLookupError:
                 pass
             except PermissionError:
                 spared.add(pid)
-        time.sleep(_WAIT)
+        time.sleep(0.005)
     if not _LINUX:
         try:
             os.killpg(child, signal.SIGKILL)
@@ -125,13 +117,13 @@ def _descendants(ancestor: int) -> set[int]:
         except OSError:
             continue  # the process has ended
         children.setdefault(parent, []).append(int(name))
-    found: set[int] = set()
+    descendants: set[int] = set()
     waiting = [ancestor]
     while waiting:
-        new = set(children.get(waiting.pop(), ())) - found
-        found |= new
+        new = set(children.get(waiting.pop(), ())) - descendants
+        descendants |= new
         waiting.extend(new)
-    return found
+    return descendants
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import diagnostics, not_tested
@@ -34,7 +34,7 @@ class Entry:
     content: str
 
 
-class AppendixSection:
+class AppendixSection(ShortRepr):
     """What a file on the credibility of a model holds, as far as this campaign knows it."""
 
     title = "For the file"
@@ -51,8 +51,6 @@ class AppendixSection:
                 table("Appendix for the file", ("Term", "Content", "Vocabulary of"), rows, class_="facts"),
             ]
         )
-
-    __repr__ = call
 
 
 def appendix(context: ReportContext) -> list[Entry]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from markupsafe import Markup
 
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.certificates import Certificate
 from ctxval.certificates.bounds import as_text
 from ctxval.report.context import ReportContext
@@ -16,7 +16,7 @@ _SHAPES = {"good": "\u25cf", "note": "\u25c6", "attention": "\u25b2", "bad": "\u
 """A shape for each light, because colours alone tell nothing in grey print."""
 
 
-class BasisSection:
+class BasisSection(ShortRepr):
     """What the verdict rests on, and what would speak against it."""
 
     title = "Assumptions and diagnostics"
@@ -34,8 +34,6 @@ class BasisSection:
                 bullets(not_tested(context)),
             ]
         )
-
-    __repr__ = call
 
 
 def _assumptions(certificate: Certificate) -> list[Markup]:

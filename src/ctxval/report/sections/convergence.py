@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.report.charts import Axis, Chart
 from ctxval.report.context import ReportContext
 from ctxval.report.diagnostics import stored_predictions
 from ctxval.report.markup import element, joined, number, paragraph
 
 
-class ConvergenceSection:
+class ConvergenceSection(ShortRepr):
     """How the search came to its worst task, and what the executions took."""
 
     title = "Convergence"
@@ -23,8 +23,6 @@ class ConvergenceSection:
         if chart is None:
             return paragraph("No distance is known yet.")
         return joined([element("div", chart, _times(context), class_="charts"), _spent(context)])
-
-    __repr__ = call
 
 
 def distances_in_order(context: ReportContext) -> Chart | None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.trial import Trial
@@ -34,7 +34,7 @@ _FILE = (
 )
 
 
-class RepeatSection:
+class RepeatSection(ShortRepr):
     """How to repeat the campaign, and each of the worst tasks."""
 
     title = "To repeat it"
@@ -56,8 +56,6 @@ class RepeatSection:
         for trial in context.worst_tasks(_WORST):
             parts += _snippets(context, trial)
         return joined(parts)
-
-    __repr__ = call
 
 
 def identity(context: ReportContext) -> dict[str, str]:

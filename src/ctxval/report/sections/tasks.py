@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.representation import call
+from ctxval._util.representation import ShortRepr
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, Kind, colour_scale, small_charts
 from ctxval.report.context import ReportContext
@@ -34,7 +34,7 @@ _ORIGINS: tuple[tuple[Kind, str, tuple[str, ...]], ...] = (
 )
 
 
-class TasksSection:
+class TasksSection(ShortRepr):
     """Where in the task space the distance is large, and how well that is known."""
 
     title = "Distance over the tasks"
@@ -53,8 +53,6 @@ class TasksSection:
         if mapped is not None:
             parts += [heading("Where the threshold is kept"), mapped]
         return joined(parts)
-
-    __repr__ = call
 
 
 def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:

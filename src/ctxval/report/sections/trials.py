@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call, counted
+from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import parted
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, small_charts
@@ -31,7 +31,7 @@ _POINTS = 90
 """Number of points of a line of the worst trials."""
 
 
-class TrialsSection:
+class TrialsSection(ShortRepr):
     """All trials, and what S and M did in them."""
 
     title = "Trials"
@@ -50,8 +50,6 @@ class TrialsSection:
                 _worst(context),
             ]
         )
-
-    __repr__ = call
 
 
 def data_element(identifier: str, data: Any) -> Markup:

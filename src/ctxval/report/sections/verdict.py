@@ -6,7 +6,7 @@ import shlex
 
 from markupsafe import Markup
 
-from ctxval._util.representation import call, counted
+from ctxval._util.representation import ShortRepr, counted
 from ctxval.certificates import Certificate
 from ctxval.certificates.bounds import at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
@@ -30,7 +30,7 @@ _STORES = 5
 """Largest number of other stores that are named."""
 
 
-class VerdictSection:
+class VerdictSection(ShortRepr):
     """The verdict, with the picture that shows it best."""
 
     title = "Verdict"
@@ -51,8 +51,6 @@ class VerdictSection:
                 element("div", element("div", drawn, class_="picture"), beside, class_="first"),
             ]
         )
-
-    __repr__ = call
 
 
 def _sentence(context: ReportContext) -> str:
