@@ -21,9 +21,6 @@ from ctxval.errors import CtxvalError, DistanceError
 OnTrial = Callable[[str, Trial], None]
 """Called with the name of a candidate and each of its trials that has ended."""
 
-_AGREE = 1e-9
-"""Largest difference of two inputs that are the same, as a share of the largest magnitude of each input."""
-
 NoteFor = Callable[[Candidate, Trial, TrialNote], TrialNote]
 """Returns the note of a shared trial, from the trial that was executed and its note."""
 
@@ -180,4 +177,4 @@ class _Elsewhere:
 
 def agrees(plan: Plan, trajectory: Trajectory) -> bool:
     """Return whether an execution is recorded for the candidate with this plan, too."""
-    return gives_inputs(plan, trajectory, _AGREE)
+    return gives_inputs(plan, trajectory, 1e-9)  # a share of the largest magnitude of each input

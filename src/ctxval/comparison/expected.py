@@ -16,8 +16,7 @@ from ctxval.comparison.executions import Executions
 from ctxval.comparison.predictions import Predictions
 from ctxval.core.trial import Trial
 
-_DRAWS = 0x6472
-"""Identifies the random stream of the tasks of a comparison; it is none of the streams of trials."""
+_DRAWS = 0x6472  # identifies the random stream of the tasks of a comparison; it is none of the streams of trials
 
 
 @dataclass(eq=False)

@@ -20,9 +20,6 @@ from ctxval.core.task_distribution import distribution_text
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 
-_WORST_FIRST = 0.5
-"""Share of the budget that the question of d* may use before that of the expected distance is answered."""
-
 
 class Race:
     """A comparison in progress. What it does next follows from the stores alone, so it can be interrupted.
@@ -89,7 +86,8 @@ class Race:
         notes = [TrialNote.of(trial) for one in self.candidates for trial in one.executed]
         spent = sum(note is not None and note.question == "worst" for note in notes)
         last = "mean" not in self.questions
-        if worst and (last or spent < _WORST_FIRST * self.budget) and self.worst.step():
+        # Share of the budget before the other question is answered.
+        if worst and (last or spent < 0.5 * self.budget) and self.worst.step():
             return True
         if not last and self.mean.step(left):
             return True

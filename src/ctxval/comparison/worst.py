@@ -29,11 +29,8 @@ from ctxval.comparison.candidates import Candidate, TrialNote
 from ctxval.comparison.executions import Executions
 from ctxval.comparison.predictions import Predictions
 
-_MARGIN = 1.02
-"""A fact must exceed what is expected of the better candidate by this factor before its bound is worth executions."""
-
+# So many more executions than the better candidate the worse one may have to come near its predicted largest one.
 _INSIST = 3
-"""So many more executions than the better candidate the worse one may have to come near its predicted largest one."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +158,8 @@ class WorstQuestion:
     ) -> bool:
         """Return whether the candidate that seems worse is executed, to raise its largest executed distance."""
         others = len(_worst_trials(better))
-        if worse.largest <= _MARGIN * max(better.largest, expected[better.name][0]):
+        # So far above that its bound is worth executions.
+        if worse.largest <= 1.02 * max(better.largest, expected[better.name][0]):
             return len(_worst_trials(worse)) <= others  # neither is clearly worse: they are executed in turn
         untested = worse.largest < TESTED * expected[worse.name][0]
         insisted = len(_worst_trials(worse)) >= _INSIST + others

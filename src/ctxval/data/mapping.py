@@ -23,8 +23,7 @@ Stamp = Literal["auto", "log", "publish", "header"]
 _VALID = re.compile(r"\s*(\S.*?)\s*(==|!=)\s*([+-]?\d+(?:\.\d*)?)\s*")
 
 _STATES = ("states", "x", "observation.state")
-_INPUTS = ("inputs", "u", "action")
-"""Names of whole vectors that are looked for if there is no mapping."""
+_INPUTS = ("inputs", "u", "action")  # names of whole vectors that are looked for if there is no mapping
 
 
 @dataclass(frozen=True)

@@ -17,15 +17,13 @@ from ctxval._util.texts import quoted, reason_of
 from ctxval.data.log import Log, MemoryTable
 from ctxval.errors import InputError
 
-_DEPTH = 6
-"""Largest depth of structures in structures."""
+_DEPTH = 6  # largest depth of structures in structures
 
-_MOST_OBJECTS = 10_000
-"""Largest number of variables and fields in a file of version 7.3."""
+_MOST_OBJECTS = 10_000  # largest number of variables and fields in a file of version 7.3
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
+# The filters of HDF5 that MATLAB uses; others may be code in a library that a path in the environment names.
 _FILTERS = ("FILTER_DEFLATE", "FILTER_SHUFFLE", "FILTER_FLETCHER32")
-"""The filters of HDF5 that MATLAB uses; others may be code in a library that a path in the environment names."""
 
 
 def read_mat(path: Path) -> list[Log]:

@@ -26,11 +26,7 @@ from ctxval.data.ros1 import ros1_decoder
 from ctxval.data.topics import Message, TopicLog
 from ctxval.errors import InputError
 
-_MOST_FILE = 64 * 2**30
-"""Largest size of a file in bytes. It is read message by message."""
-
-_MOST_CHUNK = 128 * 2**20
-"""Largest size of a record, and of a chunk of records after it is decompressed, in bytes."""
+_MOST_CHUNK = 128 * 2**20  # largest size of a record, and of a chunk of records after it is decompressed, in bytes
 
 _MOST_TOPICS = 10_000
 
@@ -51,7 +47,7 @@ class McapLog(TopicLog):
         self.source, self._path = str(path), path
         self._decoders: dict[int, Callable[[bytes], Any]] = {}
         with self._opened() as file, _damage(path, "an MCAP file"):
-            file.seek(-_MCAP_END, io.SEEK_END)
+            file.seek(-(8 + 29), io.SEEK_END)  # the footer and the magic bytes, https://mcap.dev/spec
             summary = next(self._records(file)).summary_start  # 0 if there is none
             file.seek(summary)
             self._topics = dict[str, None]()
@@ -64,7 +60,7 @@ class McapLog(TopicLog):
     @contextmanager
     def _opened(self) -> Iterator[Any]:
         try:
-            file = open_regular(self._path, _MOST_FILE)
+            file = open_regular(self._path, 64 * 2**30)  # it is read message by message
         except InputError as error:
             raise InputError(f"{self._path} cannot be read: {error}.") from error
         with file:
@@ -249,10 +245,6 @@ def read_mcap(path: Path) -> list[Log]:
 def read_bag(path: Path) -> list[Log]:
     """Return the log in a bag of ROS 1 or 2."""
     return [BagLog(path)]
-
-
-_MCAP_END = 8 + 29
-"""Size of the footer and the magic bytes at the end of an MCAP file, https://mcap.dev/spec."""
 
 
 def _decompressed(kind: str, data: bytes) -> bytes:

@@ -21,8 +21,7 @@ from ctxval.data.readers import is_lerobot, read_logs
 from ctxval.data.sampling import Break, Channel, sampled
 from ctxval.errors import InputError
 
-_LARGEST = 1e100
-"""Largest size of a recorded value: squares of errors must be finite."""
+_LARGEST = 1e100  # largest size of a recorded value: squares of errors must be finite
 
 
 @dataclass(frozen=True, eq=False)

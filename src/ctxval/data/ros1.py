@@ -16,20 +16,17 @@ import numpy as np
 from ctxval._util.extras import require_extra
 from ctxval.errors import InputError
 
+# The format of each type of numbers.
 _NUMBERS = {
     **{"bool": "?", "byte": "b", "char": "B", "int8": "b", "uint8": "B", "int16": "<h", "uint16": "<H"},
     **{"int32": "<i", "uint32": "<I", "int64": "<q", "uint64": "<Q", "float32": "<f", "float64": "<d", "octet": "B"},
 }
-"""The format of each type of numbers."""
 
+# The types that ROS 1 calls time and duration, by the names that rosbags gives them.
 _TIMES = {
     "builtin_interfaces/msg/Time": [("sec", "uint32"), ("nanosec", "uint32")],
     "builtin_interfaces/msg/Duration": [("sec", "int32"), ("nanosec", "int32")],
 }
-"""The types that ROS 1 calls time and duration, by the names that rosbags gives them."""
-
-_DEEPEST = 32
-"""Largest number of messages within each other."""
 
 
 def ros1_decoder(source: str, topic: str, name: str, definition: str) -> Callable[[bytes], Any]:
@@ -68,7 +65,7 @@ class _Message:
         self.types, self.data, self.place = types, data, 0
 
     def record(self, name: str, depth: int) -> dict[str, Any]:
-        if depth > _DEEPEST:
+        if depth > 32:
             raise ValueError(f"{name} is nested too deeply")
         return {field: self.value(kind, depth + 1) for field, kind in self.types[name]}
 

@@ -13,14 +13,8 @@ from ctxval._util.representation import record
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
 
-_LONGEST = 1.5
-"""Longest time between two samples without a gap, in median periods of the field."""
-_SLACK = 1e-3
-"""A sample within this share of a period of a wanted time belongs to it, because times are rounded."""
-_MOST_STEPS = 20_000_000
-"""Largest number of steps of one recording."""
-_MOST_STILL = 0.1
-"""Largest share of rows, besides one, with the time of the row before."""
+_SLACK = 1e-3  # a sample within this share of a period of a wanted time belongs to it, because times are rounded
+_MOST_STEPS = 20_000_000  # largest number of steps of one recording
 
 Interval = tuple[float, float]
 
@@ -136,7 +130,7 @@ def _require_forward(source: str, channel: Channel) -> None:
 def _require_resolution(source: str, channel: Channel) -> None:
     """Refuse times that are rounded so far that they do not tell rows apart; single rows may be written twice."""
     still = np.flatnonzero(np.diff(channel.times) == 0)
-    if len(still) > 1 + _MOST_STILL * len(channel.times):
+    if len(still) > 1 + 0.1 * len(channel.times):  # single rows may be written twice
         word, first = channel.place
         raise InputError(
             f"{source}: {len(still)} of {len(channel.times)} {word}s have the time of the {word} before, the first "
@@ -169,7 +163,7 @@ def _intervals(source: str, channel: Channel, longest_gap: float | None, breaks:
         return [(float(times[good][0]), np.inf)]
     # The input of the last row of a trajectory is not needed.
     _report_missing(source, channel, good, breaks)
-    longest = _LONGEST * period if longest_gap is None else longest_gap
+    longest = 1.5 * period if longest_gap is None else longest_gap  # median periods without a gap
     kept = times[good]
     rows = np.flatnonzero(good)
     cut = (np.diff(rows) > 1) | (np.diff(kept) > longest * (1 + 1e-9))

@@ -16,8 +16,7 @@ from ctxval._util.units import named_unit
 from ctxval.data.log import Clock, Log, Signal
 from ctxval.errors import InputError
 
-_MOST_MEMORY = 2**30
-"""Largest size of the numbers of a log in bytes; each message needs :data:`_OBJECT` bytes more."""
+_MOST_MEMORY = 2**30  # largest size of the numbers of a log in bytes; each message needs :data:`_OBJECT` bytes more
 
 _OBJECT = 256
 

@@ -17,14 +17,8 @@ from ctxval.errors import InputError, ShapeError, UnknownNameError
 
 SignalKind = Literal["random", "multisine", "chirp"]
 
-_HELD = 4
-"""Number of steps for which a random value is held."""
-_SINES = 12
-"""Largest number of sines in a multisine."""
-_FASTEST = 0.1
-"""Highest frequency, in cycles per step."""
-_DRAWN = 20
-"""Number of sets of random phases, of which that with the smallest peak is used."""
+_HELD = 4  # number of steps for which a random value is held
+_FASTEST = 0.1  # highest frequency, in cycles per step
 
 
 def excitation(kind: SignalKind, horizon: int, amplitude: ArrayLike, rng: np.random.Generator) -> Array:
@@ -58,9 +52,10 @@ def _random(horizon: int, rng: np.random.Generator) -> Array:
 
 
 def _multisine(horizon: int, rng: np.random.Generator) -> Array:
-    cycles = np.unique(np.linspace(1, max(1, _FASTEST * horizon), _SINES).round())
+    cycles = np.unique(np.linspace(1, max(1, _FASTEST * horizon), 12).round())
     t = np.arange(horizon)[:, None] / horizon
-    waves = [np.sin(2 * np.pi * (cycles * t + rng.uniform(size=len(cycles)))).sum(axis=1) for _ in range(_DRAWN)]
+    # Sets of random phases, of which that with the smallest peak is used.
+    waves = [np.sin(2 * np.pi * (cycles * t + rng.uniform(size=len(cycles)))).sum(axis=1) for _ in range(20)]
     best = min(waves, key=lambda wave: float(np.abs(wave).max()))
     return np.asarray(best / max(float(np.abs(best).max()), 1e-12))
 

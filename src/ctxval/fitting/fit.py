@@ -28,12 +28,9 @@ STEPS = (1, 20)
 HOLD_OUT = 0.25
 """Share of the recordings that is held out, unless another one is given."""
 
-_UNITS = (32, 32)
-"""Numbers of units in the hidden layers of the network."""
-_POINTS = 400
-"""Number of transitions that the Gaussian process is conditioned on."""
-_MOST = 20_000
-"""Largest number of transitions that a network is trained on; of more, every second, third, ... one is."""
+_UNITS = (32, 32)  # numbers of units in the hidden layers of the network
+_POINTS = 400  # number of transitions that the Gaussian process is conditioned on
+_MOST = 20_000  # largest number of transitions that a network is trained on; of more, every second, third, ... one is
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,10 +251,6 @@ def _linear(data: Transitions, recordings: Recordings) -> tuple[Model, tuple[Fit
     return model, (), tuple(identifiability(data, [*recordings.states, *recordings.inputs]))
 
 
-_WEAK = 30.0
-"""Ratio of the standard deviations of coefficients with and without the others, from which a regressor is named."""
-
-
 def identifiability(data: Transitions, names: Sequence[str]) -> list[str]:
     """Return sentences on how well transitions determine a linear model: the variance inflation of each regressor."""
     Z = np.concatenate([data.x, data.u], axis=1)
@@ -267,7 +260,7 @@ def identifiability(data: Transitions, names: Sequence[str]) -> list[str]:
         return [f"{', '.join(still)} never changes, so its coefficients are not determined"]
     correlation = np.corrcoef(Z, rowvar=False).reshape(len(names), -1)
     inflation = np.sqrt(np.diag(np.linalg.pinv(correlation)))
-    weak = [name for name, ratio in zip(names, inflation, strict=True) if ratio > _WEAK]
+    weak = [name for name, ratio in zip(names, inflation, strict=True) if ratio > 30.0]
     worst = float(inflation.max())
     if weak:
         return [

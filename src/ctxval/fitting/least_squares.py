@@ -17,15 +17,6 @@ from ctxval.errors import CtxvalError, InputError, ModelError
 from ctxval.models import Parametric
 from ctxval.models.parametric import ParametricStep
 
-_STARTS = 8
-"""Number of starting points, of which the first is the middle of the bounds."""
-_MOST = 4000
-"""Largest number of transitions that are used; of more, every second, third, ... one is."""
-_AT_BOUND = 1e-4
-"""Share of the width of the bounds within which a value counts as at a bound."""
-_CONDITION = 1e8
-"""Largest condition number of the scaled Jacobian; beyond it the data do not determine all parameters."""
-
 
 @dataclass(frozen=True)
 class FittedParameter:
@@ -74,7 +65,7 @@ def fit_parameters(
         ModelError: if the function fails on the recorded states.
     """
     low, high = as_bounds(bounds)
-    every = max(1, -(-len(data) // _MOST))
+    every = max(1, -(-len(data) // 4000))
     some = Transitions(data.x[::every], data.u[::every], data.x_next[::every])
     if some.x.size <= len(low):
         raise InputError(f"{len(low)} parameters need more than {some.x.size} recorded numbers.")
@@ -131,7 +122,7 @@ class _Problem:
 def _best(problem: _Problem, low: Array, high: Array, sizes: Array, seed: int) -> Array:
     """Return the parameters of least squared errors from several starting points."""
     rng = np.random.default_rng(seed)
-    starts = np.concatenate([[0.5 * (low + high)], rng.uniform(low, high, (_STARTS - 1, len(low)))])
+    starts = np.concatenate([[0.5 * (low + high)], rng.uniform(low, high, (7, len(low)))])
     few = max(1, len(problem.data) // 400)
     data = problem.data
     small = _Problem(
@@ -153,7 +144,8 @@ def _intervals(
     _, singular, V = np.linalg.svd(J * width, full_matrices=False)
     degrees = max(len(errors) - len(theta), 1)
     variance = float((errors**2).sum()) / degrees
-    weak = V[singular <= singular.max(initial=0.0) / _CONDITION] if singular.max(initial=0.0) > 0 else V
+    # Beyond this condition number the data do not determine all parameters.
+    weak = V[singular <= singular.max(initial=0.0) / 1e8] if singular.max(initial=0.0) > 0 else V
     undetermined = (np.abs(weak) > 0.1).any(axis=0) if len(weak) else np.zeros(len(theta), dtype=bool)
     with np.errstate(all="ignore"):
         deviations = width * np.sqrt(variance * ((V / singular[:, None]) ** 2).sum(axis=0))
@@ -174,4 +166,4 @@ def _intervals(
 
 
 def _near(value: float, bound: float, width: float) -> bool:
-    return bool(abs(value - bound) <= _AT_BOUND * width)
+    return bool(abs(value - bound) <= 1e-4 * width)

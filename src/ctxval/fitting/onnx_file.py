@@ -14,8 +14,7 @@ from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear
 
-_OPSET, _IR = 17, 8
-"""Versions that onnxruntime has read since 2022."""
+_OPSET, _IR = 17, 8  # versions that onnxruntime has read since 2022
 
 
 def write_onnx(path: str | Path, model: Model) -> None:

@@ -18,15 +18,6 @@ from ctxval.errors import CtxvalError
 from ctxval.learning.recorded import closed_loops_on_model
 from ctxval.models import Corrected, Linear, Refined
 
-_SAME = 1e-6
-"""Largest difference between the inputs of two controllers, as a share of the largest magnitude of each input."""
-_BETTER = 0.95
-"""The Jacobian of M' is used for one linearisation if this lowers the cost of the tasks on M' to so much of it."""
-_ONCE = 2
-"""Largest number of states and inputs at which a synthesizer that linearises once asks for the Jacobian."""
-_TASKS = 32
-"""Largest number of tasks whose controllers are compared."""
-
 
 @dataclass(frozen=True)
 class SameControllers:
@@ -63,7 +54,7 @@ def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refine
         Corrected(own.model, own.correction, linearised="model", data=own.data), refined.data, refined.before
     )
     costs = [_typical_cost(validation.with_model(model)) for model in (refined, kept)]
-    if costs[0] <= _BETTER * costs[1]:
+    if costs[0] <= 0.95 * costs[1]:  # clearly
         return refined, None
     return kept, (
         "controllers are designed with the Jacobian of the model before, and the prediction is corrected: the "
@@ -96,7 +87,7 @@ def _linearises_a_linear_model_once(validation: Validation, model: Model) -> boo
         validation.with_model(counted).plan(validation.space.from_unit(np.full(validation.space.dimension, 0.5)))
     except CtxvalError:
         return False
-    return 1 <= counted.points <= _ONCE
+    return 1 <= counted.points <= 2
 
 
 def _typical_cost(validation: Validation) -> float:
@@ -133,7 +124,7 @@ def _cost(validation: Validation, task: Task, loops: Trajectory) -> Array:
 
 def same_controllers(validation: Validation, executed: Sequence[tuple[Trial, Trajectory]]) -> SameControllers:
     """Return on how many executed tasks the controllers of a refined model are those that were executed."""
-    some = executed[-_TASKS:]
+    some = executed[-32:]
     distances = [one for one in (_known_distance(validation, *pair) for pair in some) if one is not None]
     return SameControllers(len(some), len(distances), max(distances, default=None))
 
@@ -142,6 +133,7 @@ def _known_distance(validation: Validation, trial: Trial, recorded: Trajectory) 
     """Return the distance of a refined model on an executed task; None if its controller has changed."""
     try:
         plan = validation.plan(validation.space.from_unit(trial.unit_point))
-        return validation.accept(plan, recorded).distance if gives_inputs(plan, recorded, _SAME) else None
+        # A share of the largest magnitude of each input.
+        return validation.accept(plan, recorded).distance if gives_inputs(plan, recorded, 1e-6) else None
     except Exception:  # users' tasks, synthesizers and distances may raise anything: what cannot be compared differs
         return None

@@ -15,16 +15,6 @@ from ctxval.refinement.held_out import HeldOut
 
 QUANTILE = 0.95
 """The share of the held-out transitions whose residual is at most the stated quantile."""
-_REGIONS = 6
-"""Largest number of regions."""
-_LEAST = 40
-"""Least number of transitions in a region: the 0.95 quantile of fewer would be their largest value."""
-_PLACES = (0.25, 0.5, 0.75)
-"""Quantiles of a coordinate at which a region may be split."""
-_GAIN = 0.1
-"""Least share of the spread of the logarithms that a split must explain."""
-_ROUNDING = 1e-6
-"""Spread of the logarithms of one transition that may be rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,8 +142,9 @@ def _split(pairs: Array, logs: Array) -> list[_Box]:
     """Return boxes with the transitions in them: the box whose split explains most is split first."""
     k = pairs.shape[1]
     boxes: list[_Box] = [(np.ones(len(pairs), dtype=bool), np.full(k, -np.inf), np.full(k, np.inf))]
-    least = max(_GAIN * float(((logs - logs.mean()) ** 2).sum()), _ROUNDING * len(logs))
-    while len(boxes) < _REGIONS:
+    # A split must explain a share of the spread, and more than rounding.
+    least = max(0.1 * float(((logs - logs.mean()) ** 2).sum()), 1e-6 * len(logs))
+    while len(boxes) < 6:
         splits = [_best_split(pairs, logs, box[0]) for box in boxes]
         best = max(range(len(boxes)), key=lambda i: splits[i][0])
         gain, column, place = splits[best]
@@ -176,7 +167,8 @@ def _best_split(pairs: Array, logs: Array, inside: Mask) -> tuple[float, int, fl
         values = pairs[inside, column]
         for place in _cuts(values):
             below = values <= place
-            if min(int(below.sum()), int((~below).sum())) < _LEAST:
+            # The 0.95 quantile of fewer would be their largest value.
+            if min(int(below.sum()), int((~below).sum())) < 40:
                 continue
             left = sum(float(((part - part.mean()) ** 2).sum()) for part in (own[below], own[~below]))
             best = max(best, (total - left, column, place))
@@ -185,7 +177,8 @@ def _best_split(pairs: Array, logs: Array, inside: Mask) -> tuple[float, int, fl
 
 def _cuts(values: Array) -> Sequence[float]:
     """Return places at which a coordinate may be split, rounded to three digits so that they can be written down."""
-    return [float(f"{place:.3g}") for place in np.quantile(values, _PLACES).tolist()]
+    # Rounded, so that they can be written down.
+    return [float(f"{place:.3g}") for place in np.quantile(values, (0.25, 0.5, 0.75)).tolist()]
 
 
 def _region(magnitude: Array, inside: Mask, low: Array, high: Array) -> ResidualRegion:

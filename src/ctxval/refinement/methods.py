@@ -23,19 +23,11 @@ from ctxval.models.parametric import ParametricStep
 from ctxval.refinement.held_out import HeldOut, held_out
 from ctxval.refinement.records import Records
 
-_CENTRES = 300
-"""Largest number of transitions that a correction is conditioned on."""
+_CENTRES = 300  # largest number of transitions that a correction is conditioned on
+# Fewer of them are kept, at least so many, if they predict the others with this relative error: design on the model
+# is then faster.
 _FEWEST, _PRECISE = 24, 0.005
-"""Fewer of them are kept, at least so many, if they predict the others with this relative error: design on the model is
-then faster."""
-_FAMILY = (2.5, 0.0)
-"""Smoothness and growth of the covariance of a correction."""
-_UNITS = (32, 32)
-"""Numbers of units in the hidden layers of a network."""
-_NEGLIGIBLE = 1e-7
-"""A residual below this share of the state's typical change is rounding."""
-_CHECKED = 50
-"""Number of recorded pairs at which a learned model is tried."""
+_UNITS = (32, 32)  # numbers of units in the hidden layers of a network
 
 RefitKind = Literal["linear", "network", "gaussian-process"]
 NAMES = ("residual", *get_args(RefitKind), "parameters", "fit")
@@ -118,12 +110,13 @@ class ResidualCorrection(Method):
                 "predicted from state and input. A state may be missing, such as a temperature or a delay, or the "
                 "executions have too little in common."
             )
-        worth: Mask = np.asarray(errors.rms_before > _NEGLIGIBLE * errors.changes.std(axis=0))
+        worth: Mask = np.asarray(errors.rms_before > 1e-7 * errors.changes.std(axis=0))
         notes = () if (better | ~worth).all() else (_uncorrected(better | ~worth),)
         return Learned(Corrected(model, whole.of_states(better), data=records.transitions), errors.kept(better), notes)
 
     def _correction(self, model: Model, records: Records) -> Correction | None:
-        settings = PosteriorSettings(hyperparameters=1, centres=self.centres, families=(_FAMILY,), of_steps=False)
+        # Matern 5/2 that does not grow with the inputs.
+        settings = PosteriorSettings(hyperparameters=1, centres=self.centres, families=((2.5, 0.0),), of_steps=False)
         found = learn_posterior(model, records.transitions, records.sources, settings=settings)
         return None if found is None else correction_of(found)
 
@@ -293,7 +286,7 @@ class UserFit(Method):
 def _usable(model: Model, records: Records) -> Model:
     """Return a model that gives finite states of the right shape at recorded pairs."""
     data = records.transitions
-    rows = np.linspace(0, len(data) - 1, min(_CHECKED, len(data))).astype(int)
+    rows = np.linspace(0, len(data) - 1, min(50, len(data))).astype(int)
     try:
         with np.errstate(all="ignore"):
             found = np.asarray(model.step(data.x[rows], data.u[rows]), dtype=np.float64)

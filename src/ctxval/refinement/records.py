@@ -13,8 +13,8 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.errors import InputError
 
+# Largest number of parts that are held out one after the other; of more executions, some are held out together.
 _FOLDS = 10
-"""Largest number of parts that are held out one after the other; of more executions, some are held out together."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,6 @@ from ctxval.core.model import Model
 from ctxval.data.recordings import Recordings
 from ctxval.replay.steps import Predictions, RecordedSteps, predicted, root_mean_square
 
-_BINS = 5
-"""Number of regions of one state or input; each has about as many steps."""
-
 
 @dataclass(frozen=True)
 class StepError:
@@ -126,7 +123,7 @@ def regions(model: Model, recorded: RecordedSteps) -> tuple[Region, ...]:
     labels = recorded.recordings.states | recorded.recordings.inputs
     found: list[Region] = []
     for (name, unit), column in zip(labels.items(), values.T, strict=True):
-        edges = np.unique(np.quantile(column, np.linspace(0, 1, _BINS + 1)))
+        edges = np.unique(np.quantile(column, np.linspace(0, 1, 6)))
         bins = np.clip(np.searchsorted(edges, column, side="right") - 1, 0, max(len(edges) - 2, 0))
         for k in range(max(len(edges) - 1, 0)):
             inside = error[known][bins == k]

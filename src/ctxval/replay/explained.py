@@ -13,16 +13,7 @@ from ctxval.core.trajectory import Transitions
 from ctxval.learning import PosteriorSettings, learn_posterior
 from ctxval.replay.steps import RecordedSteps, stepped
 
-_FOLDS = 4
-"""Largest number of parts of the recordings that are held out in turn."""
-_LEARNED = 1500
-"""Largest number of transitions from which the residual is learned."""
-_CENTRES = 250
-"""Largest number of transitions that it is conditioned on."""
-_MOST = 12_000
-"""Largest number of recorded steps that are used."""
-_RIDGE = 1e-6
-"""Share of the mean square that regularises least squares."""
+_LEARNED = 1500  # largest number of transitions from which the residual is learned
 
 
 @dataclass(frozen=True)
@@ -92,7 +83,7 @@ class _Steps:
     """Recorded steps with the step before each, in parts that are held out in turn."""
 
     def __init__(self, model: Model, recorded: RecordedSteps) -> None:
-        where = recorded.windows(1, 1, _MOST)
+        where = recorded.windows(1, 1, 12_000)
         x, u = recorded.states(where), recorded.inputs(where)
         x_before, u_before = recorded.states(where, -1), recorded.inputs(where, -1)
         self.transitions = Transitions(x, u, recorded.states(where, 1))
@@ -105,7 +96,7 @@ class _Steps:
             self._keep(finite)
         groups = where.groups[finite]
         known = np.unique(groups)
-        self.folds: Rows = np.searchsorted(known, groups) * min(_FOLDS, len(known)) // max(len(known), 1)
+        self.folds: Rows = np.searchsorted(known, groups) * min(4, len(known)) // max(len(known), 1)
         runs, places = where.runs[finite], where.places[finite]
         self.follows: Mask = (np.diff(runs) == 0) & (np.diff(places) == 1)
 
@@ -128,7 +119,7 @@ def _affine(features: Array, targets: Array, held: Mask) -> Array:
     shift, scale = features[~held].mean(axis=0), np.maximum(features[~held].std(axis=0), 1e-12)
     Z = np.column_stack([np.ones(len(features)), (features - shift) / scale])
     G = Z[~held].T @ Z[~held]
-    G += _RIDGE * np.trace(G) / len(G) * np.eye(len(G))
+    G += 1e-6 * np.trace(G) / len(G) * np.eye(len(G))
     return np.asarray(Z[held] @ np.linalg.solve(G, Z[~held].T @ targets[~held]))
 
 
@@ -139,7 +130,7 @@ def _learned(model: Model, data: _Steps, held: Mask, seed: int) -> Array:
         rows = np.sort(np.random.default_rng(seed).permutation(rows)[:_LEARNED])
     some = Transitions(data.transitions.x[rows], data.transitions.u[rows], data.transitions.x_next[rows])
     with single_threaded():
-        settings = PosteriorSettings(hyperparameters=1, centres=_CENTRES)
+        settings = PosteriorSettings(hyperparameters=1, centres=250)
         learned = learn_posterior(model, some, data.folds[rows], settings=settings)
         if learned is None:
             return np.zeros_like(data.residuals[held])

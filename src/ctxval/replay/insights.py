@@ -9,16 +9,8 @@ from ctxval.replay.explained import ResidualShare
 from ctxval.replay.timing import Suggestion
 from ctxval.replay.untested import PredictedTasks
 
-_RATIO = 1.5
-"""Ratio of the error in a region from which it is named."""
-_SHARE = 0.3
-"""Share of a residual from which an explanation is named."""
-_SMALL = 1e-3
-"""A one-step error below this share of the change is called small, and its causes are not named."""
-_LEFT = 0.05
-"""Share of a residual that is left below which the cause of the rest is not named."""
-_BEYOND = 0.05
-"""Excess of the closed loops over the records from which it is named."""
+_SHARE = 0.3  # share of a residual from which an explanation is named
+_SMALL = 1e-3  # a one-step error below this share of the change is called small, and its causes are not named
 
 
 def insights(
@@ -80,7 +72,7 @@ def _of_residuals(errors: Sequence[StepError], residuals: Sequence[ResidualShare
                 f"state and input explain {100 * one.explained:.0f} % of the residual of {one.state}: the rest of "
                 f"{left} is noise, or has a cause that is not recorded"
             )
-        if one.history >= _SHARE and one.rest > _LEFT * one.rms:
+        if one.history >= _SHARE and one.rest > 0.05 * one.rms:
             yield (
                 f"the step before explains {100 * one.history:.0f} % of what state and input leave of the residual of "
                 f"{one.state}: the system has a state that is not recorded, a delay, or filtered measurements"
@@ -90,7 +82,7 @@ def _of_residuals(errors: Sequence[StepError], residuals: Sequence[ResidualShare
 def _of_regions(errors: Sequence[StepError], found: Sequence[Region]) -> Iterator[str]:
     if max((one.relative for one in errors if one.steps == 1), default=0.0) < _SMALL:
         return
-    large = sorted((one for one in found if one.ratio >= _RATIO), key=lambda one: -one.ratio)
+    large = sorted((one for one in found if one.ratio >= 1.5), key=lambda one: -one.ratio)
     for one in large[:3]:
         unit = f" {one.unit}" if one.unit else ""
         yield (
@@ -108,7 +100,7 @@ def _of_tasks(names: Mapping[str, str], tasks: PredictedTasks | None) -> Iterato
         f"of all tasks, {at} has the largest predicted distance, {worst.median:.3g} (between {worst.low:.3g} and "
         f"{worst.high:.3g}); no execution has tested it"
     )
-    if tasks.beyond > _BEYOND:
+    if tasks.beyond > 0.05:
         yield (
             f"the closed loops of the tasks lead beyond all records of {list(names)[tasks.beyond_of]}, by "
             f"{100 * tasks.beyond:.0f} % of the range that they visit: predictions are extrapolated there"

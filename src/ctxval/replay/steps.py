@@ -12,10 +12,7 @@ from ctxval.core.model import Model
 from ctxval.data.recordings import Recordings
 from ctxval.errors import CtxvalError, ModelError
 
-_MOST = 40_000
-"""Largest number of predictions of one kind; of more, every second, third, ... one is made."""
-_EVALUATIONS = 400_000
-"""Largest number of steps of the model in predictions of one kind."""
+_MOST = 40_000  # largest number of predictions of one kind; of more, every second, third, ... one is made
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +52,7 @@ class Windows:
         return len(self.runs)
 
 
-_PARTS = 5
-"""Number of parts of a single recording, which then take the place of recordings."""
+_PARTS = 5  # number of parts of a single recording, which then take the place of recordings
 
 
 class RecordedSteps:
@@ -106,7 +102,7 @@ class RecordedSteps:
 
 def predicted(model: Model, recorded: RecordedSteps, steps: int) -> Predictions:
     """Return predictions of a number of steps from recorded states; none if no recording is so long."""
-    where = recorded.windows(0, steps, min(_MOST, max(200, _EVALUATIONS // steps)))
+    where = recorded.windows(0, steps, min(_MOST, max(200, 400_000 // steps)))
     if not len(where):
         n, m = len(recorded.recordings.states), len(recorded.recordings.inputs)
         none = np.empty((0, n))

@@ -17,20 +17,14 @@ from ctxval._util.representation import record
 from ctxval.core.model import Model
 from ctxval.replay.steps import RecordedSteps, Windows, stepped
 
+# Delays of the inputs that are tried in whole steps; tenths of a step are tried around the best of them.
 _SHIFTS = tuple(range(-3, 11))
-"""Delays of the inputs that are tried in whole steps; tenths of a step are tried around the best of them."""
-_MULTIPLES = (2, 3, 4, 5, 10)
-"""Ratios of the two time steps that are tried."""
+_MULTIPLES = (2, 3, 4, 5, 10)  # ratios of the two time steps that are tried
+# Largest ratio of held-out errors with and without a change that is suggested.
 _CLEAR = {"delay": 0.85, "time step": 0.7}
-"""Largest ratio of held-out errors with and without a change that is suggested."""
+# Largest difference between the values that two halves of the recordings choose: steps, or ratios of time steps.
 _ALIKE_VALUES = {"delay": 0.5, "time step": 0.0}
-"""Largest difference between the values that two halves of the recordings choose: steps, or ratios of time steps."""
-_AGREE = 0.8
-"""Smallest share of the recordings in which the error falls."""
-_MOST = 8000
-"""Largest number of recorded steps that are used."""
-_ALIKE = 1e-9
-"""Errors below this share of the change are rounding: nothing is suggested then."""
+_MOST = 8000  # largest number of recorded steps that are used
 
 
 @dataclass(frozen=True)
@@ -184,10 +178,11 @@ def _chosen(kind: str, errors: Mapping[float, Array], groups: Rows, usual: float
     base = table[values.index(usual)]
     halves = [np.arange(len(known)) % 2 == k for k in (0, 1)]
     picked = [values[int(np.argmin(table[:, half].sum(axis=1)))] for half in halves]
-    if abs(picked[0] - picked[1]) > _ALIKE_VALUES[kind] or usual in picked or base.mean() < _ALIKE**2:
+    # Smaller errors are rounding.
+    if abs(picked[0] - picked[1]) > _ALIKE_VALUES[kind] or usual in picked or base.mean() < 1e-9**2:
         return None
     row = int(np.argmin(table.sum(axis=1)))
     ratio, agreeing = float(np.sqrt(table[row].sum() / base.sum())), float((table[row] < base).mean())
-    if ratio > _CLEAR[kind] or agreeing < _AGREE:
+    if ratio > _CLEAR[kind] or agreeing < 0.8:  # in most recordings
         return None
     return values[row], ratio, agreeing

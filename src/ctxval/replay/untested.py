@@ -17,20 +17,7 @@ from ctxval.learning import DynamicsStudy, LearnedDynamics
 from ctxval.learning.closed_loops import loop_pairs
 from ctxval.learning.worst_case import WorstCase
 
-_WORST = 5
-"""Number of tasks with large predicted distances that are listed."""
-_RANDOM = 96
-"""Number of random tasks among those from which executions are chosen."""
-_CANDIDATES = 192
-"""Largest number of these tasks."""
-_PAIRS = 700
-"""Number of state-input pairs from which the pivots of the draws are chosen."""
-_SAME = 0.02
-"""Least distance of two listed tasks, as a share of the cube's diagonal."""
-_ELSEWHERE = 0.01
-"""Weight of all tasks together, against that of the likely worst ones."""
-_DIVERGED = 10.0
-"""A draw that diverges counts as this many times the 0.95 quantile of the finite distances."""
+_ELSEWHERE = 0.01  # weight of all tasks together, against that of the likely worst ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,12 +87,13 @@ def predicted_tasks(
     if not len(points):
         return None
     order = np.argsort(-np.median(drawn, axis=0), kind="stable")
-    apart = order[separated_rows(points[order], _SAME * np.sqrt(points.shape[1]), len(points))]
+    # A share of the diagonal of the cube.
+    apart = order[separated_rows(points[order], 0.02 * np.sqrt(points.shape[1]), len(points))]
     points, drawn = points[apart], drawn[:, apart]
     chosen, resolved = _informative(drawn, executions)
     maxima = worst.maxima
     return PredictedTasks(
-        tuple(_task(validation, points[row], drawn[:, row]) for row in range(min(_WORST, len(points)))),
+        tuple(_task(validation, points[row], drawn[:, row]) for row in range(min(5, len(points)))),
         float(np.median(maxima)),
         float(np.quantile(maxima, 0.95, method="higher")),
         tuple(
@@ -121,22 +109,24 @@ def predicted_tasks(
 def _candidates(worst: WorstCase, study: DynamicsStudy, seed: int) -> Array:
     """Return tasks that may be worst, and random ones, points of the unit cube ``(T, d)``."""
     pool = study.search.pool
-    random = pool[np.random.default_rng([seed, 3]).permutation(len(pool))[:_RANDOM]]
+    random = pool[np.random.default_rng([seed, 3]).permutation(len(pool))[:96]]
     together = np.concatenate([worst.elites[:24], worst.points, random])
-    return np.unique(together.round(6), axis=0)[:: max(1, -(-len(together) // (2 * _CANDIDATES)))]
+    return np.unique(together.round(6), axis=0)[:: max(1, -(-len(together) // 384))]
 
 
 def _distances(learned: LearnedDynamics, points: Array, seed: int) -> Array:
     """Return the distances ``(S, T)`` of tasks on draws of the dynamics."""
     rng, planner = np.random.default_rng([seed, 4]), learned.study.planner
     pairs = loop_pairs(planner, learned.posterior, points)
-    draws = learned.posterior.draw(pairs[rng.permutation(len(pairs))[:_PAIRS]], rng)
+    # Pairs from which the pivots of the samples are chosen.
+    draws = learned.posterior.draw(pairs[rng.permutation(len(pairs))[:700]], rng)
     return planner.distances(draws, planner.plan(points), len(points))
 
 
 def _finite(drawn: Array) -> Array:
     known = drawn[np.isfinite(drawn)]
-    largest = _DIVERGED * float(np.quantile(known, 0.95)) if len(known) else 1.0
+    # A sample that diverges counts as a large distance.
+    largest = 10.0 * float(np.quantile(known, 0.95)) if len(known) else 1.0
     return np.minimum(drawn, max(largest, float(known.max(initial=0.0))))
 
 

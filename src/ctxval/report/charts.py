@@ -28,8 +28,6 @@ SMALL = {"width": 340, "height": 220}
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 12, 46
 _TICKS = 5
-_MOST_MARKS = 600
-"""More marks than this are drawn as dots, which have no names."""
 
 Kind = Literal[
     "mean", "model", "system", "corrected", "reference", "best", "threshold", "bound", "sample", "initial", "covering",
@@ -157,7 +155,7 @@ class Chart:
         """Add marks; their names appear if the pointer rests on them."""
         xs, ys = np.ravel(self.across(x)), np.ravel(self.up(y))
         self._named(kind, label, "mark")
-        if len(xs) > _MOST_MARKS:
+        if len(xs) > 600:  # dots have no names, and are smaller in the file
             dots = "".join(
                 f"M{left:.0f},{top:.0f}h0" for left, top in zip(xs, ys, strict=True) if np.isfinite(left + top)
             )

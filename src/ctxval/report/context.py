@@ -25,15 +25,6 @@ from ctxval.learning.replays import Replay, replay_executed
 from ctxval.report.distance_model import DistanceModel
 from ctxval.storage.store import Store
 
-MOST_REPLAYS = 120
-"""Largest number of trials that are replayed on the corrected model: those with the largest distances."""
-
-MOST_RECORDINGS = 400
-"""Largest number of trials whose trajectories are read: those with the largest distances."""
-
-_SLOW_REPLAYS = 40
-"""The same, if the synthesizer designs one controller at a time."""
-
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -165,7 +156,7 @@ class ReportContext:
         """The trajectories of the worst trials that have both, by number; those of another size are left out."""
         found: dict[int, Recording] = {}
         sizes: tuple[int, int] | None = None
-        for trial in self.worst_first[:MOST_RECORDINGS]:
+        for trial in self.worst_first[:400]:
             one = self._recording(trial)
             if one is None:
                 continue
@@ -237,7 +228,8 @@ class ReportContext:
         if self.validation is None or not self.recordings:
             return {}
         by_number = {trial.number: trial for trial in self.completed}
-        numbers = list(self.recordings)[: MOST_REPLAYS if self.batched else _SLOW_REPLAYS]
+        # Designs that cannot be made in a batch take long.
+        numbers = list(self.recordings)[: 120 if self.batched else 40]
         executed = [(by_number[number].unit_point, one.system) for number, one in self.recordings.items()]
         with stage("replaying executed tasks", len(numbers), "tasks"):
             found = replay_executed(self.validation, executed, [by_number[number].unit_point for number in numbers])

@@ -18,17 +18,12 @@ from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.findings import Finding, Light, Question, findings_of
 from ctxval.report.markup import number, percent, quantity
 
-_IMPROVED = 0.01
-"""Least increase of the largest distance that counts as an improvement, as a share of it."""
+_IMPROVED = 0.01  # least increase of the largest distance that counts as an improvement, as a share of it
 
-_QUIET = 1 / 3
-"""Share of the executions without an improvement after which a search is taken to have converged."""
+_LISTED = 10  # largest number of failed trials that are listed one by one
 
-_LISTED = 10
-"""Largest number of failed trials that are listed one by one."""
-
+# Range of the root mean square of standardised errors that is as expected, and the value above which it is not.
 _CALIBRATED, _ROUGH = (0.5, 1.5), 2.5
-"""Range of the root mean square of standardised errors that is as expected, and the value above which it is not."""
 
 
 def diagnostics(context: ReportContext) -> list[Finding]:
@@ -106,7 +101,7 @@ def _converged(context: ReportContext) -> Finding | None:
     so_far = np.maximum.accumulate(distances)
     last = int(np.argmax(so_far >= (1 - _IMPROVED) * so_far[-1]))
     quiet = len(distances) - 1 - last
-    good = quiet >= max(3.0, _QUIET * len(distances))
+    good = quiet >= max(3.0, len(distances) / 3)
     text = (
         f"The largest distance was within {percent(_IMPROVED)} of its final value after {last + 1} of "
         f"{len(distances)} measured executions; {quiet} followed without an improvement."

@@ -13,18 +13,8 @@ from ctxval.core.trial import Trial
 from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.surrogate import Learned, learn
 
-NORMAL_95 = 1.96
-"""Number of standard deviations of a band of 95 %."""
-
-_TASKS = 4096
-"""Number of random tasks from which shares of the task space are estimated."""
-
-_SOBOL = 256
-"""Number of base points of the sensitivity indices, a power of two; d + 2 times as many tasks are predicted."""
-
-
+# Largest number of distances that the Gaussian process is conditioned on: half of them are the largest ones.
 _MOST = 500
-"""Largest number of distances that the Gaussian process is conditioned on: half of them are the largest ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +79,7 @@ class DistanceModel:
     @functools.cached_property
     def tasks(self) -> Array:
         """Random tasks, points of the unit cube ``(m, d)``."""
-        return np.random.default_rng(0).random((_TASKS, self.points.shape[1]))
+        return np.random.default_rng(0).random((4096, self.points.shape[1]))
 
     @functools.cached_property
     def over_tasks(self) -> Band:
@@ -108,7 +98,8 @@ class DistanceModel:
         from scipy.stats import sobol_indices, uniform  # imported here, because it is slow to load
 
         with np.errstate(all="ignore"):
-            found = sobol_indices(func=lambda x: self.predict(x.T).median[None], n=_SOBOL, dists=[uniform()] * d, rng=0)
+            # A power of two; d + 2 times as many tasks are predicted.
+            found = sobol_indices(func=lambda x: self.predict(x.T).median[None], n=256, dists=[uniform()] * d, rng=0)
         return np.asarray(np.clip(np.nan_to_num(np.ravel(found.total_order)), 0.0, 1.0))
 
     def _band(self, mean: Array, variance: Array) -> Band:
@@ -117,7 +108,7 @@ class DistanceModel:
                 values = self.learned.warp.backward(self.learned.shift + self.learned.scale * standardised)
             return np.maximum(values, 0.0)
 
-        half = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
+        half = 1.96 * np.sqrt(np.maximum(variance, 0.0))  # a band of 95 %
         return Band(on_own_scale(mean), on_own_scale(mean - half), on_own_scale(mean + half))
 
 

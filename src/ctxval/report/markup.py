@@ -14,19 +14,13 @@ from markupsafe import Markup, escape
 from ctxval._util.representation import shown
 from ctxval._util.texts import plain, shortened, visible
 
-LONGEST = 2_000
-"""Characters of one text."""
-
 UNCUT = 100_000
 """Characters of one text that must never be shortened, such as an assumption."""
-
-_CELL = 300
-"""Characters of a cell of a table."""
 
 _VOID = ("br", "meta", "link", "input")
 
 
-def text(value: object, longest: int = LONGEST) -> Markup:
+def text(value: object, longest: int = 2_000) -> Markup:
     """Return a text that cannot be markup; :class:`Markup` and charts stay as they are."""
     if hasattr(value, "__html__"):
         return Markup(value.__html__())
@@ -111,7 +105,7 @@ def cell(value: object) -> Markup:
         return Markup("&ndash;")
     if hasattr(value, "__html__"):
         return Markup(value.__html__())
-    return text(value if isinstance(value, str) else number(value), _CELL)
+    return text(value if isinstance(value, str) else number(value), 300)
 
 
 def bar(share: float) -> Markup:

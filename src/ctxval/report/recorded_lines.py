@@ -15,11 +15,7 @@ from ctxval.report.context import Recording, ReportContext
 MOST_CHARACTERS = 850_000
 """Largest number of characters of all lines together; a report stays below 1.5 MB."""
 
-_POINTS = (200, 120, 70)
-"""Numbers of points of a line that are tried, until the lines of all trials fit."""
-
-_LEVELS = 65_535
-"""Number of steps of a value between the smallest and the largest one of its line."""
+_POINTS = (200, 120, 70)  # numbers of points of a line that are tried, until the lines of all trials fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +117,7 @@ def _columns(values: Array) -> list[dict[str, Any]]:
 def packed(values: Array) -> dict[str, Any]:
     """Return numbers ``(k,)`` as their smallest value, a step, and multiples of the step in 16 bits each as base64."""
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
-    step = (high - low) / _LEVELS
+    step = (high - low) / 65_535  # 16 bits
     if not (np.isfinite(step) and step > 0):
         return {"low": _finite(low), "step": 0.0, "n": len(values)}
     levels = np.rint((values - low) / step).astype("<u2")

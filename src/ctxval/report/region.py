@@ -11,11 +11,7 @@ from ctxval.report.charts import Axis, Chart, colour_scale
 from ctxval.report.context import ReportContext
 from ctxval.report.markup import element, joined, number, paragraph, percent
 
-_SIDE = 31
-"""Number of predicted tasks on each side of a map, and a third of those of a curve."""
-
-_DRAWN = 400
-"""Number of random tasks that are predicted if there are more than two parameters."""
+_SIDE = 31  # number of predicted tasks on each side of a map, and a third of those of a curve
 
 
 def region_map(context: ReportContext) -> Markup | None:
@@ -40,7 +36,7 @@ def _tasks(dimension: int) -> Array:
     if dimension == 2:
         side = np.linspace(0, 1, _SIDE)
         return np.stack(np.meshgrid(side, side, indexing="xy"), axis=-1).reshape(-1, 2)
-    return np.random.default_rng(0).random((_DRAWN, dimension))
+    return np.random.default_rng(0).random((400, dimension))
 
 
 def _said(certificate: Certificate, margin: float, tau: float, bounds: Array) -> Markup:

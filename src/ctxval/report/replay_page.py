@@ -18,11 +18,9 @@ from ctxval.report.page import Rendered, SectionOf, framed, now, rendered_sectio
 
 __all__ = ["replay_page", "write_replay_page"]
 
-_LISTED = 20
-"""Largest number of sources and of splits that are listed."""
+_LISTED = 20  # largest number of sources and of splits that are listed
 
-_CHARTED = 12
-"""Largest number of states and inputs with charts of their own."""
+_CHARTED = 12  # largest number of states and inputs with charts of their own
 
 
 class _Section:

@@ -30,10 +30,8 @@ from ctxval.reproduce.study import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_RANDOM = 500
-"""Executions of the passive searches."""
-_ACTIVE = 60
-"""Executions of the active searches."""
+_RANDOM = 500  # executions of the passive searches
+_ACTIVE = 60  # executions of the active searches
 _PERCENTS = (20.0, 15.0, 10.0, 5.0, 2.0, 1.0)
 _SHOWN = 0
 

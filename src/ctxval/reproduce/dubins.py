@@ -26,14 +26,11 @@ from ctxval.reproduce.study import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_RANDOM = 500
-"""Executions of the passive searches."""
-_ACTIVE = 100
-"""Executions of the active searches."""
-_TASKS = 200
-"""Random tasks that are simulated for Aspect 1."""
+_RANDOM = 500  # executions of the passive searches
+_ACTIVE = 100  # executions of the active searches
+_TASKS = 200  # random tasks that are simulated for Aspect 1
+# Ratio of the root mean square to the formula as printed, which divides by H instead of its root.
 _SQUARE = np.sqrt(dubins.Settings().horizon)
-"""Ratio of the root mean square to the formula as printed, which divides by H instead of its root."""
 
 
 class DubinsMedians:

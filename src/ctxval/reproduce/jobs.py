@@ -32,14 +32,11 @@ Result = dict[str, Any]
 DISCARDED = 5
 """The paper's k in sampling and discarding."""
 
-_KNOWN = 101
-"""Number of tasks whose distance to another trial's model a prior is made from."""
+_KNOWN = 101  # number of tasks whose distance to another trial's model a prior is made from
 
-_FACTOR = 1.5
-"""Largest ratio of a length-scale to that of another trial, in both directions."""
+_FACTOR = 1.5  # largest ratio of a length-scale to that of another trial, in both directions
 
-_DIGITS = 10
-"""Number of significant digits in stored results: more than any figure shows, at half the size."""
+_DIGITS = 10  # number of significant digits in stored results: more than any figure shows, at half the size
 
 
 @dataclass(frozen=True)

@@ -24,15 +24,6 @@ from ctxval.distances import FinalState, WholeTrajectory
 from ctxval.distances.base import require_indices
 from ctxval.errors import InputError, ModelError
 
-_ROLLOUTS = 4096
-"""Number of rollouts in one batch, large enough to be fast and small enough for memory."""
-
-_PARTIAL = 0.5 ** np.arange(1, 7)
-"""Fractions of the way by which the whole sequence is moved, in case whole moves of single entries are too far."""
-
-_NEGLIGIBLE = 1e-10
-"""Smallest relative increase that counts as an improvement."""
-
 
 @dataclass(frozen=True, eq=False)
 class OpenLoopWorst:
@@ -227,8 +218,8 @@ def _dual(vectors: Array, order: float) -> Array:
 
 # Maximisation
 
+# A proposal returns a target for each entry of the inputs, and the gain of the objective by that entry alone.
 _Proposal = Callable[[_Pair, Array, _Objective, Rows], tuple[Array, Array]]
-"""A proposal returns a target for each entry of the inputs, and the gain of the objective by that entry alone."""
 
 
 def _first_inputs(pair: _Pair, restarts: int, seed: int) -> Array:
@@ -253,7 +244,7 @@ def _ascend(pair: _Pair, U: Array, objective: _Objective, proposal: _Proposal, i
         candidates = _moves(U[rows], *proposal(pair, U[rows], objective, rows))
         reached = objective.value(pair.gap(candidates), rows)
         best, columns = reached.argmax(axis=0), np.arange(len(rows))
-        improved = reached[best, columns] > values[rows] + _NEGLIGIBLE * np.abs(values[rows])
+        improved = reached[best, columns] > values[rows] + 1e-10 * np.abs(values[rows])
         best, columns, rows = best[improved], columns[improved], rows[improved]
         U[rows], values[rows] = candidates[best, columns], reached[best, columns]
     return U
@@ -269,7 +260,7 @@ def _moves(U: Array, targets: Array, gains: Array) -> Array:
     rank = np.argsort(order, axis=1).reshape(U.shape)
     counts = [*(2**j for j in range(size.bit_length()) if 2**j < size), size]
     whole = [np.where(rank < count, targets, U) for count in counts]
-    return np.stack([*whole, *(U + share * (targets - U) for share in _PARTIAL)])
+    return np.stack([*whole, *(U + share * (targets - U) for share in 0.5 ** np.arange(1, 7))])
 
 
 def _by_gradient(pair: _Pair, U: Array, objective: _Objective, rows: Rows) -> tuple[Array, Array]:
@@ -282,7 +273,7 @@ def _by_gradient(pair: _Pair, U: Array, objective: _Objective, rows: Rows) -> tu
 def _by_trial(pair: _Pair, U: Array, objective: _Objective, rows: Rows) -> tuple[Array, Array]:
     """Propose the opposite bound, with the true gain of each single switch."""
     targets = -np.copysign(pair.bound, U)
-    step = max(1, _ROLLOUTS // U[0].size)
+    step = max(1, 4096 // U[0].size)  # rollouts in one batch
     gains = [
         _trial_gains(pair, U[i : i + step], targets[i : i + step], objective, rows[i : i + step])
         for i in range(0, len(U), step)

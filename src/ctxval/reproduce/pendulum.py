@@ -37,10 +37,8 @@ SHOWN = 0
 """The seed of figures that show a single trial."""
 
 _BUDGET = 100
-_COMMON = 5
-"""Number of common first samples."""
-_NEAR = 2.5
-"""Per cent of d*: the paper says of SC that it is so near after 60 samples."""
+_COMMON = 5  # number of common first samples
+_NEAR = 2.5  # per cent of d*: the paper says of SC that it is so near after 60 samples
 
 
 class Frameworks:
@@ -101,8 +99,7 @@ class Frameworks:
         ]
 
 
-_Profiles = list[tuple[Array, Array]]
-"""Goals and distances of each trial."""
+_Profiles = list[tuple[Array, Array]]  # goals and distances of each trial
 
 
 def _worst_goal(paper: str, profiles: _Profiles) -> Claim:

@@ -12,8 +12,8 @@ from ctxval.report.diagnostics import diagnostics, not_tested
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.markup import UNCUT, bullets, details, element, heading, joined, paragraph, table, text
 
+# A shape for each light, because colours alone tell nothing in grey print.
 _SHAPES = {"good": "\u25cf", "note": "\u25c6", "attention": "\u25b2", "bad": "\u25a0", "unknown": "\u25cb"}
-"""A shape for each light, because colours alone tell nothing in grey print."""
 
 
 class BasisSection:

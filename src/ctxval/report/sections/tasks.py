@@ -18,14 +18,7 @@ from ctxval.report.markup import bar, element, heading, joined, number, paragrap
 from ctxval.report.parallel import parallel_coordinates
 from ctxval.report.region import region_map
 
-_CURVE, _GRID = 121, 32
-"""Number of points of a curve, and of each side of a map."""
-
-_SLOW_CURVE = 31
-"""Number of points of a curve, if each needs the design of a controller that cannot be made in a batch."""
-
-_SLICES = 12
-"""Largest number of slices: of the parameters to which the distance is most sensitive."""
+_CURVE, _GRID = 121, 32  # number of points of a curve, and of each side of a map
 
 _ORIGINS: tuple[tuple[Kind, str, tuple[str, ...]], ...] = (
     ("initial", "initial or chosen by a person", ("iid", "initial", "manual")),
@@ -63,7 +56,7 @@ def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:
     if d == 2:
         both = (_slice(context, axis) for axis in range(2))
         return joined([said, element("div", _map(context, model), *both, class_="charts")])
-    axes = [int(j) for j in np.argsort(-model.sensitivity, kind="stable")[:_SLICES]]
+    axes = [int(j) for j in np.argsort(-model.sensitivity, kind="stable")[:12]]
     if d > len(axes):
         said += paragraph(f"{d - len(axes)} parameters with less influence have no slice here.")
     slices = filter(None, (_slice(context, axis, small=True) for axis in axes))
@@ -94,7 +87,8 @@ def _estimated(context: ReportContext, unit: Array) -> Band | None:
 def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart | None:
     """Return the distance along one parameter, through the worst executed task; None if it cannot be estimated."""
     space, worst = context.space, context.worst_first[0]
-    count = _CURVE if context.batched or context.validation is None else _SLOW_CURVE
+    # Designs that cannot be made in a batch take long.
+    count = _CURVE if context.batched or context.validation is None else 31
     unit = np.tile(worst.unit_point, (count, 1))
     unit[:, axis] = np.linspace(0, 1, count)
     x, band = space.from_unit(unit)[:, axis], _estimated(context, unit)

@@ -17,18 +17,9 @@ from ctxval.report.context import Recording, ReportContext
 from ctxval.report.markup import cell, details, element, heading, joined, paragraph, quantity
 from ctxval.report.recorded_lines import RecordedLines, recorded_lines
 
-DATA = "trial-data"
-"""Identifier of the element with the trajectories."""
-
-_ROWS = 1000
-"""Largest number of trials in the table: those with the largest distances, and those without a distance."""
+_ROWS = 1000  # largest number of trials in the table: those with the largest distances, and those without a distance
 
 _WORST = 5
-_SIGNALS = 10
-"""Largest number of states and inputs that are drawn for each of the worst trials: those with the largest errors."""
-
-_POINTS = 90
-"""Number of points of a line of the worst trials."""
 
 
 class TrialsSection:
@@ -46,7 +37,7 @@ class TrialsSection:
                 _left_out(context, lines),
                 _table(context, lines),
                 element("div", id="trial", aria_live="polite", class_="needs-script"),
-                data_element(DATA, lines.data),
+                data_element("trial-data", lines.data),
                 _worst(context),
             ]
         )
@@ -142,7 +133,7 @@ def _signals(context: ReportContext, number_: int) -> list[Chart]:
     sizes = [
         float(np.abs(s - m).max(initial=0.0) / max(np.ptp(m), 1e-300)) for m, s in zip(of_model, of_system, strict=True)
     ]
-    chosen = sorted(np.argsort(sizes)[::-1][:_SIGNALS].tolist())
+    chosen = sorted(np.argsort(sizes)[::-1][:10].tolist())  # those with the largest errors
     drawn = []
     for j in chosen:
         lines = {"system": of_system[j], "model": of_model[j]}
@@ -173,5 +164,5 @@ def _signal(title: str, label: str, times: Array, lines: dict[str, Array], refer
 
 
 def _thin(chart: Chart, times: Array, values: Array, kind: Any, name: str) -> None:
-    rows = np.unique(np.linspace(0, len(values) - 1, min(_POINTS, len(values))).astype(int))
+    rows = np.unique(np.linspace(0, len(values) - 1, min(90, len(values))).astype(int))
     chart.line(times[: len(values)][rows], values[rows], kind, name)

@@ -20,14 +20,10 @@ from ctxval.report.sections.tasks import distance_over_task
 from ctxval.report.sections.trials import task_of
 from ctxval.storage.other_stores import other_stores
 
+# A shape for each verdict, because colours alone tell nothing in grey print.
 _SHAPES = {"validated": "\u2714", "falsified": "\u2718", "undecided": "?", "no verdict": "\u2013"}
-"""A shape for each verdict, because colours alone tell nothing in grey print."""
 
-_MORE = 10
-"""Number of further executions that are advised if none can be forecast."""
-
-_STORES = 5
-"""Largest number of other stores that are named."""
+_MORE = 10  # number of further executions that are advised if none can be forecast
 
 
 class VerdictSection:
@@ -148,7 +144,7 @@ def _remarks(context: ReportContext) -> list[Markup]:
     others = [] if context.store.path is None else other_stores(context.store.path)
     if others:
         count = counted(len(others), "other store")
-        names = [other.name for other in others[:_STORES]]
+        names = [other.name for other in others[:5]]
         sentence = f"The folder contains {count} of this experiment: {', '.join(names)}. The best result of several "
         said.append(paragraph(f"{sentence}campaigns is wrong more often than its confidence states.", class_="note"))
     return said
