@@ -10,14 +10,14 @@ from ctxval.reproduce.arm import ArmModels, ArmSamples
 from ctxval.reproduce.dubins import DubinsMedians
 from ctxval.reproduce.jobs import Job, Results
 from ctxval.reproduce.linear import LinearComplexity
-from ctxval.reproduce.pendulum import ConvergedGP, Frameworks, Techniques, Trajectories
+from ctxval.reproduce.pendulum import ConvergedGP, FourFrameworks, Techniques, Trajectories
 from ctxval.reproduce.study import FULL, QUICK, Scale, Study
-from ctxval.reproduce.table import write_table
+from ctxval.reproduce.table import table_text
 
 __all__ = ["FULL", "QUICK", "STUDIES", "Scale", "Study", "reproduce", "studies_named"]
 
 STUDIES: tuple[Study, ...] = (
-    Frameworks(),
+    FourFrameworks(),
     Trajectories(),
     Techniques(),
     ConvergedGP(),
@@ -81,4 +81,6 @@ def reproduce(
         study.draw(results, scale).savefig(out / f"{study.name}.png", dpi=150)
         study.data(results, scale).write(out / f"{study.name}.csv")
     complete = [study for study in STUDIES if all(job in results for job in study.jobs(scale))]
-    return write_table(out, complete, results, scale)
+    table = out.with_name(f"{out.name}.md")
+    table.write_text(table_text(out, complete, results, scale))
+    return table
