@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,7 @@ class Executions:
 
     def __post_init__(self) -> None:
         for candidate in self.candidates:
-            candidate.recorder.dynamics.elsewhere = _Elsewhere(self, candidate)
+            candidate.recorder.dynamics.elsewhere = partial(self.elsewhere, candidate)
 
     @property
     def count(self) -> int:
@@ -64,14 +65,13 @@ class Executions:
         Args:
             without: a task that is left out, a point of the unit cube ``(d,)``.
         """
-        found = [
-            (-1 if (note := TrialNote.of(trial)) is None else note.step, row, trial, trajectory)
+        executed = [
+            ((-1 if (note := TrialNote.of(trial)) is None else note.step, row, trial.number), trial, trajectory)
             for row, candidate in enumerate(self.candidates)
             for trial, trajectory in candidate.trajectories()
             if not is_shared(trial) and (without is None or not np.array_equal(trial.unit_point, without))
         ]
-        ordered = sorted(found, key=lambda one: (one[0], one[1], one[2].number))
-        return [(trial, trajectory) for _, _, trial, trajectory in ordered]
+        return [(trial, trajectory) for _, trial, trajectory in sorted(executed, key=lambda row: row[0])]
 
     def execute(self, candidate: Candidate, choice: Choice, note: TrialNote, *, predicts: bool) -> None:
         """Execute one task, and record the execution for the others."""
@@ -127,11 +127,10 @@ class Executions:
             return
         with other.campaign.store.sole_writer(), self.hiding(trial.unit_point):
             if known is None:
-                own = replace(
-                    self.note_for(other, trial, note), shared=(candidate.name, trial.number), decided=self.kept()
-                )
+                source = candidate.name, trial.number
+                copied = replace(self.note_for(other, trial, note), shared=source, decided=self.kept()).to_note()
                 choice = Choice(
-                    trial.unit_point, trial.origin, planned_draws=0, note=own.to_note(), parameters=trial.parameters
+                    trial.unit_point, trial.origin, planned_draws=0, note=copied, parameters=trial.parameters
                 )
                 with other.recorder.predicting(note.question == "worst"):
                     known = other.recorder.open(choice).trial
@@ -162,17 +161,6 @@ class Executions:
             and (other.name, trial.number) not in own
             and (self._hidden is None or not np.array_equal(trial.unit_point, self._hidden))
         ]
-
-
-@dataclass(frozen=True, eq=False)
-class _Elsewhere:
-    """The executions that teach the dynamics to a candidate although they are none of its trials."""
-
-    executions: Executions
-    candidate: Candidate
-
-    def __call__(self) -> Sequence[Trajectory]:
-        return self.executions.elsewhere(self.candidate)
 
 
 def agrees(plan: Plan, trajectory: Trajectory) -> bool:

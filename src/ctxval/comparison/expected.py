@@ -45,12 +45,6 @@ class MeanQuestion:
         """All candidates."""
         return self.executions.candidates
 
-    @property
-    def beta(self) -> float:
-        """The probability of an error for one pair."""
-        count = len(self.candidates)
-        return (1 - self.confidence) / (count * (count - 1) / 2)
-
     def point(self, draw: int) -> Array:
         """Return an independent draw from the distribution of tasks, a point of the unit cube ``(d,)``.
 
@@ -68,7 +62,9 @@ class MeanQuestion:
 
     def difference(self, a: Candidate, b: Candidate) -> MeanDifference:
         """Return the expected distance of a candidate minus that of another one."""
-        return mean_difference(self.differences(a, b), self.beta)
+        count = len(self.candidates)
+        error_of_pair = (1 - self.confidence) / (count * (count - 1) / 2)
+        return mean_difference(self.differences(a, b), error_of_pair)
 
     def differences(self, a: Candidate, b: Candidate) -> PairedDifferences:
         """Return the differences at the draws that both have, up to the first one without a usable distance."""
@@ -104,11 +100,8 @@ class MeanQuestion:
     @property
     def undecided(self) -> list[tuple[Candidate, Candidate]]:
         """The pairs that are not decided and can still be."""
-        return [
-            (a, b)
-            for a, b in combinations(self.candidates, 2)
-            if not self.difference(a, b).sign and self.lost(a, b) is None
-        ]  # fmt: skip
+        pairs = combinations(self.candidates, 2)
+        return [(a, b) for a, b in pairs if not self.difference(a, b).sign and self.lost(a, b) is None]
 
     def step(self, left: int) -> bool:
         """Execute the next draw with one candidate; return False if there is nothing to execute."""
@@ -131,13 +124,8 @@ class MeanQuestion:
     def _usual_cost(self, active: int) -> int:
         """Return the number of executions that the last draw took; that of all candidates if there was none."""
         last = self._next_draw()
-        own = [
-            note.shared is None
-            for one in self.candidates
-            for draw, (_, note) in self.draws_of(one).items()
-            if draw == last
-        ]
-        return min(active, sum(own) or active)
+        notes = [self.draws_of(candidate)[last][1] for candidate in self.candidates if last in self.draws_of(candidate)]
+        return min(active, sum(note.shared is None for note in notes) or active)
 
     def _next_draw(self) -> int:
         """Return the number of the last draw that was begun; 0 if there was none."""

@@ -76,12 +76,16 @@ class PairResult:
     variance_left: float | None = None
 
     @property
+    def larger(self) -> str:
+        """The name of the one with the larger value, if this is decided."""
+        return self.second if self.smaller == self.first else self.first
+
+    @property
     def answer(self) -> str:
         """The answer in a few words."""
         if self.smaller is None:
             return f"{self.first} or {self.second}: undecided"
-        other = self.second if self.smaller == self.first else self.first
-        return f"{self.smaller} has a smaller {WORDS[self.question]} than {other}"
+        return f"{self.smaller} has a smaller {WORDS[self.question]} than {self.larger}"
 
     def __repr__(self) -> str:
         return lines(call(self, self.question, self.first, self.second, smaller=self.smaller), line(self.reason))
@@ -135,7 +139,7 @@ class Comparison:
 
         A candidate stands in an earlier group than another one only if all pairs between the groups are decided.
         """
-        smaller = {(one.smaller, _other(one)) for one in self.pairs if one.question == question and one.smaller}
+        smaller = {(pair.smaller, pair.larger) for pair in self.pairs if pair.question == question and pair.smaller}
         wins = {one.name: sum(first == one.name for first, _ in smaller) for one in self.candidates}
         ordered = sorted((one.name for one in self.candidates), key=lambda name: -wins[name])
         groups: list[tuple[str, ...]] = []
@@ -187,7 +191,3 @@ class Comparison:
                 *(("assumes", assumption) for assumption in self.assumptions),
             ],
         )
-
-
-def _other(pair: PairResult) -> str:
-    return pair.second if pair.smaller == pair.first else pair.first

@@ -56,14 +56,8 @@ class WorstDecision:
     def of(cls, kept: Mapping[str, Any]) -> WorstDecision | None:
         """Return the decision that a trial's note has; None if it is none."""
         try:
-            return cls(
-                str(kept["smaller"]),
-                str(kept["larger"]),
-                float(kept["bound"]),
-                float(kept["distance"]),
-                str(kept["certificate"]),
-                int(kept["executions"]),
-            )
+            names, bounds = (str(kept["smaller"]), str(kept["larger"])), (float(kept["bound"]), float(kept["distance"]))
+            return cls(*names, *bounds, str(kept["certificate"]), int(kept["executions"]))
         except (KeyError, TypeError, ValueError):
             return None
 
@@ -121,9 +115,7 @@ class WorstQuestion:
     def undecided(self) -> list[tuple[Candidate, Candidate]]:
         """The pairs that are not decided, each in both orders."""
         known = {frozenset((one.smaller, one.larger)) for one in self.decisions}
-        return [
-            (a, b) for a, b in permutations(self.candidates, 2) if frozenset((a.name, b.name)) not in known
-        ]  # fmt: skip
+        return [(a, b) for a, b in permutations(self.candidates, 2) if frozenset((a.name, b.name)) not in known]
 
     def step(self) -> bool:
         """Execute the task that is expected to decide first; return False if all pairs are decided."""
@@ -174,26 +166,17 @@ class WorstQuestion:
 
     def _certified(self, better: Candidate) -> bool:
         """Keep all decisions by the certificate of a candidate; return whether there is a new one."""
-        above = [
-            other
-            for one, other in self.undecided
-            if one is better and other.largest > max(better.largest, 0.0)
-        ]  # fmt: skip
-        found = False
+        above = [other for one, other in self.undecided if one is better and other.largest > max(better.largest, 0.0)]
+        new = False
         for other in above:
             verdict = better.campaign.verdict(other.largest, certificate=self.options, progress=False)
             if verdict.answer == "validated" and verdict.certificate is not None:
-                certificate = verdict.certificate
-                self._decided[better.name, other.name] = WorstDecision(
-                    better.name,
-                    other.name,
-                    certificate.upper_bound + ERRORS * certificate.error,
-                    other.largest,
-                    certificate.kind,
-                    self.executions.count,
-                )
-                found = True
-        return found
+                names, certificate = (better.name, other.name), verdict.certificate
+                bound = certificate.upper_bound + ERRORS * certificate.error
+                executions = self.executions.count
+                self._decided[names] = WorstDecision(*names, bound, other.largest, certificate.kind, executions)
+                new = True
+        return new
 
     def _execute(self, candidate: Candidate, choice: Choice, predicted: float | None = None) -> None:
         note = TrialNote(self.executions.steps, "worst", predicted=predicted)
