@@ -103,7 +103,7 @@ def compare(
     made = _candidates(_named(candidates), stores, seed, named_values(option))
     race = Race(
         made,
-        question,
+        question,  # type: ignore[arg-type]  # the constructor refuses other words
         budget=budget,
         confidence=CONFIDENCE if confidence is None else confidence,
         seed=seed,

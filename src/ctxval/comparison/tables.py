@@ -21,7 +21,7 @@ PAIRS = ("question", "smaller", "than", "difference", "interval", "tasks")
 
 def candidate_rows(comparison: Comparison) -> list[tuple[str, ...]]:
     """Return a row for each candidate, as texts."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for known in comparison.candidates:
         bound = "-" if known.bound is None else _number(float(at_most(known.bound)))
         counts = str(known.executions), str(known.shared)
@@ -31,7 +31,7 @@ def candidate_rows(comparison: Comparison) -> list[tuple[str, ...]]:
 
 def pair_rows(comparison: Comparison) -> list[tuple[str, ...]]:
     """Return a row for each pair and question, as texts."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for pair in comparison.pairs:
         names = (f"{pair.first} ? {pair.second}", "undecided")
         if pair.smaller is not None:

@@ -17,9 +17,8 @@ from ctxval.errors import InputError, ModelError, UnknownNameError
 from ctxval.fitting.least_squares import FittedParameter, as_bounds, fit_parameters
 from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear
 from ctxval.models.parametric import ParametricStep
-from ctxval.replay.accuracy import StepError, step_errors
+from ctxval.replay.accuracy import RecordedSteps, StepError, step_errors
 from ctxval.replay.report import plain_numbers
-from ctxval.replay.steps import RecordedSteps
 
 Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
 KINDS: tuple[Kind, ...] = get_args(Kind)[:4]

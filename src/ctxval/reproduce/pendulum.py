@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -317,7 +317,7 @@ class ConvergedGP(Study):
         axes.fill_between(goals, low, high, color=GREY, alpha=0.5, linewidth=0, label="95 % band of the GP")
         axes.plot(goals, mean, color=BLUE, linewidth=1.8, label="GP mean")
         axes.plot(goals, truth, color="#D55E00", linestyle="--", linewidth=1.6, label="true distance")
-        marks = {"marker": "o", "linestyle": "", "markeredgecolor": BLACK, "markersize": 5}
+        marks: dict[str, Any] = {"marker": "o", "linestyle": "", "markeredgecolor": BLACK, "markersize": 5}
         axes.plot(x[:5], y[:5], **marks, color="white", label="first samples")
         axes.plot(x[5:], y[5:], **marks, color=BLACK, label="acquired samples")
         best = y.argmax()
