@@ -17,9 +17,6 @@ from ctxval.errors import InputError, ShapeError, UnknownNameError
 
 SignalKind = Literal["random", "multisine", "chirp"]
 
-_HELD = 4  # number of steps for which a random value is held
-_FASTEST = 0.1  # highest frequency, in cycles per step
-
 
 def excitation(kind: SignalKind, horizon: int, amplitude: ArrayLike, rng: np.random.Generator) -> Array:
     """Return a signal for each input, shape ``(H, m)``, with magnitudes up to the amplitude.
@@ -43,28 +40,24 @@ def excitation(kind: SignalKind, horizon: int, amplitude: ArrayLike, rng: np.ran
     sizes = np.atleast_1d(as_finite("amplitude", amplitude))
     if sizes.ndim != 1 or (sizes < 0).any() or not sizes.any():
         raise InputError(f"amplitude must be numbers >= 0, not all of them 0, got {np.asarray(amplitude).tolist()}.")
-    makers = {"random": _random, "multisine": _multisine, "chirp": _chirp}
-    return np.stack([size * makers[kind](horizon, rng) for size in sizes], axis=-1)
+    return np.stack([size * _signal(kind, horizon, rng) for size in sizes], axis=-1)
 
 
-def _random(horizon: int, rng: np.random.Generator) -> Array:
-    return np.asarray(np.repeat(rng.uniform(-1, 1, -(-horizon // _HELD)), _HELD)[:horizon])
-
-
-def _multisine(horizon: int, rng: np.random.Generator) -> Array:
-    cycles = np.unique(np.linspace(1, max(1, _FASTEST * horizon), 12).round())
+def _signal(kind: SignalKind, horizon: int, rng: np.random.Generator) -> Array:
+    fastest = 0.1  # cycles per step
+    if kind == "random":
+        return np.asarray(np.repeat(rng.uniform(-1, 1, -(-horizon // 4)), 4)[:horizon])
+    if kind == "chirp":
+        t = np.arange(horizon)
+        first = min(1 / horizon, fastest)
+        turns = first * t + 0.5 * (fastest - first) * t**2 / horizon
+        return np.asarray(np.sin(2 * np.pi * (turns + rng.uniform())))
+    cycles = np.unique(np.linspace(1, max(1, fastest * horizon), 12).round())
     t = np.arange(horizon)[:, None] / horizon
-    # Sets of random phases, of which that with the smallest peak is used.
+    # Of several sets of random phases, that with the smallest peak is used.
     waves = [np.sin(2 * np.pi * (cycles * t + rng.uniform(size=len(cycles)))).sum(axis=1) for _ in range(20)]
     best = min(waves, key=lambda wave: float(np.abs(wave).max()))
     return np.asarray(best / max(float(np.abs(best).max()), 1e-12))
-
-
-def _chirp(horizon: int, rng: np.random.Generator) -> Array:
-    t = np.arange(horizon)
-    first = min(1 / horizon, _FASTEST)
-    turns = first * t + 0.5 * (_FASTEST - first) * t**2 / horizon
-    return np.asarray(np.sin(2 * np.pi * (turns + rng.uniform())))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,10 +114,10 @@ class Excitation:
             raise ShapeError(f"amplitude must be one number for each of {m} inputs, got {sizes.tolist()}.")
         self.amplitude: Array = np.broadcast_to(sizes, (m,))
         excitation(kind, 2, self.amplitude, np.random.default_rng(0))
-        own = getattr(plan.controller, "limits", None) if limits is None else limits
-        if own is None:
+        limits = getattr(plan.controller, "limits", None) if limits is None else limits
+        if limits is None:
             raise InputError("the controllers have no limits: give the limits within which the inputs must stay.")
-        self.limits = Limits.of(own, m)
+        self.limits = Limits.of(limits, m)
 
     def plan(self, number: int) -> Plan:
         """Return the plan of a run: a random task."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -66,7 +66,7 @@ def fit_parameters(
     """
     low, high = as_bounds(bounds)
     every = max(1, -(-len(data) // 4000))
-    some = Transitions(data.x[::every], data.u[::every], data.x_next[::every])
+    some = data[::every]
     if some.x.size <= len(low):
         raise InputError(f"{len(low)} parameters need more than {some.x.size} recorded numbers.")
     problem = _Problem(step, list(bounds), some, vectorized)
@@ -75,11 +75,11 @@ def fit_parameters(
         theta = _best(problem, low, high, sizes, seed)
         left = problem.errors(theta)
         sizes = np.maximum(np.sqrt((left**2).mean(axis=0)), 1e-9 * sizes)
-        found = least_squares(
+        best = least_squares(
             lambda p: (problem.errors(p) / sizes).ravel(), theta, bounds=(low, high), x_scale=high - low
         )
-    intervals = _intervals(list(bounds), found.x, found.jac, found.fun, (low, high), confidence)
-    return Parametric(step, dict(zip(bounds, found.x, strict=True)), vectorized=vectorized, data=data), intervals
+    intervals = _intervals(list(bounds), best.x, best.jac, best.fun, (low, high), confidence)
+    return Parametric(step, dict(zip(bounds, best.x, strict=True)), vectorized=vectorized, data=data), intervals
 
 
 def as_bounds(bounds: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
@@ -123,17 +123,12 @@ def _best(problem: _Problem, low: Array, high: Array, sizes: Array, seed: int) -
     """Return the parameters of least squared errors from several starting points."""
     rng = np.random.default_rng(seed)
     starts = np.concatenate([[0.5 * (low + high)], rng.uniform(low, high, (7, len(low)))])
-    few = max(1, len(problem.data) // 400)
-    data = problem.data
-    small = _Problem(
-        *(problem.step, problem.names, Transitions(data.x[::few], data.u[::few], data.x_next[::few])),
-        problem.vectorized,
-    )
-    found = [
+    small = replace(problem, data=problem.data[:: max(1, len(problem.data) // 400)])
+    results = [
         least_squares(lambda p: (small.errors(p) / sizes).ravel(), start, bounds=(low, high), x_scale=high - low)
         for start in starts
     ]
-    return np.asarray(min(found, key=lambda one: one.cost).x)
+    return np.asarray(min(results, key=lambda result: result.cost).x)
 
 
 def _intervals(
@@ -150,20 +145,14 @@ def _intervals(
     with np.errstate(all="ignore"):
         deviations = width * np.sqrt(variance * ((V / singular[:, None]) ** 2).sum(axis=0))
     reach = np.where(undetermined, np.inf, deviations * stdtrit(degrees, 0.5 + confidence / 2))
-    found = []
+    parameters = []
     for i, name in enumerate(names):
-        at = [
-            end for end, value in (("lower", bounds[0][i]), ("upper", bounds[1][i])) if _near(theta[i], value, width[i])
-        ]
+        ends = zip(("lower", "upper"), bounds, strict=True)
+        near = [end for end, bound in ends if abs(theta[i] - bound[i]) <= 1e-4 * width[i]]
         others = [names[j] for j in np.flatnonzero(undetermined).tolist() if j != i]
-        note = f"at its {at[0]} bound" if at else ""
+        note = f"at its {near[0]} bound" if near else ""
         if undetermined[i]:
             note = f"not determined together with {', '.join(others)}" if others else "not determined"
-        found.append(
-            FittedParameter(name, float(theta[i]), float(theta[i] - reach[i]), float(theta[i] + reach[i]), note)
-        )
-    return tuple(found)
-
-
-def _near(value: float, bound: float, width: float) -> bool:
-    return bool(abs(value - bound) <= 1e-4 * width)
+        interval = float(theta[i] - reach[i]), float(theta[i] + reach[i])
+        parameters.append(FittedParameter(name, float(theta[i]), *interval, note))
+    return tuple(parameters)
