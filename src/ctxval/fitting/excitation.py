@@ -48,9 +48,9 @@ def _signal(kind: SignalKind, horizon: int, rng: np.random.Generator) -> Array:
     if kind == "random":
         return np.asarray(np.repeat(rng.uniform(-1, 1, -(-horizon // 4)), 4)[:horizon])
     if kind == "chirp":
-        t = np.arange(horizon)
+        steps = np.arange(horizon)
         first = min(1 / horizon, fastest)
-        turns = first * t + 0.5 * (fastest - first) * t**2 / horizon
+        turns = first * steps + 0.5 * (fastest - first) * steps**2 / horizon
         return np.asarray(np.sin(2 * np.pi * (turns + rng.uniform())))
     cycles = np.unique(np.linspace(1, max(1, fastest * horizon), 12).round())
     t = np.arange(horizon)[:, None] / horizon

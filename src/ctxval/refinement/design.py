@@ -95,21 +95,15 @@ def _typical_cost(validation: Validation) -> float:
     try:
         with single_threaded():
             loops = closed_loops_on_model(validation)
-            if loops is None or loops.states.ndim == 2:
-                return _cost_one_by_one(validation)
-            space = validation.space
-            points = space.from_unit(np.random.default_rng(0).random((len(loops.states), space.dimension)))
+            space, rng = validation.space, np.random.default_rng(0)
+            if loops is None or loops.states.ndim == 2:  # designs cannot be made in a batch
+                plans = [validation.plan(point) for point in space.from_unit(rng.random((8, space.dimension)))]
+                return float(np.median([_cost(validation, plan.task, plan.model_trajectory) for plan in plans]))
+            points = space.from_unit(rng.random((len(loops.states), space.dimension)))
             costs = _cost(validation, validation.task(space.parameters(points)), loops)
             return float(np.median(costs)) if np.isfinite(costs).all() else np.inf
     except Exception:  # users' tasks, synthesizers and costs may raise anything, on tasks that may never be executed
         return np.inf
-
-
-def _cost_one_by_one(validation: Validation) -> float:
-    space = validation.space
-    points = space.from_unit(np.random.default_rng(0).random((8, space.dimension)))
-    plans = [validation.plan(point) for point in points]
-    return float(np.median([_cost(validation, plan.task, plan.model_trajectory) for plan in plans]))
 
 
 def _cost(validation: Validation, task: Task, loops: Trajectory) -> Array:
@@ -124,16 +118,15 @@ def _cost(validation: Validation, task: Task, loops: Trajectory) -> Array:
 
 def same_controllers(validation: Validation, executed: Sequence[tuple[Trial, Trajectory]]) -> SameControllers:
     """Return on how many executed tasks the controllers of a refined model are those that were executed."""
-    some = executed[-32:]
-    distances = [one for one in (_known_distance(validation, *pair) for pair in some) if one is not None]
-    return SameControllers(len(some), len(distances), max(distances, default=None))
-
-
-def _known_distance(validation: Validation, trial: Trial, recorded: Trajectory) -> float | None:
-    """Return the distance of a refined model on an executed task; None if its controller has changed."""
-    try:
-        plan = validation.plan(validation.space.from_unit(trial.unit_point))
-        # A share of the largest magnitude of each input.
-        return validation.accept(plan, recorded).distance if gives_inputs(plan, recorded, 1e-6) else None
-    except Exception:  # users' tasks, synthesizers and distances may raise anything: what cannot be compared differs
-        return None
+    distances = []
+    for trial, recorded in executed[-32:]:
+        try:
+            plan = validation.plan(validation.space.from_unit(trial.unit_point))
+            if gives_inputs(plan, recorded, 1e-6):  # a share of the largest magnitude of each input
+                distances.append(validation.accept(plan, recorded).distance)
+        except (
+            Exception
+        ):  # users' tasks, synthesizers and distances may raise anything: what cannot be compared differs
+            continue
+    known = [distance for distance in distances if distance is not None]
+    return SameControllers(len(executed[-32:]), len(known), max(known, default=None))

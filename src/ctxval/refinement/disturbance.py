@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import Shown, call
 from ctxval._util.texts import aligned
-from ctxval.refinement.held_out import HeldOut
+from ctxval.refinement.records import HeldOut
 
 QUANTILE = 0.95
 """The share of the held-out transitions whose residual is at most the stated quantile."""
@@ -60,8 +59,10 @@ class MeasuredResidual:
         """The table as plain text."""
         units = [f"{name} [{unit}]" if unit else name for name, unit in self.states.items()]
         head = ["region", "steps", *(f"{unit}: 95 %" for unit in units), *(f"{unit}: largest" for unit in units)]
-        rows = [head, *(self._row(one, self._where(one)) for one in self.regions)]
-        rows.append(self._row(self.whole, "all records"))
+        rows = [head]
+        for region, where in [*((region, self._where(region)) for region in self.regions), (self.whole, "all records")]:
+            sizes = (*region.quantile.tolist(), *region.largest.tolist())
+            rows.append([where, str(region.steps), *(f"{value:.3g}" for value in sizes)])
         return aligned(rows, right=True)
 
     @property
@@ -74,12 +75,10 @@ class MeasuredResidual:
         ]
         return ", ".join(parts)
 
-    def _row(self, one: ResidualRegion, where: str) -> list[str]:
-        return [where, str(one.steps), *(f"{value:.3g}" for value in (*one.quantile.tolist(), *one.largest.tolist()))]
-
-    def _where(self, one: ResidualRegion) -> str:
+    def _where(self, region: ResidualRegion) -> str:
         parts = []
-        for name, low, high in zip((*self.states, *self.inputs), one.low.tolist(), one.high.tolist(), strict=True):
+        ends = zip((*self.states, *self.inputs), region.low.tolist(), region.high.tolist(), strict=True)
+        for name, low, high in ends:
             if np.isfinite(low) and np.isfinite(high):
                 parts.append(f"{low:.3g} < {name} <= {high:.3g}")
             elif np.isfinite(low):
@@ -95,7 +94,7 @@ class MeasuredResidual:
         def plain(one: ResidualRegion) -> dict[str, Any]:
             ends = zip(names, one.low.tolist(), one.high.tolist(), strict=True)
             return {
-                "range": {name: [_finite(low), _finite(high)] for name, low, high in ends},
+                "range": {name: [end if np.isfinite(end) else None for end in pair] for name, *pair in ends},
                 "steps": one.steps,
                 "quantile": dict(zip(self.states, one.quantile.tolist(), strict=True)),
                 "largest": dict(zip(self.states, one.largest.tolist(), strict=True)),
@@ -131,7 +130,7 @@ def measure_residual(found: HeldOut, states: dict[str, str], inputs: dict[str, s
     regions = [_region(magnitude, *box) for box in boxes]
     inside = np.ones(len(magnitude), dtype=bool)
     whole = _region(magnitude, inside, found.pairs.min(axis=0), found.pairs.max(axis=0))
-    ordered = sorted(regions, key=lambda one: float((one.quantile / sizes).max()))
+    ordered = sorted(regions, key=lambda region: float((region.quantile / sizes).max()))
     return MeasuredResidual(states, inputs, whole, tuple(ordered))
 
 
@@ -161,30 +160,21 @@ def _split(pairs: Array, logs: Array) -> list[_Box]:
 def _best_split(pairs: Array, logs: Array, inside: Mask) -> tuple[float, int, float]:
     """Return the spread that the best split of a box explains, with its column and its place."""
     best = (0.0, 0, 0.0)
-    own = logs[inside]
-    total = float(((own - own.mean()) ** 2).sum())
+    chosen = logs[inside]
+    total = float(((chosen - chosen.mean()) ** 2).sum())
     for column in range(pairs.shape[1]):
         values = pairs[inside, column]
-        for place in _cuts(values):
+        # Rounded, so that they can be written down.
+        for place in (float(f"{cut:.3g}") for cut in np.quantile(values, (0.25, 0.5, 0.75))):
             below = values <= place
             # The 0.95 quantile of fewer would be their largest value.
             if min(int(below.sum()), int((~below).sum())) < 40:
                 continue
-            left = sum(float(((part - part.mean()) ** 2).sum()) for part in (own[below], own[~below]))
+            left = sum(float(((part - part.mean()) ** 2).sum()) for part in (chosen[below], chosen[~below]))
             best = max(best, (total - left, column, place))
     return best
 
 
-def _cuts(values: Array) -> Sequence[float]:
-    """Return places at which a coordinate may be split, rounded to three digits so that they can be written down."""
-    # Rounded, so that they can be written down.
-    return [float(f"{place:.3g}") for place in np.quantile(values, (0.25, 0.5, 0.75)).tolist()]
-
-
 def _region(magnitude: Array, inside: Mask, low: Array, high: Array) -> ResidualRegion:
-    own = magnitude[inside]
-    return ResidualRegion(low, high, len(own), np.quantile(own, QUANTILE, axis=0), own.max(axis=0))
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+    sizes = magnitude[inside]
+    return ResidualRegion(low, high, len(sizes), np.quantile(sizes, QUANTILE, axis=0), sizes.max(axis=0))

@@ -54,18 +54,17 @@ def write_refined(path: str | Path, found: Refinement, step: str | None = None) 
         "statement": found.statement,
         "residual": found.residual.to_dict(),
     }
+    remark = (
+        f"{MADE_BY}. Residual S(x, u) - M(x, u) of one step, measured on executions that the model was not learned "
+        f"from, and not guaranteed.\nMeasured for {found.residual.range_text}.\nA robust controller must assume at "
+        "least these disturbances."
+    )
     texts = {
         ".residual.json": json.dumps(describe(about, 12), indent=1, allow_nan=False) + "\n",
-        ".residual.txt": f"{found.residual.text}\n\n{_REMARK.format(range=found.residual.range_text)}\n",
+        ".residual.txt": f"{found.residual.text}\n\n{remark}\n",
     }
     for suffix, text in texts.items():
         beside = target.with_suffix(suffix)
         write_text(beside, text)
         written.append(str(beside))
     return written
-
-
-_REMARK = (
-    f"{MADE_BY}. Residual S(x, u) - M(x, u) of one step, measured on executions that the model was not learned from, "
-    "and not guaranteed.\nMeasured for {range}.\nA robust controller must assume at least these disturbances."
-)

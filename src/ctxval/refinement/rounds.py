@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -95,11 +95,7 @@ class Round:
             "bound": self.verdict.bound,
             "certificate": None if found is None else found.to_json(),
             "notes": list(self.notes),
-            "unchanged_controllers": {
-                "tasks": self.unchanged.tasks,
-                "same": self.unchanged.same,
-                "worst": self.unchanged.worst,
-            },
+            "unchanged_controllers": asdict(self.unchanged),
         }
 
     def __repr__(self) -> str:
@@ -158,21 +154,20 @@ class Refinement:
     @property
     def statement(self) -> str:
         """What the last verdict means: the executions that it counts, and its confidence after several rounds."""
-        own = self.last.executions
-        others = self.executions - own
-        said = (
-            f"The verdict on the model of round {self.last.number} counts {counted(own, 'execution')} under its own "
-            "controllers"
+        others = self.executions - self.last.executions
+        counts = (
+            f"The verdict on the model of round {self.last.number} counts "
+            f"{counted(self.last.executions, 'execution')} under its own controllers"
         )
         if others:
-            said += (
+            counts += (
                 f"; {counted(others, 'execution')} under controllers of other models taught the model, and "
                 f"{'proves' if others == 1 else 'prove'} nothing of it"
             )
         if self.answer != "validated" or not self.last.number:
-            return f"{said}."
+            return f"{counts}."
         return (
-            f"{said}. Its confidence is {self.last.confidence:.6g}: the k-th refined model may be validated wrongly "
+            f"{counts}. Its confidence is {self.last.confidence:.6g}: the k-th refined model may be validated wrongly "
             f"with probability {1 - self.confidence:.3g} / (k (k + 1)), so the whole sequence is wrong with "
             f"probability at most {1 - self.confidence:.3g}, however many models were tried. This holds for one "
             "refinement: if several refinements begin with the same stores or executions, the probability that any of "

@@ -131,8 +131,15 @@ def replay(
         logged = [run.trajectory for run in recordings.runs]
         tasks = predicted_tasks(validation, logged, executions=executions, seed=seed)
     data = RecordedData(
-        *(tuple(dict.fromkeys(run.source for run in recordings.runs)), len(recordings.runs), recordings.steps),
-        *(recordings.dt, recordings.states, recordings.inputs, recordings.breaks, recordings.notes, len(seen)),
+        sources=tuple(dict.fromkeys(run.source for run in recordings.runs)),
+        recordings=len(recordings.runs),
+        steps=recordings.steps,
+        dt=recordings.dt,
+        states=recordings.states,
+        inputs=recordings.inputs,
+        breaks=recordings.breaks,
+        notes=recordings.notes,
+        seen=len(seen),
     )
     sentences = [
         *_of_data(data),
