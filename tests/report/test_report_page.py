@@ -18,9 +18,9 @@ from rig_pages import HOSTILE, hostile_store, pendulum, plane
 from ctxval import Campaign, Trial, report
 from ctxval.certificates import CertificateOptions, Region
 from ctxval.errors import InputError
-from ctxval.report import ReportContext, context_of_campaign, context_of_store
+from ctxval.report import ReportContext, context_of_campaign, context_of_store, sections
 from ctxval.report.recorded_lines import packed, recorded_lines
-from ctxval.report.sections import appendix, base
+from ctxval.report.sections import appendix
 from ctxval.report.sections.repeat import command_of, identity, python_snippet
 
 POSTERIOR = CertificateOptions.posterior()
@@ -226,11 +226,11 @@ def test_what_is_no_section_is_refused(swing: ReportContext) -> None:
 
 
 def test_installed_packages_add_sections(swing: ReportContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("weather", "test_report_page:Sunny", base.GROUP)
-    monkeypatch.setattr(base, "entry_points", lambda group: [point])
+    point = EntryPoint("weather", "test_report_page:Sunny", sections.GROUP)
+    monkeypatch.setattr(sections, "entry_points", lambda group: [point])
     assert "sunshine" in report.page(swing)
-    broken = EntryPoint("broken", "no_such_module:Nothing", base.GROUP)
-    monkeypatch.setattr(base, "entry_points", lambda group: [broken])
+    broken = EntryPoint("broken", "no_such_module:Nothing", sections.GROUP)
+    monkeypatch.setattr(sections, "entry_points", lambda group: [broken])
     with pytest.raises(InputError, match="the section 'broken' cannot be loaded"):
         report.page(swing)
 

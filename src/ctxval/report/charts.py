@@ -31,7 +31,7 @@ _TICKS = 5
 
 Kind = Literal[
     "mean", "model", "system", "corrected", "reference", "best", "threshold", "bound", "sample", "initial", "covering",
-    "failed", "worst", "band", "weak", "identity",
+    "failed", "worst", "band", "weak", "rest", "identity", "axis",
 ]  # fmt: skip
 """What is drawn, which decides its colour, its line style and its mark."""
 
@@ -225,6 +225,7 @@ class Chart:
             viewBox=f"0 0 {self.width} {self.height}",
             role="img",
             class_="chart",
+            width=self.width,
         )
         names = legend(self._legend) if with_legend else None
         return element("figure", drawing, names, *below, element("figcaption", self.title))
