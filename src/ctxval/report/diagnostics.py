@@ -55,7 +55,11 @@ def _certificate(context: ReportContext) -> Finding | None:
         return Finding("Certificate", "bad", f"Refused: {verdict.reason}")
     if found.doubt is None:
         return None
-    numbers = {"kind": found.kind, "upper_bound": _finite(found.upper_bound), "confidence": found.confidence}
+    numbers = {
+        "kind": found.kind,
+        "upper_bound": found.upper_bound if np.isfinite(found.upper_bound) else None,
+        "confidence": found.confidence,
+    }
     return Finding("Certificate", "bad", f"Withdrawn: {found.doubt}.", numbers)
 
 
@@ -171,47 +175,32 @@ _QUESTIONS: tuple[tuple[str, Question], ...] = (
 
 def not_tested(context: ReportContext) -> list[str]:
     """Return what was not tested, one sentence each."""
-    said = []
+    sentences = []
     certificate = context.certificate
     if certificate is not None and certificate.volume:
         left_out = at_most(100 * certificate.volume, 3)
-        said.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
+        sentences.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
     if len(context.points):
-        said += _regions(context)
+        share, d = share_far_from_trials(context.points), context.space.dimension
+        if share:
+            sentences.append(
+                f"{percent(share)} of the task space is farther than {RESOLUTION:g} diagonals from every trial; there "
+                "the distance is inferred and not executed."
+            )
+        bare = len(bare_corners(context.points, RESOLUTION))
+        where = "ends of the range" if d == 1 else "corners of the task space"
+        if bare:
+            sentences.append(f"{bare} of the {2**d} {where} have no trial next to them.")
     for trial in context.failed[:_LISTED]:
-        where = ", ".join(
-            f"{label} = {number(value)}"
-            for label, value in zip(context.space.labels, context.coordinates([trial])[0], strict=True)
-        )
-        said.append(f"The distance at the task of trial {trial.number} ({where}), because it {_ended(trial)}.")
+        values = zip(context.space.labels, context.coordinates([trial])[0], strict=True)
+        where = ", ".join(f"{label} = {number(value)}" for label, value in values)
+        ended = "failed" if trial.state == "failed" else "could not be measured"
+        sentences.append(f"The distance at the task of trial {trial.number} ({where}), because it {ended}.")
     if len(context.failed) > _LISTED:
-        said.append(f"The distances of {len(context.failed) - _LISTED} more trials that failed or were not measured.")
-    said.append(
+        more = len(context.failed) - _LISTED
+        sentences.append(f"The distances of {more} more trials that failed or were not measured.")
+    sentences.append(
         "Tasks outside the task space, other controllers, and conditions that the recorded state does not hold, such "
         "as wear, temperature or payload."
     )
-    return said
-
-
-def _regions(context: ReportContext) -> list[str]:
-    said = []
-    share = share_far_from_trials(context.points)
-    if share:
-        said.append(
-            f"{percent(share)} of the task space is farther than {RESOLUTION:g} diagonals from every trial; there the "
-            "distance is inferred and not executed."
-        )
-    bare = len(bare_corners(context.points, RESOLUTION))
-    if bare:
-        d = context.space.dimension
-        where = "ends of the range" if d == 1 else "corners of the task space"
-        said.append(f"{bare} of the {2**d} {where} have no trial next to them.")
-    return said
-
-
-def _ended(trial: Trial) -> str:
-    return "failed" if trial.state == "failed" else "could not be measured"
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    return sentences

@@ -13,9 +13,6 @@ from ctxval.core.trial import Trial
 from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.surrogate import Learned, learn
 
-# Largest number of distances that the Gaussian process is conditioned on: half of them are the largest ones.
-_MOST = 500
-
 
 @dataclass(frozen=True, eq=False)
 class Band:
@@ -50,7 +47,12 @@ class DistanceModel:
     @classmethod
     def of(cls, trials: Sequence[Trial]) -> DistanceModel | None:
         """Return the model of completed trials; None if fewer than two distances are known, or none can be fitted."""
-        known = _some([trial for trial in trials if trial.distance is not None])
+        known = [trial for trial in trials if trial.distance is not None]
+        if len(known) > 500:  # those with the largest distances, and others evenly spread over their order
+            order = sorted(range(len(known)), key=lambda k: -(known[k].distance or 0.0))
+            rest = sorted(order[250:])
+            evenly = np.linspace(0, len(rest) - 1, 250).astype(int)
+            known = [known[k] for k in sorted({*order[:250], *(rest[j] for j in evenly.tolist())})]
         points = np.array([trial.unit_point for trial in known])
         values = np.array([trial.distance for trial in known], dtype=np.float64)
         if len(known) < 2:
@@ -99,8 +101,8 @@ class DistanceModel:
 
         with np.errstate(all="ignore"):
             # A power of two; d + 2 times as many tasks are predicted.
-            found = sobol_indices(func=lambda x: self.predict(x.T).median[None], n=256, dists=[uniform()] * d, rng=0)
-        return np.asarray(np.clip(np.nan_to_num(np.ravel(found.total_order)), 0.0, 1.0))
+            indices = sobol_indices(func=lambda x: self.predict(x.T).median[None], n=256, dists=[uniform()] * d, rng=0)
+        return np.asarray(np.clip(np.nan_to_num(np.ravel(indices.total_order)), 0.0, 1.0))
 
     def _band(self, mean: Array, variance: Array) -> Band:
         def on_own_scale(standardised: Array) -> Array:
@@ -110,13 +112,3 @@ class DistanceModel:
 
         half = 1.96 * np.sqrt(np.maximum(variance, 0.0))  # a band of 95 %
         return Band(on_own_scale(mean), on_own_scale(mean - half), on_own_scale(mean + half))
-
-
-def _some(trials: Sequence[Trial]) -> Sequence[Trial]:
-    """Return at most ``_MOST`` trials: those with the largest distances, and others evenly spread over their order."""
-    if len(trials) <= _MOST:
-        return trials
-    order = sorted(range(len(trials)), key=lambda k: -(trials[k].distance or 0.0))
-    rest = sorted(order[_MOST // 2 :])
-    evenly = np.linspace(0, len(rest) - 1, _MOST - _MOST // 2).astype(int)
-    return [trials[k] for k in sorted({*order[: _MOST // 2], *(rest[j] for j in evenly.tolist())})]

@@ -8,7 +8,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import counted
 from ctxval.core import soundness
 from ctxval.core.distance import ComposedDistance
-from ctxval.report.context import Recording, ReportContext, distance_of
+from ctxval.report.context import ReportContext, TrajectoryPair, distance_of
 from ctxval.report.findings import Finding, Question, findings_of
 from ctxval.report.markup import number, percent, quantity
 
@@ -174,7 +174,7 @@ def components(context: ReportContext) -> Finding | None:
     return Finding("What errs, and when", "note", text, numbers)
 
 
-def _shares(context: ReportContext, worst: list[Recording]) -> dict[str, float]:
+def _shares(context: ReportContext, worst: list[TrajectoryPair]) -> dict[str, float]:
     """Return the shares of the states in the error that the distance is composed of; empty if they are not known."""
     validation = context.validation
     distance = None if validation is None else validation.distance

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import Any
 from xml.etree import ElementTree
 
@@ -16,7 +17,7 @@ from ctxval.report.diagnostics import diagnostics, not_tested
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.insights import insights
 from ctxval.report.markup import UNCUT, number, quantity
-from ctxval.report.sections.appendix import appendix, appendix_json
+from ctxval.report.sections.appendix import appendix
 from ctxval.report.sections.repeat import command_snippet, identity, python_snippet, repeating_command
 
 _WORST = 5
@@ -49,7 +50,7 @@ def to_json(context: ReportContext) -> dict[str, Any]:
             ],
             "command": repeating_command(context) or None,
             "identity": identity(context),
-            "appendix": appendix_json(context),
+            "appendix": [asdict(entry) for entry in appendix(context)],
         }
         plain: dict[str, Any] = json.loads(json.dumps(describe(report, depth=12), allow_nan=False))
     return plain
