@@ -73,9 +73,11 @@ class Log(ABC):
 
     Attributes:
         source: the file, and the episode in it, for messages.
+        period: seconds between two samples, if the log states it.
     """
 
     source: str
+    period: float | None = None
 
     @abstractmethod
     def fields(self) -> tuple[str, ...]:
@@ -92,11 +94,6 @@ class Log(ABC):
         Raises:
             InputError: if there is no such field, or it does not hold numbers; the message names file, field and row.
         """
-
-    @property
-    def period(self) -> float | None:
-        """Seconds between two samples, if the log states it."""
-        return None
 
     def episodes(self, used: Sequence[str]) -> list[Log]:
         """Return the recordings in this log, one for each number in a column such as ``episode``.
@@ -126,11 +123,7 @@ class Table(Log):
 
     @abstractmethod
     def columns(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return columns, each with shape ``(N,)``, or ``(N, k)`` for vectors.
-
-        Raises:
-            InputError: if a column does not hold numbers.
-        """
+        """Return columns, each with shape ``(N,)``, or ``(N, k)`` for vectors."""
 
     def fields(self) -> tuple[str, ...]:
         """Return the names of the columns."""
@@ -234,13 +227,8 @@ class MemoryTable(Table):
     """
 
     def __init__(self, source: str, columns: Mapping[str, Array], first: int = 0, period: float | None = None) -> None:
-        self.source, self.first = source, first
-        self._columns, self._period = dict(columns), period
-
-    @property
-    def period(self) -> float | None:
-        """Seconds between two rows, if the file states it."""
-        return self._period
+        self.source, self.first, self.period = source, first, period
+        self._columns = dict(columns)
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the columns."""
@@ -252,24 +240,12 @@ class MemoryTable(Table):
 
 
 class Rows(Table):
-    """Some rows of a table, such as one episode.
-
-    Args:
-        table: the table.
-        name: what the rows are, for messages.
-        start, stop: the numbers of the first row and of the row after the last.
-        count: the number of rows of the table.
-        read: the columns that other parts of the table have read.
-    """
+    """Some rows of a table, such as one episode; ``read`` has the columns that other parts of the table have read."""
 
     def __init__(self, table: Table, name: str, start: int, stop: int, count: int, read: dict[str, Array]) -> None:
         self.source, self.word, self.first = f"{table.source}, {name}", table.word, table.first + start
         self._table, self._rows, self._count, self._read = table, slice(start, stop), count, read
-
-    @property
-    def period(self) -> float | None:
-        """Seconds between two rows, if the file states it."""
-        return self._table.period
+        self.period = table.period
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the columns."""

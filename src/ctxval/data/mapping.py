@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
+from ctxval._util.checked import FiniteFloat, Seconds, checked, require
 from ctxval._util.columns import column_of
 from ctxval._util.files import read_bytes
 from ctxval._util.representation import record
@@ -26,6 +26,7 @@ _STATES = ("states", "x", "observation.state")
 _INPUTS = ("inputs", "u", "action")  # names of whole vectors that are looked for if there is no mapping
 
 
+@checked
 @dataclass(frozen=True)
 class Field:
     """Where one state or input is in a log; the value is ``factor * recorded + offset``.
@@ -49,32 +50,18 @@ class Field:
     path: str
     unit: str = ""
     recorded: str = ""
-    factor: float | None = None
-    offset: float = 0.0
+    factor: FiniteFloat | None = None
+    offset: FiniteFloat = 0.0
     angle: bool = False
     held: bool = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.path, str) or not self.path.strip():
+        if not self.path.strip():
             raise InputError(f"the path of a field must be a text, got {self.path!r}.")
-        for name in ("unit", "recorded"):
-            if not isinstance(getattr(self, name), str):
-                raise InputError(f"{name} of the field {self.path} must be a text, got {getattr(self, name)!r}.")
-        for name in ("factor", "offset"):
-            value = getattr(self, name)
-            if value is not None and not _is_number(value):
-                raise InputError(f"{name} of the field {self.path} must be a finite number, got {value!r}.")
-        _ = self.scale("")
+        self.scale("")
 
     def scale(self, stated: str) -> float:
-        """Return the factor of the recorded value.
-
-        Args:
-            stated: the unit that the log itself states; empty if it states none.
-
-        Raises:
-            InputError: if the log states another unit than the mapping, or the units cannot be converted.
-        """
+        """Return the factor of the recorded value; ``stated`` is the unit that the log itself states, if any."""
         if self.factor is not None:
             return float(self.factor)
         try:
@@ -94,8 +81,7 @@ class LogMapping:
         states, inputs: the fields of the states and inputs by name, in the order of the model.
         time: the column of the times of a table; None to look for ``t``, ``time``, ``times`` or ``timestamp``.
         time_unit: the unit of this column, s, ms, us, ns, min or h, if its name does not state it; seconds by default.
-        stamp: the time of a message: ``log``, when it was recorded; ``publish``, when it was sent; ``header``, the
-            ``header.stamp`` in it; or ``auto``, ``header`` if all messages have plausible ones, else ``log``.
+        stamp: the time of a message, as in :class:`Clock`.
         dt: length of a step in seconds; None for the median period of the first state. A table without times has one
             row for each step.
         delay: seconds between the time at which an input is logged and the time from which it acts on the states.
@@ -128,14 +114,10 @@ class LogMapping:
         conversion(self.time_unit or "s", "s")
         if self.valid is not None and _VALID.fullmatch(str(self.valid)) is None:
             raise InputError(f"valid must be a field and a number, such as 'status == 0', got {self.valid!r}.")
-        if self.stamp not in get_args(Stamp):
-            raise UnknownNameError.among("stamp", str(self.stamp), get_args(Stamp))
-        for name in ("dt", "longest_gap"):
-            value = getattr(self, name)
-            if value is not None and not (_is_number(value) and value > 0):
-                raise InputError(f"{name} of a mapping must be a positive number of seconds, got {value!r}.")
-        if not _is_number(self.delay):
-            raise InputError(f"delay of a mapping must be a finite number of seconds, got {self.delay!r}.")
+        require("stamp", Stamp, self.stamp)
+        require("dt", Seconds | None, self.dt)
+        require("longest_gap", Seconds | None, self.longest_gap)
+        require("delay", FiniteFloat, self.delay)
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -215,22 +197,22 @@ class LogMapping:
             named = {name: Field(name, unit) for name, unit in wanted.items()}
             outputs = {name: one for name, one in named.items() if name not in (inputs or {})}
             return LogMapping(outputs, {name: named[name] for name in inputs or {}}, dt=log.period)
-        found = _usual(known, _STATES, "x"), _usual(known, _INPUTS, "u")
-        if not found[0]:
+        usual = _usual(known, _STATES, "x"), _usual(known, _INPUTS, "u")
+        if not usual[0]:
             raise InputError(
                 f"{log.source} has no states under a usual name ({', '.join(_STATES)}, x0): name the states and inputs "
                 f"with --state and --input or in a mapping; the fields are {enumerated(known, LISTED)}."
             )
-        return LogMapping(*found, dt=log.period)
+        return LogMapping(*usual, dt=log.period)
 
     __repr__ = record
 
 
-def _in_units(own: Mapping[str, Field], units: Mapping[str, str]) -> dict[str, Field]:
-    by_place = units.values() if len(units) == len(own) else [""] * len(own)
+def _in_units(fields: Mapping[str, Field], units: Mapping[str, str]) -> dict[str, Field]:
+    by_place = units.values() if len(units) == len(fields) else [""] * len(fields)
     return {
-        name: replace(one, unit=one.unit or units.get(name, unit)) if one.factor is None else one
-        for (name, one), unit in zip(own.items(), by_place, strict=True)
+        name: replace(field, unit=field.unit or units.get(name, unit)) if field.factor is None else field
+        for (name, field), unit in zip(fields.items(), by_place, strict=True)
     }
 
 
@@ -238,11 +220,11 @@ def _usual(known: Sequence[str], vectors: Sequence[str], letter: str) -> dict[st
     for name in vectors:
         if name in known:
             return {letter: Field(name)}
-    found: dict[str, Field] = {}
+    columns: dict[str, Field] = {}
     plain = {named_unit(name)[0] for name in known}
-    while f"{letter}{len(found)}" in plain:
-        found[f"{letter}{len(found)}"] = Field(f"{letter}{len(found)}")
-    return found
+    while (name := f"{letter}{len(columns)}") in plain:
+        columns[name] = Field(name)
+    return columns
 
 
 def _field(name: str, given: Any) -> Field:
@@ -256,7 +238,10 @@ def _field(name: str, given: Any) -> Field:
         for key in table:
             if key not in known:
                 raise UnknownNameError.among(f"entry of the field {name}", key, known)
-        return Field(**{"path": name, **table})
+        try:
+            return Field(**{"path": name, **table})
+        except InputError as error:
+            raise InputError(f"the field {name}: {error}") from error
     raise InputError(f"the field {name} must be a path or a table, got {given!r}.")
 
 
@@ -268,7 +253,3 @@ def _named(kind: str, given: Any) -> dict[str, Any]:
     if not isinstance(given, Mapping):
         raise InputError(f"{kind} must be a table of fields or a list of paths, got {given!r}.")
     return {name: replace(_field(name, one)) for name, one in given.items()}
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -78,22 +78,15 @@ def _version_7_3(path: Path) -> dict[str, Array]:
     with h5py.File(path, "r") as file:
         checked = _Checked(h5py)
         checked.group("", file.id, _DEPTH)
-        return {name: _array(h5py.Dataset(found)) for name, found in checked.arrays.items()}
-
-
-def _array(dataset: Any) -> Array:
-    values = np.squeeze(np.asarray(dataset[()], dtype=np.float64)).T  # MATLAB counts the first index fastest
-    return np.asarray(values)
+        arrays = {name: h5py.Dataset(identifier)[()] for name, identifier in checked.arrays.items()}
+        # MATLAB counts the first index fastest.
+        return {name: np.squeeze(np.asarray(values, dtype=np.float64)).T for name, values in arrays.items()}
 
 
 class _Checked:
     """The numeric arrays of an HDF5 file by their paths, before anything of them is read.
 
-    Args:
-        h5py: the library.
-
-    Raises:
-        InputError: if the file leads to another one, or declares more than may be read.
+    A file that leads to another one, or declares more than may be read, is refused.
     """
 
     def __init__(self, h5py: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from ctxval._util.units import conversion
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.log import Log, Table
 from ctxval.data.mapping import LogMapping
-from ctxval.data.parquet import ACTION, STATE, lerobot_names
+from ctxval.data.parquet import lerobot_names
 from ctxval.data.readers import is_lerobot, read_logs
 from ctxval.data.sampling import Break, Channel, sampled
 from ctxval.errors import InputError
@@ -104,7 +105,10 @@ def read_recordings(
     """
     logs = read_logs(paths)
     chosen = LogMapping.usual(logs[0], states, inputs) if mapping is None else mapping
-    names = _stated_names(paths) if mapping is None else {}
+    names: dict[str, list[str]] = {}
+    if mapping is None and len(paths) == 1 and is_lerobot(Path(paths[0])):
+        with suppress(InputError, AttributeError, TypeError):  # names are only labels
+            names = dict(lerobot_names(Path(paths[0])))
     return recordings_of(logs, replace(chosen.in_units(states or {}, inputs or {}), **changes), names)
 
 
@@ -203,7 +207,12 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
                     place=(signal.word, signal.first),
                 )
             )
-    return _distinct(channels)
+    # In LeRobot data sets, states and actions have the same names.
+    states = {channel.name for channel in channels if not channel.of_input}
+    return [
+        replace(channel, name=f"{channel.name} command") if channel.of_input and channel.name in states else channel
+        for channel in channels
+    ]
 
 
 _CLOCKS = {
@@ -237,14 +246,6 @@ def _require_period(log: Log, channels: Sequence[Channel], dt: float) -> None:
         )
 
 
-def _distinct(channels: list[Channel]) -> list[Channel]:
-    """Return channels with distinct names: in LeRobot data sets, states and actions have the same ones."""
-    states = {channel.name for channel in channels if not channel.of_input}
-    return [
-        replace(one, name=f"{one.name} command") if one.of_input and one.name in states else one for one in channels
-    ]
-
-
 def _period(log: Log, channel: Channel) -> float:
     """Return the mean period of a channel, in which longer steps count as several ones."""
     steps = np.diff(channel.times)
@@ -270,14 +271,3 @@ def _notes(mapping: LogMapping, dt: float, channels: Sequence[Channel]) -> Itera
             )
     if mapping.delay:
         yield f"inputs act {mapping.delay:g} s after they are logged"
-
-
-def _stated_names(paths: Sequence[str | Path]) -> dict[str, list[str]]:
-    """Return the names of the components of states and actions, if one LeRobot data set is read."""
-    if len(paths) != 1 or not is_lerobot(Path(paths[0])):
-        return {}
-    try:
-        stated = lerobot_names(Path(paths[0]))
-    except (InputError, AttributeError, TypeError):  # names are only labels
-        return {}
-    return {column: stated[column] for column in (STATE, ACTION) if column in stated}

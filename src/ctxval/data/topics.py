@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -49,23 +50,16 @@ class TopicLog(Log):
 
     @abstractmethod
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
-        """Yield the messages of some topics in the order of their log times.
-
-        Raises:
-            InputError: if a message cannot be decoded.
-        """
+        """Yield the messages of some topics in the order of their log times."""
 
     def fields(self) -> tuple[str, ...]:
         """Return the names of the fields that hold numbers in the first message of each topic."""
-        left, found = set(self.topics()), list[str]()
+        names: list[str] = []
         for topic in self.topics():
-            try:
+            with suppress(InputError):  # the topic has another encoding
                 first = next(iter(self.messages([topic])), None)
-            except InputError:
-                continue  # the topic has another encoding
-            left.discard(topic)
-            found += [] if first is None else [f"{topic}.{path}" for path in _leaves(first.content)]
-        return tuple(found)
+                names += [] if first is None else [f"{topic}.{path}" for path in _leaves(first.content)]
+        return tuple(names)
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         """Return fields over time; see :meth:`Log.signals`."""
@@ -118,20 +112,25 @@ class TopicLog(Log):
     def _split(self, field: str) -> tuple[str, tuple[str | int, ...]]:
         for topic in sorted(self.topics(), key=len, reverse=True):
             if field.startswith(f"{topic}."):
-                return topic, _path(field[len(topic) + 1 :])
+                steps: list[str | int] = []  # such as pose.position[2].x
+                for part in field[len(topic) + 1 :].split("."):
+                    name, *indices = part.replace("]", "").split("[")
+                    steps += [name, *(int(index) if index.isdigit() else index for index in indices)]
+                return topic, tuple(step for step in steps if step != "")
         raise self.missing(field)
 
     def _value(self, message: Message, number: int, path: tuple[str | int, ...]) -> Array:
-        found = _resolved(message.content, path)
+        value = _resolved(message.content, path)
         try:
-            if found is None or isinstance(found, str | bytes):
+            if value is None or isinstance(value, str | bytes):
                 raise TypeError
-            return np.asarray(found, dtype=np.float64).reshape(-1)
+            return np.asarray(value, dtype=np.float64).reshape(-1)
         except (TypeError, ValueError):
-            shown = "nothing" if found is None else repr(found)[:60]
+            shown = "nothing" if value is None else repr(value)[:60]
+            name = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path).removeprefix(".")
             raise InputError(
-                f"{self.source}, message {number} of {message.topic}: {_joined(path)} must be a number or a list of "
-                f"numbers, got {shown}."
+                f"{self.source}, message {number} of {message.topic}: {name} must be a number or a list of numbers, "
+                f"got {shown}."
             ) from None
 
 
@@ -154,19 +153,6 @@ def _plausible(stamps: Mapping[str, Sequence[Mapping[str, int | None]]]) -> bool
             return False
         late += [stamp["log"] - stamp["header"] for stamp in own]  # type: ignore[operator]
     return bool(late) and max(late) - min(late) <= 10**9
-
-
-def _path(text: str) -> tuple[str | int, ...]:
-    """Return the steps of a path such as ``pose.position[2].x``."""
-    steps: list[str | int] = []
-    for part in text.split("."):
-        name, *indices = part.replace("]", "").split("[")
-        steps += [name, *(int(index) if index.isdigit() else index for index in indices)]
-    return tuple(step for step in steps if step != "")
-
-
-def _joined(path: Sequence[str | int]) -> str:
-    return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path).removeprefix(".")
 
 
 def _resolved(content: Any, path: Sequence[str | int]) -> Any:

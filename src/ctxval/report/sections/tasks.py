@@ -269,11 +269,10 @@ def _region(context: ReportContext) -> Markup | None:
         i, j = int(order[0]), int(order[1])
         x, y = (Axis(space.labels[k], float(space.low[k]), float(space.high[k])) for k in (i, j))
         chart = Chart(title, x, y, height=360)
-        for chosen, kind, name in (
-            (~inside, "weak", "above the threshold or not predicted"),
-            (inside, "sample", "keeps the threshold"),
-        ):
-            if chosen.any():
-                chart.marks(points[chosen, i], points[chosen, j], kind, name)
+        outside = points[~inside]
+        if len(outside):
+            chart.marks(outside[:, i], outside[:, j], "weak", "above the threshold or not predicted")
+        if inside.any():
+            chart.marks(points[inside, i], points[inside, j], "sample", "keeps the threshold")
         drawn = chart
     return joined([text, element("div", drawn, class_="charts wide")])
