@@ -73,12 +73,7 @@ class TrialNote:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One model, controller or distance, with its campaign.
-
-    Attributes:
-        name: the name in the comparison.
-        campaign: the campaign, whose store has its trials.
-    """
+    """One model, controller or distance, with its campaign."""
 
     name: str
     campaign: Campaign

@@ -28,14 +28,7 @@ NoteFor = Callable[[Candidate, Trial, TrialNote], TrialNote]
 
 @dataclass(eq=False)
 class Executions:
-    """Executes tasks for candidates, and records each execution for all candidates whose controllers agree.
-
-    Attributes:
-        candidates: all candidates.
-        note_for: returns the note of a shared trial.
-        on_trial: called with each trial that has ended; None if nobody listens.
-        kept: returns the decisions so far, which are stored with each trial.
-    """
+    """Executes tasks for candidates, and records each execution for all candidates whose controllers agree."""
 
     candidates: Sequence[Candidate]
     note_for: NoteFor
@@ -60,11 +53,7 @@ class Executions:
         return max((note.step + 1 for note in notes if note is not None), default=0)
 
     def history(self, without: Array | None = None) -> list[tuple[Trial, Trajectory]]:
-        """Return all executions in the order in which they were made, each one once.
-
-        Args:
-            without: a task that is left out, a point of the unit cube ``(d,)``.
-        """
+        """Return all executions in the order in which they were made, each one once."""
         executed = [
             ((-1 if (note := TrialNote.of(trial)) is None else note.step, row, trial.number), trial, trajectory)
             for row, candidate in enumerate(self.candidates)

@@ -25,13 +25,6 @@ class MeanQuestion:
 
     Each task is drawn from the distribution of tasks and executed with every candidate that is in an undecided pair.
     Before its draw, the distance of each candidate is predicted from all executions so far.
-
-    Attributes:
-        executions: executes the tasks.
-        predictions: for each candidate, by name.
-        confidence: the probability with which all decisions and intervals hold together.
-        seed: the seed of the draws.
-        most: a number that no distance can exceed; None if none is known.
     """
 
     executions: Executions

@@ -25,10 +25,6 @@ class Predictions:
 
     The system is the same for all candidates, so each execution teaches the residual of each model, whatever controller
     was used.
-
-    Args:
-        candidate: the candidate.
-        seed: the seed of the tasks that are predicted.
     """
 
     def __init__(self, candidate: Candidate, seed: int) -> None:
@@ -59,12 +55,6 @@ class Predictions:
         """Return the prediction of a draw and its mean over other tasks; None if nothing can be predicted.
 
         The mean is over new independent tasks for each draw, so that its error has the expectation 0.
-
-        Args:
-            known: executions before the draw.
-            point: the draw, a point of the unit cube ``(d,)``.
-            draw: the number of the draw.
-            most: a number that no distance can exceed; None if none is known.
         """
         prediction = self._from(known)
         if prediction is None:

@@ -124,11 +124,7 @@ class Comparison:
         return tuple(dict.fromkeys(pair.question for pair in self.pairs))
 
     def pair(self, question: Question, first: str, second: str) -> PairResult:
-        """Return the decision on a pair, named in any order.
-
-        Raises:
-            KeyError: if there is no such pair or question.
-        """
+        """Return the decision on a pair, named in any order."""
         for one in self.pairs:
             if one.question == question and {one.first, one.second} == {first, second}:
                 return one

@@ -64,15 +64,7 @@ class WorstDecision:
 
 @dataclass(eq=False)
 class WorstQuestion:
-    """Decides which candidates have the smaller d*, and chooses the executions for it.
-
-    Attributes:
-        executions: executes the tasks.
-        predictions: for each candidate, by name.
-        confidence: the probability with which all decisions hold together.
-        budget: the largest total number of executions.
-        stochastic: whether two executions of one task may differ.
-    """
+    """Decides which candidates have the smaller d*, and chooses the executions for it."""
 
     executions: Executions
     predictions: Mapping[str, Predictions]

@@ -96,11 +96,7 @@ class Log(ABC):
         """
 
     def episodes(self, used: Sequence[str]) -> list[Log]:
-        """Return the recordings in this log, one for each number in a column such as ``episode``.
-
-        Args:
-            used: the fields that are states or inputs.
-        """
+        """Return the recordings in this log, one for each number in a column such as ``episode``."""
         return [self]
 
     def missing(self, field: str) -> InputError:

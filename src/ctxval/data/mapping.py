@@ -42,9 +42,6 @@ class Field:
         angle: whether it is an angle in radians that the log may keep between -pi and pi: it is continued over turns.
         held: whether a value holds until the next one is logged, however long that takes, such as that of a command
             that is sent only if it changes.
-
-    Raises:
-        InputError: if the path is empty, or the units cannot be converted.
     """
 
     path: str
@@ -88,10 +85,6 @@ class LogMapping:
         longest_gap: longest time in seconds between two samples of one field over which it is interpolated or held;
             None for 1.5 median periods of the field. A recording is split at longer gaps and at missing values.
         valid: which rows count, such as ``status == 0``: a field, ``==`` or ``!=``, and a number; None for all rows.
-
-    Raises:
-        InputError: if there is no state, or a number is not allowed.
-        UnknownNameError: if there is no such stamp.
     """
 
     states: Mapping[str, Field]
@@ -145,10 +138,6 @@ class LogMapping:
 
         A field is a path, or a table with the attributes of :class:`Field`. ``states`` and ``inputs`` may also be lists
         of paths.
-
-        Raises:
-            UnknownNameError: if there is no such key.
-            InputError: if a value is not allowed.
         """
         known = [one.name for one in fields(LogMapping)]
         for key in table:
@@ -161,11 +150,7 @@ class LogMapping:
 
     @staticmethod
     def from_toml(path: str | Path) -> LogMapping:
-        """Return the mapping in a TOML file, or in the table ``[recordings]`` of an experiment file.
-
-        Raises:
-            InputError: if the file cannot be read, is not TOML, or a value is not allowed.
-        """
+        """Return the mapping in a TOML file, or in the table ``[recordings]`` of an experiment file."""
         try:
             content = tomllib.loads(read_bytes(path).decode("utf-8"))
         except InputError as error:
@@ -187,9 +172,6 @@ class LogMapping:
         Args:
             log: the log.
             states, inputs: names with their units that are looked for before these.
-
-        Raises:
-            InputError: if the log has none of them; the message lists its fields.
         """
         known = log.fields()
         wanted = {**(states or {}), **(inputs or {})}

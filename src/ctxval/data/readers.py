@@ -29,9 +29,6 @@ def read_logs(paths: Sequence[str | Path]) -> list[Log]:
 
     A folder is a bag of ROS 2 if it has a file ``metadata.yaml``, a LeRobot data set if it has ``meta/info.json``, and
     otherwise all logs in it are read, in the order of their names.
-
-    Raises:
-        InputError: if there is no such file, if it has another suffix, or if it cannot be read.
     """
     logs = [log for path in paths for log in _logs(Path(path))]
     if not logs:

@@ -68,11 +68,7 @@ class Recordings:
         return sum(run.trajectory.horizon for run in self.runs)
 
     def transitions(self, runs: Iterable[int] | None = None) -> tuple[Transitions, Rows]:
-        """Return the steps of some recordings as transitions, and the number of the recording of each.
-
-        Args:
-            runs: the numbers of the recordings; all of them by default.
-        """
+        """Return the steps of some recordings as transitions, and the number of the recording of each."""
         numbers = list(range(len(self.runs)) if runs is None else runs)
         parts = [self.runs[number].trajectory.transitions() for number in numbers]
         return replace(Transitions.joined(parts), dt=self.dt), np.repeat(
@@ -121,9 +117,6 @@ def recordings_of(
         logs: the logs.
         mapping: which fields are states and inputs; by default, they are found by usual names.
         names: names of the components of vector fields, if they are known.
-
-    Raises:
-        InputError: if a log lacks a field, if logs differ in their fields, or if nothing can be used.
     """
     chosen = LogMapping.usual(logs[0]) if mapping is None else mapping
     runs: list[Recording] = []

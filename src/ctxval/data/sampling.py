@@ -78,11 +78,7 @@ class Channel:
 def sampled(
     source: str, channels: Sequence[Channel], dt: float, delay: float, longest_gap: float | None
 ) -> tuple[list[tuple[float, Trajectory]], list[Break]]:
-    """Return the parts of a log in which all channels have values, at equal steps, and where it was split.
-
-    Returns:
-        The start of each part in seconds with its trajectory, and the breaks.
-    """
+    """Return the parts of a log in which all channels have values, at equal steps, and where it was split."""
     parts: list[tuple[float, Trajectory]] = []
     breaks: list[Break] = []
     for pieces in _forward_pieces(source, channels, breaks):

@@ -30,10 +30,6 @@ def excitation(kind: SignalKind, horizon: int, amplitude: ArrayLike, rng: np.ran
         horizon: number of steps H.
         amplitude: the largest magnitude for each input, shape ``(m,)``.
         rng: the source of the random numbers.
-
-    Raises:
-        UnknownNameError: if there is no such kind.
-        InputError: if an amplitude is negative or not finite.
     """
     if kind not in get_args(SignalKind):
         raise UnknownNameError.among("kind of excitation", str(kind), get_args(SignalKind))
@@ -62,13 +58,7 @@ def _signal(kind: SignalKind, horizon: int, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Excited:
-    """A controller with a signal added to its inputs, within limits.
-
-    Attributes:
-        controller: the controller.
-        signal: the signal, shape ``(H, m)``.
-        limits: the limits of the sum.
-    """
+    """A controller with a signal added to its inputs, within limits."""
 
     controller: Controller
     signal: Array
@@ -94,11 +84,6 @@ class Excitation:
         amplitude: the largest magnitude of the signal for each input, shape ``(m,)``, or a number.
         limits: the limits of the inputs; by default those of the controllers.
         seed: the seed.
-
-    Raises:
-        UnknownNameError: if there is no such kind.
-        InputError: if the system is operated by people, or there are no limits.
-        ShapeError: if the number of amplitudes is not that of the inputs.
     """
 
     def __init__(

@@ -72,12 +72,7 @@ class FittedModel:
 
 @dataclass(frozen=True)
 class FailedFit:
-    """A kind of model that could not be learned from recordings.
-
-    Attributes:
-        kind: the kind.
-        reason: why.
-    """
+    """A kind of model that could not be learned from recordings."""
 
     kind: Kind
     reason: str

@@ -59,10 +59,6 @@ def fit_parameters(
         vectorized: whether ``step`` takes whole batches.
         confidence: the confidence of each interval.
         seed: seed of the starting points.
-
-    Raises:
-        InputError: if bounds or data cannot be used.
-        ModelError: if the function fails on the recorded states.
     """
     low, high = as_bounds(bounds)
     every = max(1, -(-len(data) // 4000))

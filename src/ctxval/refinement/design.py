@@ -43,9 +43,6 @@ def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refine
     A synthesizer that linearises once, such as LQR, needs a linear model that is good on the whole task. If M is
     linear, it is such a model, and the Jacobian of a nonlinear M' at one point may be none. It is used only if random
     tasks have a clearly smaller cost on M' with it. Nothing is executed.
-
-    Returns:
-        the model, and a sentence if the Jacobian of M is used.
     """
     own = refined.model
     if not isinstance(own, Corrected) or not _linearises_a_linear_model_once(validation, own.model):

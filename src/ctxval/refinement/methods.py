@@ -125,11 +125,7 @@ class ResidualCorrection(Method):
 
 
 def correction_of(posterior: DynamicsPosterior) -> Correction:
-    """Return a learned residual as a correction, with the box of the records that it was learned from.
-
-    Args:
-        posterior: a posterior whose covariance is a Matern 5/2 one that does not grow with the inputs.
-    """
+    """Return a learned residual as a correction, with the box of the records that it was learned from."""
     data, mean = posterior.data, posterior.with_few_centres(_FEWEST, _PRECISE)
     low, high = data.pairs.min(axis=0), data.pairs.max(axis=0)
     values = np.exp(mean.hyperparameters.theta)
@@ -151,9 +147,6 @@ class Refit(Method):
     Attributes:
         kind: ``linear``, ``network`` or ``gaussian-process``.
         seed: seed of all random numbers.
-
-    Raises:
-        UnknownNameError: if there is no such kind.
     """
 
     kind: RefitKind
@@ -198,9 +191,6 @@ class ParameterFit(Method):
         step: the function; None for that of the first model, which must then be a ``Parametric``.
         vectorized: whether ``step`` takes whole batches.
         seed: seed of the starting points.
-
-    Raises:
-        InputError: if the bounds cannot be used.
     """
 
     bounds: Mapping[str, tuple[float, float]]
@@ -240,9 +230,6 @@ class UserFit(Method):
 
     Attributes:
         fit: the function of the transitions; it must always return the same for the same data.
-
-    Raises:
-        InputError: if it is not a function.
     """
 
     fit: Callable[[Transitions], Model | Step]

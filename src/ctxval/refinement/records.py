@@ -21,9 +21,6 @@ class Records:
     Attributes:
         executed: the trajectories of the system, in the order of the rounds.
         own: the data of the first model; None if it has none.
-
-    Raises:
-        InputError: if there are neither.
     """
 
     executed: tuple[Trajectory, ...]
@@ -145,11 +142,6 @@ def held_out(learn: Callable[[Records], Model], before: Model, records: Records)
 
     Transitions on which a model is not finite count with the error of the first model, and so do parts that leave too
     few records to learn from.
-
-    Args:
-        learn: learns a model.
-        before: the first model.
-        records: the records.
     """
     parts = []
     for group, (known, held) in enumerate(records.folds()):

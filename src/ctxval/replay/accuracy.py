@@ -114,10 +114,6 @@ class RecordedSteps:
     """The steps of some recordings.
 
     If there is only one recording, it is divided into five parts of equal length, which take the place of recordings.
-
-    Args:
-        recordings: the recordings.
-        used: the numbers of the recordings that are used.
     """
 
     def __init__(self, recordings: Recordings, used: Sequence[int]) -> None:

@@ -309,6 +309,6 @@ def colour_scale(low: float, high: float, label: str) -> Markup:
 def _path(at: Array, class_: str, *, closed: bool = False) -> Markup:
     """Return a path through points ``(k, 2)``, in relative coordinates, which are shorter."""
     tenths = np.rint(10 * at).astype(int)
-    (x, y), *steps = [tenths[0].tolist(), *np.diff(tenths, axis=0).tolist()]
-    rest = "".join(f"l{dx / 10:g},{dy / 10:g}" for dx, dy in steps)
-    return element("path", d=f"M{x / 10:g},{y / 10:g}{rest}{'z' if closed else ''}", class_=class_)
+    start = f"M{tenths[0, 0] / 10:g},{tenths[0, 1] / 10:g}"
+    steps = "".join(f"l{dx / 10:g},{dy / 10:g}" for dx, dy in np.diff(tenths, axis=0).tolist())
+    return element("path", d=start + steps + ("z" if closed else ""), class_=class_)

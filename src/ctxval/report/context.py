@@ -93,10 +93,6 @@ class ReportContext:
         """Return the trials with the largest distances at different tasks, the largest first.
 
         A search executes its worst task several times, almost unchanged; of such trials only the first is returned.
-
-        Args:
-            count: largest number of trials.
-            recorded: whether only trials with recordings are returned.
         """
         chosen: list[Trial] = []
         for trial in self.worst_first:
@@ -284,10 +280,6 @@ def context_of_store(
         certificate: the kind and the options of the certificate.
         missing: why the experiment is not loaded, as a sentence.
         labels: names and units.
-
-    Raises:
-        InputError: if the store does not describe its task space, or its trials do not lie in it.
-        StoreError: if the store cannot be read.
     """
     with store.snapshot():
         description, changes, trials = store.description(), store.history(), store.trials()

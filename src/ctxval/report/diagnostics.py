@@ -87,12 +87,7 @@ def _covering(context: ReportContext) -> Finding | None:
 
 
 def share_far_from_trials(points: Array, resolution: float = RESOLUTION) -> float:
-    """Return the share of the tasks that are farther than a resolution from every trial.
-
-    Args:
-        points: points of the unit cube of the trials ``(n, d)``.
-        resolution: the distance in diagonals of the task space.
-    """
+    """Return the share of the tasks that are farther than a resolution from every trial."""
     d = points.shape[1]
     gaps, _ = KDTree(points).query(np.random.default_rng(0).random((4096, d)))
     return float(np.mean(gaps / np.sqrt(d) > resolution))

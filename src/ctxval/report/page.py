@@ -38,9 +38,6 @@ def page(context: ReportContext, sections: Sequence[Section] = ()) -> str:
     Args:
         context: what the report is made from.
         sections: further sections, which follow those that every report has.
-
-    Raises:
-        InputError: if a section has no title or no method ``render``.
     """
     with np.errstate(all="ignore"):  # a store may have any numbers
         parts = [

@@ -30,11 +30,7 @@ STUDIES: tuple[Study, ...] = (
 
 
 def studies_named(name: str) -> list[Study]:
-    """Return the study with this name, or all studies for ``all``.
-
-    Raises:
-        UnknownNameError: if there is no such study.
-    """
+    """Return the study with this name, or all studies for ``all``."""
     if name == "all":
         return list(STUDIES)
     found = [study for study in STUDIES if study.name == name]
@@ -65,9 +61,6 @@ def reproduce(
         workers: number of processes.
         on_start: function that is called with the number of missing runs.
         on_done: function that is called after each run, with its job.
-
-    Raises:
-        InputError: if there is no such study, or the number of workers is not positive.
     """
     if workers < 1:
         raise InputError(f"workers must be at least 1, got {workers}.")

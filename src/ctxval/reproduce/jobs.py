@@ -210,9 +210,6 @@ class Results:
     """Stored results, a file of JSON lines for each kind of job; those of a case that has changed since do not count.
 
     A change of the searches makes no result invalid: the table says which results were measured before it.
-
-    Args:
-        folder: of the files; it is made with the first result.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -52,11 +52,7 @@ SECTIONS: tuple[Section, ...] = (
 
 
 def all_sections(added: Sequence[Section]) -> list[Section]:
-    """Return the sections of every report, those of installed packages, and those that the user adds.
-
-    Raises:
-        InputError: if a section has no title or no method ``render``, or cannot be loaded.
-    """
+    """Return the sections of every report, those of installed packages, and those that the user adds."""
     installed: list[Section] = []
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         try:

@@ -22,13 +22,7 @@ _NASA, _V10, _V20 = "NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry of the appendix.
-
-    Attributes:
-        term: the term of the standard.
-        standard: the standards that use it.
-        content: what this campaign has to say about it, in sentences.
-    """
+    """One entry of the appendix."""
 
     term: str
     standard: str

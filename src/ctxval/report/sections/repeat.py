@@ -105,13 +105,7 @@ def repeating_command(context: ReportContext) -> str:
 
 
 def command_of(context: ReportContext, budget: int | None = None, *others: str) -> str:
-    """Return the command that runs the campaign; empty if no command made the store.
-
-    Args:
-        context: what the report is made from.
-        budget: another budget than that of the campaign.
-        others: further words.
-    """
+    """Return the command that runs the campaign; empty if no command made the store."""
     settings = context.settings
     if not settings:
         return ""

@@ -11,6 +11,7 @@ from markupsafe import Markup
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, counted
 from ctxval._util.texts import parted
+from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, Kind, small_charts
 from ctxval.report.context import ReportContext
@@ -129,16 +130,10 @@ def task_of(context: ReportContext, trial: Trial) -> str:
 def _signals(context: ReportContext, trial: int) -> list[Chart]:
     """Return one chart for each state and input of a trial, those with the largest errors if they are many."""
     pair, replay = context.recordings[trial], context.replays.get(trial)
-    signals: dict[Kind, list[Array]] = {
-        name: [*run.states.T, *run.inputs.T]
-        for name, run in (
-            # The corrected model is drawn first, as a wide line, because it often coincides with S.
-            ("corrected", None if replay is None else replay.corrected),
-            ("system", pair.system),
-            ("model", pair.model),
-        )
-        if run is not None
-    }
+    corrected = None if replay is None else replay.corrected
+    # The corrected model is drawn first, as a wide line, because it often coincides with S.
+    runs: dict[Kind, Trajectory | None] = {"corrected": corrected, "system": pair.system, "model": pair.model}
+    signals = {kind: [*run.states.T, *run.inputs.T] for kind, run in runs.items() if run is not None}
     labels, times = [label for names in context.signals for label in names], pair.system.times
     errors = [
         float(np.abs(s - m).max(initial=0.0) / max(np.ptp(m), 1e-300))
