@@ -132,7 +132,7 @@ def require_comparable(candidates: Mapping[str, Validation]) -> None:
     """Check that the candidates have the same system, the same tasks and distances of the same unit."""
     if len(candidates) < 2:
         raise InputError(f"a comparison needs at least two candidates, got {len(candidates)}.")
-    if any(getattr(one.system, "manual", False) for one in candidates.values()):
+    if any(getattr(candidate.system, "manual", False) for candidate in candidates.values()):
         raise InputError("candidates cannot be compared on a system that people execute.")
     (first, expected), *others = candidates.items()
     described = _comparable(expected)

@@ -43,7 +43,7 @@ class MeanQuestion:
 
         It depends on all models, so that a model that is learned again with the draws is not judged by them.
         """
-        models = [one.recorder.draws.of_model() for one in self.candidates]
+        models = [candidate.recorder.draws.of_model() for candidate in self.candidates]
         rng = np.random.default_rng([self.seed, draw, _DRAWS, *models])
         space = self.candidates[0].campaign.validation.space
         return np.asarray(space.rounded(space.unit_draws(1, rng)[0]))
@@ -98,12 +98,12 @@ class MeanQuestion:
 
     def step(self, left: int) -> bool:
         """Execute the next draw with one candidate; return False if there is nothing to execute."""
-        active = [one for one in self.candidates if any(one in pair for pair in self.undecided)]
+        active = [candidate for candidate in self.candidates if any(candidate in pair for pair in self.undecided)]
         if not active:
             return False
         draw = self._next_draw()
         point = self.point(draw)
-        waiting = [one for one in active if draw not in self.draws_of(one)]
+        waiting = [candidate for candidate in active if draw not in self.draws_of(candidate)]
         if not waiting:
             draw += 1
             point, waiting = self.point(draw), active
@@ -122,7 +122,7 @@ class MeanQuestion:
 
     def _next_draw(self) -> int:
         """Return the number of the last draw that was begun; 0 if there was none."""
-        return max((draw for one in self.candidates for draw in self.draws_of(one)), default=0)
+        return max((draw for candidate in self.candidates for draw in self.draws_of(candidate)), default=0)
 
     def note_of(self, candidate: Candidate, note: TrialNote, point: Array) -> TrialNote:
         """Return the note of a draw for a candidate, with the prediction from all executions of other tasks."""

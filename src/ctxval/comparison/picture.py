@@ -41,18 +41,26 @@ def _worst(ax: Axes, comparison: Comparison) -> None:
         if one.bound is not None:
             ax.plot(one.bound, row, "|", color=_ORANGE, markersize=14, markeredgewidth=2.5)
     ax.plot([], [], "|", color=_ORANGE, markersize=12, markeredgewidth=2.5, label="bound on d*")
-    known = [value for one in comparison.candidates for value in (one.largest, one.bound) if value is not None]
+    known = [
+        value
+        for candidate in comparison.candidates
+        for value in (candidate.largest, candidate.bound)
+        if value is not None
+    ]
     ax.set_xlim(0, 1.08 * max(known, default=1.0) or 1.0)
     _finish(ax, [candidate.name for candidate in comparison.candidates], "distance", comparison)
 
 
 def _mean(ax: Axes, comparison: Comparison) -> None:
     """Draw the confidence sequence of each difference of expected distances."""
-    pairs = [one for one in comparison.pairs if one.question == "mean"]
+    pairs = [pair for pair in comparison.pairs if pair.question == "mean"]
     ax.set_title("difference of expected distances")
     ax.axvline(0.0, color="black", linewidth=1)
     finite = [
-        abs(end) for one in pairs for end in (one.low, one.high, one.estimate) if end is not None and np.isfinite(end)
+        abs(end)
+        for pair in pairs
+        for end in (pair.low, pair.high, pair.estimate)
+        if end is not None and np.isfinite(end)
     ]
     reach = 1.15 * max(finite, default=1.0) or 1.0
     ax.plot([], [], "o-", color=_BLUE, label="decided")

@@ -85,7 +85,7 @@ class Race:
         if left <= 0:
             return False
         worst = "worst" in self.questions and bool(self.worst.undecided)
-        notes = [TrialNote.of(trial) for one in self.candidates for trial in one.executed]
+        notes = [TrialNote.of(trial) for candidate in self.candidates for trial in candidate.executed]
         spent = sum(note is not None and note.question == "worst" for note in notes)
         last = "mean" not in self.questions
         # Share of the budget before the other question is answered.
@@ -97,7 +97,7 @@ class Race:
 
     def _require_possible(self) -> None:
         """Check that no executed distance refutes the stated largest one, with which decisions would be false."""
-        largest = max(one.largest for one in self.candidates)
+        largest = max(candidate.largest for candidate in self.candidates)
         if self.mean.most is not None and largest > self.mean.most:
             raise InputError(f"largest_possible is {self.mean.most:g}, but a distance of {largest:.6g} was executed.")
 
@@ -119,7 +119,7 @@ class Race:
 
     def _candidate(self, candidate: Candidate) -> CandidateResult:
         worst = candidate.campaign.worst
-        bounds = [one.bound for one in self.worst.decisions if one.smaller == candidate.name]
+        bounds = [decision.bound for decision in self.worst.decisions if decision.smaller == candidate.name]
         drawn = [trial.distance for trial, _ in self.mean.draws_of(candidate).values() if trial.distance is not None]
         return CandidateResult(
             candidate.name,

@@ -125,9 +125,9 @@ class Comparison:
 
     def pair(self, question: Question, first: str, second: str) -> PairResult:
         """Return the decision on a pair, named in any order."""
-        for one in self.pairs:
-            if one.question == question and {one.first, one.second} == {first, second}:
-                return one
+        for pair in self.pairs:
+            if pair.question == question and {pair.first, pair.second} == {first, second}:
+                return pair
         raise KeyError(f"{question}: {first}, {second}")
 
     def ranking(self, question: Question) -> tuple[tuple[str, ...], ...]:
@@ -136,8 +136,8 @@ class Comparison:
         A candidate stands in an earlier group than another one only if all pairs between the groups are decided.
         """
         smaller = {(pair.smaller, pair.larger) for pair in self.pairs if pair.question == question and pair.smaller}
-        wins = {one.name: sum(first == one.name for first, _ in smaller) for one in self.candidates}
-        ordered = sorted((one.name for one in self.candidates), key=lambda name: -wins[name])
+        wins = {candidate.name: sum(first == candidate.name for first, _ in smaller) for candidate in self.candidates}
+        ordered = sorted((candidate.name for candidate in self.candidates), key=lambda name: -wins[name])
         groups: list[tuple[str, ...]] = []
         start = 0
         for end in range(1, len(ordered) + 1):

@@ -100,13 +100,15 @@ class WorstQuestion:
     @property
     def decisions(self) -> tuple[WorstDecision, ...]:
         """All decisions that no executed distance contradicts."""
-        largest = {one.name: one.largest for one in self.candidates}
-        return tuple(one for one in self._decided.values() if largest.get(one.smaller, np.inf) <= one.bound)
+        largest = {candidate.name: candidate.largest for candidate in self.candidates}
+        return tuple(
+            decision for decision in self._decided.values() if largest.get(decision.smaller, np.inf) <= decision.bound
+        )
 
     @property
     def undecided(self) -> list[tuple[Candidate, Candidate]]:
         """The pairs that are not decided, each in both orders."""
-        known = {frozenset((one.smaller, one.larger)) for one in self.decisions}
+        known = {frozenset((decision.smaller, decision.larger)) for decision in self.decisions}
         return [(a, b) for a, b in permutations(self.candidates, 2) if frozenset((a.name, b.name)) not in known]
 
     def step(self) -> bool:
@@ -177,7 +179,7 @@ class WorstQuestion:
 
     def kept(self) -> tuple[dict[str, Any], ...]:
         """Return all decisions as the note of the next trial keeps them."""
-        return tuple(dict(vars(one)) for one in self._decided.values())
+        return tuple(dict(vars(decision)) for decision in self._decided.values())
 
 
 def _trusted(candidate: Candidate) -> bool:

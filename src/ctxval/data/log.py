@@ -154,7 +154,7 @@ class Table(Log):
         marks = [values for values in map(self.marks, counters) if values.ndim == 1 and len(values) > 1]
         if not marks or len({len(values) for values in marks}) > 1:
             return [self]
-        changed = np.any([one[1:] != one[:-1] for one in marks], axis=0)
+        changed = np.any([mark[1:] != mark[:-1] for mark in marks], axis=0)
         ends = [*(np.flatnonzero(changed) + 1).tolist(), len(marks[0])]
         kind = counters[0].partition("_")[0]
         names = [f"{kind} {str(marks[0][start]).removesuffix('.0')}" for start in (0, *ends[:-1])]

@@ -139,7 +139,7 @@ class LogMapping:
         A field is a path, or a table with the attributes of :class:`Field`. ``states`` and ``inputs`` may also be lists
         of paths.
         """
-        known = [one.name for one in fields(LogMapping)]
+        known = [field.name for field in fields(LogMapping)]
         for key in table:
             if key not in known:
                 raise UnknownNameError.among("entry of the mapping of recordings", key, known)
@@ -215,7 +215,7 @@ def _field(name: str, given: Any) -> Field:
     if isinstance(given, str):
         return Field(given)
     if isinstance(given, Mapping):
-        known = [one.name for one in fields(Field)]
+        known = [field.name for field in fields(Field)]
         table = {("path" if key == "field" else key): value for key, value in given.items()}
         for key in table:
             if key not in known:

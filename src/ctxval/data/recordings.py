@@ -123,7 +123,7 @@ def recordings_of(
     breaks: list[Break] = []
     notes: list[str] = []
     dt, first = chosen.dt, list[Channel]()
-    used = [one.path for one in chosen.fields.values()]
+    used = [field.path for field in chosen.fields.values()]
     for log in (part for whole in logs for part in whole.episodes(used)):
         channels = _channels(log, chosen, names or {}, notes)
         labels = [(channel.name, channel.of_input) for channel in channels]
@@ -159,10 +159,10 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
         clock = replace(clock, period=mapping.dt)
     condition = mapping.condition
     fields = mapping.fields
-    signals = log.signals([one.path for one in fields.values()] + ([condition[0]] if condition else []), clock)
+    signals = log.signals([field.path for field in fields.values()] + ([condition[0]] if condition else []), clock)
     channels = []
-    for name, one in fields.items():
-        signal = signals[one.path]
+    for name, field in fields.items():
+        signal = signals[field.path]
         values = signal.values.copy()
         if condition is not None:
             status, equal, number = signals[condition[0]], condition[1], condition[2]
@@ -171,8 +171,8 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
             values[(status.values[rows, 0] == number) != equal] = np.nan
         if signal.clock:
             notes.append(f"the times of messages are {_CLOCKS[signal.clock]}")
-        components = names.get(one.path, [])
-        width, scale = values.shape[1], one.scale(signal.unit)
+        components = names.get(field.path, [])
+        width, scale = values.shape[1], field.scale(signal.unit)
         for k in range(width):
             label = components[k] if len(components) == width else (name if width == 1 else f"{name}{k}")
             for value in sentinels(values[:, k], scale):
@@ -190,13 +190,13 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
             channels.append(
                 Channel(
                     label,
-                    one.unit or (signal.unit if one.factor is None else ""),
+                    field.unit or (signal.unit if field.factor is None else ""),
                     name in mapping.inputs,
                     signal.times,
-                    scale * values[:, k] + one.offset,
-                    angle=one.angle,
-                    held=one.held,
-                    path=one.path,
+                    scale * values[:, k] + field.offset,
+                    angle=field.angle,
+                    held=field.held,
+                    path=field.path,
                     place=(signal.word, signal.first),
                 )
             )
@@ -230,7 +230,7 @@ def _in_unit_of(log: Log, channel: Channel, first: Channel) -> Channel:
 
 def _require_period(log: Log, channels: Sequence[Channel], dt: float) -> None:
     """Refuse states that are recorded much less often than every step, or whose times have another unit."""
-    period = min((one.period for one in channels if not one.of_input and one.period), default=dt)
+    period = min((channel.period for channel in channels if not channel.of_input and channel.period), default=dt)
     advice = unit_advice(period, dt)
     if period > FAR * dt or advice:
         raise InputError(

@@ -82,7 +82,7 @@ def sampled(
     parts: list[tuple[float, Trajectory]] = []
     breaks: list[Break] = []
     for pieces in _forward_pieces(source, channels, breaks):
-        moved = [replace(one, times=one.times + delay) if one.of_input else one for one in pieces]
+        moved = [replace(channel, times=channel.times + delay) if channel.of_input else channel for channel in pieces]
         common: list[Interval] = [(-np.inf, np.inf)]
         for channel in moved:
             common = _intersection(common, _intervals(source, channel, longest_gap, breaks))
@@ -190,7 +190,7 @@ def _part(source: str, channels: Sequence[Channel], interval: Interval, dt: floa
     if steps > _MOST_STEPS:
         raise InputError(f"{source} has {steps:.3g} steps of {dt:g} s, more than {_MOST_STEPS}: give a larger dt.")
     times: Array = np.asarray(dt * np.arange(int(steps) + 1), dtype=np.float64)
-    states = [_interpolated(one, start + times) for one in channels if not one.of_input]
+    states = [_interpolated(channel, start + times) for channel in channels if not channel.of_input]
     inputs = []
     for channel in channels:
         if channel.of_input:  # it holds until the next sample, which may come within a step

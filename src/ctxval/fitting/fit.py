@@ -49,7 +49,7 @@ class FittedModel:
     @property
     def relative(self) -> float:
         """The largest one-step error of a state on held-out recordings, as a share of its recorded change."""
-        return max((one.relative for one in self.errors if one.steps == 1), default=float("inf"))
+        return max((error.relative for error in self.errors if error.steps == 1), default=float("inf"))
 
     @property
     def useless(self) -> str | None:
@@ -57,8 +57,10 @@ class FittedModel:
 
         After one step, or after the largest number of steps, its error in a state is at least the recorded change.
         """
-        last = max((one.steps for one in self.errors), default=0)
-        worst = max((one for one in self.errors if one.steps in (1, last)), key=lambda one: one.relative, default=None)
+        last = max((error.steps for error in self.errors), default=0)
+        worst = max(
+            (error for error in self.errors if error.steps in (1, last)), key=lambda one: one.relative, default=None
+        )
         if worst is None or worst.relative < 1:
             return None
         return (
@@ -112,7 +114,7 @@ class FitReport:
         return {**report, "dt": self.held_out.dt, "notes": list(self.held_out.notes)}
 
     def __repr__(self) -> str:
-        return call(self, [one.kind for one in self.fitted], failed=[one.kind for one in self.failed])
+        return call(self, [model.kind for model in self.fitted], failed=[fit.kind for fit in self.failed])
 
 
 def fit(

@@ -104,7 +104,7 @@ class MeasuredResidual:
             "quantile_level": QUANTILE,
             "units": {**self.states, **self.inputs},
             "whole": plain(self.whole),
-            "regions": [plain(one) for one in self.regions],
+            "regions": [plain(region) for region in self.regions],
             "guaranteed": False,
         }
 

@@ -43,13 +43,13 @@ class Records:
     def transitions(self) -> Transitions:
         """All transitions, those of the first model first."""
         own = [] if self.own is None else [self.own]
-        return Transitions.joined([*own, *(one.transitions() for one in self.executed)])
+        return Transitions.joined([*own, *(run.transitions() for run in self.executed)])
 
     @property
     def sources(self) -> Rows:
         """The execution of each transition; -1 for the data of the first model."""
         own = 0 if self.own is None else len(self.own)
-        of = np.repeat(np.arange(len(self.executed)), [one.horizon for one in self.executed])
+        of = np.repeat(np.arange(len(self.executed)), [run.horizon for run in self.executed])
         return np.concatenate([np.full(own, -1), of])
 
     def folds(self) -> list[tuple[Records, Records]]:
@@ -130,7 +130,7 @@ class HeldOut:
         if not executed:
             return self
         last = int(self.groups.max(initial=-1))
-        parts = [_compared(one.transitions(), model, before, last + 1 + k) for k, one in enumerate(executed)]
+        parts = [_compared(run.transitions(), model, before, last + 1 + k) for k, run in enumerate(executed)]
         return _joined([self, *parts])
 
     def __repr__(self) -> str:

@@ -138,14 +138,14 @@ class _Loop:
     def _execute(self, campaign: Campaign, options: CertificateOptions) -> None:
         """Execute tasks of a campaign until it is decided or the budget ends; people execute theirs themselves."""
         known = counterexample(campaign.trials, self.threshold) is not None
-        left = self.budget - sum(one.executions for one in self.rounds if one.campaign is not campaign)
+        left = self.budget - sum(item.executions for item in self.rounds if item.campaign is not campaign)
         if known or getattr(campaign.validation.system, "manual", False) or left < 1:
             return
         campaign.run(left, self.threshold, certificate=options, **self.execution)
 
     def _why_ended(self) -> str | None:
         """Return why there is no further round; None if there is one."""
-        last, spent = self.rounds[-1], sum(one.executions for one in self.rounds)
+        last, spent = self.rounds[-1], sum(item.executions for item in self.rounds)
         if last.verdict.answer == "validated":
             which = "the given model" if not last.number else f"the model of round {last.number}"
             return f"{which} is validated"
@@ -232,8 +232,8 @@ class _Loop:
         return before_refinement(self.first.validation.model)
 
     def _executed(self, rounds: list[Round]) -> Iterator[tuple[Trial, Trajectory]]:
-        for one in rounds:
-            yield from executed_trials(one.campaign.store, one.campaign.trials)
+        for item in rounds:
+            yield from executed_trials(item.campaign.store, item.campaign.trials)
 
     def _learned(self, number: int) -> Learned:
         """Return what the rounds before a number teach; the result needs it after the round, too."""

@@ -149,7 +149,7 @@ class Refinement:
     @property
     def executions(self) -> int:
         """The number of executions of all rounds."""
-        return sum(one.executions for one in self.rounds)
+        return sum(item.executions for item in self.rounds)
 
     @property
     def statement(self) -> str:
@@ -183,7 +183,7 @@ class Refinement:
     @property
     def text(self) -> str:
         """The rounds as a table of plain text."""
-        return aligned([self.head, *(one.cells for one in self.rounds)])
+        return aligned([self.head, *(item.cells for item in self.rounds)])
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the models as plain values."""
@@ -198,11 +198,11 @@ class Refinement:
             "statement": self.statement,
             "distance_before": self.rounds[0].worst,
             "distance_after": self.last.worst,
-            "rounds": [one.to_dict() for one in self.rounds],
+            "rounds": [item.to_dict() for item in self.rounds],
             "one_step_error": {
                 name: {"before": before, "after": after} for name, (before, after) in self.accuracy.items()
             },
-            "parameters": [vars(one) for one in self.parameters],
+            "parameters": [vars(parameter) for parameter in self.parameters],
             "residual": None if self.residual is None else self.residual.to_dict(),
         }
 

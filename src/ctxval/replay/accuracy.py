@@ -119,9 +119,9 @@ class RecordedSteps:
     def __init__(self, recordings: Recordings, used: Sequence[int]) -> None:
         self.recordings = recordings
         self._used = [recordings.runs[number].trajectory for number in used]
-        self._states = np.concatenate([one.states for one in self._used])
-        self._inputs = np.concatenate([one.inputs for one in self._used])
-        self._horizons = np.array([one.horizon for one in self._used])
+        self._states = np.concatenate([run.states for run in self._used])
+        self._inputs = np.concatenate([run.inputs for run in self._used])
+        self._horizons = np.array([run.horizon for run in self._used])
         self._first_input = np.cumsum([0, *self._horizons[:-1]])
         self._first_state = self._first_input + np.arange(len(self._used))
 

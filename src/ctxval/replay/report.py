@@ -85,7 +85,7 @@ class ReplayReport:
         return report
 
     def __repr__(self) -> str:
-        worst = max((one.relative for one in self.errors if one.steps == 1), default=float("nan"))
+        worst = max((error.relative for error in self.errors if error.steps == 1), default=float("nan"))
         return call(self, self.data, largest_relative_error=worst, suggestions=len(self.suggestions))
 
 
@@ -222,7 +222,7 @@ def _of_data(data: RecordedData) -> Iterator[str]:
 
 
 def _of_errors(errors: Sequence[StepError], held_out: int) -> Iterator[str]:
-    single = [one for one in errors if one.steps == 1]
+    single = [error for error in errors if error.steps == 1]
     if not single:
         yield "no recording has a single step, so nothing can be compared"
         return
@@ -233,7 +233,7 @@ def _of_errors(errors: Sequence[StepError], held_out: int) -> Iterator[str]:
             f"{100 * worst.relative:.0f} % of the recorded change"
         )
     last = max(errors, key=lambda one: one.steps)
-    late = [one for one in errors if one.steps == last.steps and one.relative >= 1]
+    late = [error for error in errors if error.steps == last.steps and error.relative >= 1]
     if late and worst.relative < 1:
         states = ", ".join(one.state for one in late)
         yield f"after {last.steps} steps the model predicts {states} no better than no change at all"
@@ -245,7 +245,7 @@ def _of_errors(errors: Sequence[StepError], held_out: int) -> Iterator[str]:
 
 
 def _of_residuals(errors: Sequence[StepError], residuals: Sequence[ResidualShare]) -> Iterator[str]:
-    relative = {one.state: one.relative for one in errors if one.steps == 1}
+    relative = {error.state: error.relative for error in errors if error.steps == 1}
     for one in residuals:
         if relative.get(one.state, 0.0) < _SMALL:
             continue
@@ -269,7 +269,7 @@ def _of_residuals(errors: Sequence[StepError], residuals: Sequence[ResidualShare
 
 
 def _of_regions(errors: Sequence[StepError], where: Sequence[Region]) -> Iterator[str]:
-    if max((one.relative for one in errors if one.steps == 1), default=0.0) < _SMALL:
+    if max((error.relative for error in errors if error.steps == 1), default=0.0) < _SMALL:
         return
     large = sorted((one for one in where if one.ratio >= 1.5), key=lambda one: -one.ratio)
     for one in large[:3]:

@@ -71,7 +71,7 @@ class Axis:
             zero: whether it starts at 0; values are then expected to be at least 0.
             room: share of the range that is left free at each end.
         """
-        flat = np.concatenate([np.ravel(np.asarray(one, dtype=np.float64)) for one in values] or [np.zeros(1)])
+        flat = np.concatenate([np.ravel(np.asarray(array, dtype=np.float64)) for array in values] or [np.zeros(1)])
         finite = flat[np.isfinite(flat) & (np.abs(flat) < 1e300)]
         low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
         low = 0.0 if zero else low - room * (high - low)

@@ -120,7 +120,7 @@ def explained(context: ReportContext) -> Finding | None:
     if context.validation is None:
         return Finding("Corrected model", "unknown", "Not known: it needs the experiment, which is not loaded.")
     by_number = {trial.number: distance_of(trial) for trial in context.completed}
-    pairs = [(by_number[k], one.distance) for k, one in context.replays.items() if np.isfinite(one.distance)]
+    pairs = [(by_number[k], replay.distance) for k, replay in context.replays.items() if np.isfinite(replay.distance)]
     if len(pairs) < 2:
         return Finding("Corrected model", "unknown", "Not known: the trials do not teach a correction of M.")
     executed, predicted = np.array(pairs).T
@@ -216,7 +216,7 @@ def unusual_motion(context: ReportContext) -> Finding | None:
     if len(context.recordings) < 4:
         return None
     sizes = np.array(
-        [np.abs(one.model.states - one.model.states[0]).max(axis=0) for one in context.recordings.values()]
+        [np.abs(run.model.states - run.model.states[0]).max(axis=0) for run in context.recordings.values()]
     )
     usual = np.maximum(np.median(sizes, axis=0), 1e-3 * sizes.max(axis=0) + 1e-300)
     ratios = sizes[:_WORST] / usual

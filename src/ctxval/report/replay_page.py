@@ -200,9 +200,9 @@ def _named(name: str, unit: str) -> str:
 
 def _error_chart(errors: Sequence[StepError]) -> Chart:
     """Return the root mean square error of one state over the number of steps, with the spread over recordings."""
-    steps = np.array([float(one.steps) for one in errors])
+    steps = np.array([float(error.steps) for error in errors])
     rms, low, high, change = (
-        np.array([getattr(one, k) for one in errors]) for k in ("rms", "lowest", "highest", "change")
+        np.array([getattr(error, k) for error in errors]) for k in ("rms", "lowest", "highest", "change")
     )
     first = errors[0]
     x, y = Axis.over("steps", steps, room=0.03), Axis.over(_named(first.state, first.unit), high, rms, zero=True)

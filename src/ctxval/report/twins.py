@@ -35,8 +35,8 @@ def to_json(context: ReportContext) -> dict[str, Any]:
             "failed": [trial.number for trial in context.failed],
             "certificate": None if certificate is None else certificate.to_json(),
             "missing": context.missing or None,
-            "diagnostics": [one.to_json() for one in diagnostics(context)],
-            "insights": [one.to_json() for one in insights(context)],
+            "diagnostics": [finding.to_json() for finding in diagnostics(context)],
+            "insights": [finding.to_json() for finding in insights(context)],
             "not_tested": not_tested(context),
             "worst": [
                 {

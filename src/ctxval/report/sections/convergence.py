@@ -35,7 +35,7 @@ def distances_in_order(context: ReportContext) -> Chart | None:
     so_far = np.maximum.accumulate(context.distances)
     last = float(max(trial.number for trial in context.trials))
     limits = [one for one in (context.threshold, context.bound) if one is not None]
-    beforehand = [(trial.number, one.median) for trial, one in stored_predictions(context)]
+    beforehand = [(trial.number, prediction.median) for trial, prediction in stored_predictions(context)]
     chart = Chart(
         "Distance of each trial, and the largest one so far",
         _trial_axis(last),
