@@ -106,8 +106,8 @@ class Candidate:
 
     def trial_at(self, point: Array) -> Trial | None:
         """Return the last trial of a task, a point of the unit cube ``(d,)``; None if there is none."""
-        found = [trial for trial in self.trials if np.array_equal(trial.unit_point, point)]
-        return found[-1] if found else None
+        trials = [trial for trial in self.trials if np.array_equal(trial.unit_point, point)]
+        return trials[-1] if trials else None
 
     def trajectories(self) -> Iterator[tuple[Trial, Trajectory]]:
         """Yield the completed trials with a recorded trajectory; each trajectory is read once."""
@@ -137,9 +137,9 @@ def require_comparable(candidates: Mapping[str, Validation]) -> None:
     (first, expected), *others = candidates.items()
     described = _comparable(expected)
     for other, validation in others:
-        found = _comparable(validation)
+        other_described = _comparable(validation)
         for part, what in (("space", "task spaces"), ("tasks", "tasks"), ("system", "systems")):
-            unequal = next(differences(described[part], found[part], part), None)
+            unequal = next(differences(described[part], other_described[part], part), None)
             if unequal is not None:
                 raise InputError(
                     f"{first} and {other} must have the same {what}, but {unequal[0]} differs: only models, "

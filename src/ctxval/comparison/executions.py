@@ -140,14 +140,14 @@ class Executions:
 
     def elsewhere(self, candidate: Candidate) -> list[Trajectory]:
         """Return the executions that are in no trial of a candidate."""
-        own = {note.shared for trial in candidate.trials if (note := TrialNote.of(trial)) is not None and note.shared}
+        known = {note.shared for trial in candidate.trials if (note := TrialNote.of(trial)) is not None and note.shared}
         return [
             trajectory
             for other in self.candidates
             if other is not candidate
             for trial, trajectory in other.trajectories()
             if not is_shared(trial)
-            and (other.name, trial.number) not in own
+            and (other.name, trial.number) not in known
             and (self._hidden is None or not np.array_equal(trial.unit_point, self._hidden))
         ]
 

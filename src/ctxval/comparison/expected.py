@@ -50,8 +50,8 @@ class MeanQuestion:
 
     def draws_of(self, candidate: Candidate) -> dict[int, tuple[Trial, TrialNote]]:
         """Return the trials of the draws that have ended, by the number of the draw."""
-        found = ((trial, TrialNote.of(trial)) for trial in candidate.trials if trial.state != "open")
-        return {note.draw: (trial, note) for trial, note in found if note is not None and note.draw is not None}
+        noted = ((trial, TrialNote.of(trial)) for trial in candidate.trials if trial.state != "open")
+        return {note.draw: (trial, note) for trial, note in noted if note is not None and note.draw is not None}
 
     def difference(self, a: Candidate, b: Candidate) -> MeanDifference:
         """Return the expected distance of a candidate minus that of another one."""
@@ -64,7 +64,7 @@ class MeanQuestion:
         first, second = self.draws_of(a), self.draws_of(b)
         values, predicted = [], []
         for draw in sorted(first.keys() & second.keys()):
-            pair = [self._known(*found[draw]) for found in (first, second)]
+            pair = [self._known(*draws[draw]) for draws in (first, second)]
             if pair[0] is None or pair[1] is None:
                 break
             values.append(pair[0][0] - pair[1][0])
@@ -127,6 +127,6 @@ class MeanQuestion:
     def note_of(self, candidate: Candidate, note: TrialNote, point: Array) -> TrialNote:
         """Return the note of a draw for a candidate, with the prediction from all executions of other tasks."""
         known = [(trial.unit_point, trajectory) for trial, trajectory in self.executions.history(without=point)]
-        found = self.predictions[candidate.name].of_draw(known, point, note.draw or 0, self.most)
-        value, centre = (None, None) if found is None else found
+        prediction = self.predictions[candidate.name].of_draw(known, point, note.draw or 0, self.most)
+        value, centre = (None, None) if prediction is None else prediction
         return TrialNote(note.step, "mean", note.draw, value, centre)

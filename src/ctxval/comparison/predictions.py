@@ -74,8 +74,8 @@ class Predictions:
         key = tuple(id(trajectory) for _, trajectory in known)
         if self._last is None or self._last[0] != key:
             try:
-                found = self._study.predict(list(known))
+                prediction = self._study.predict(list(known))
             except Exception:  # the user's parts, at states that no execution has reached, must not end a comparison
-                found = None
-            self._last = key, found
+                prediction = None
+            self._last = key, prediction
         return self._last[1]

@@ -78,9 +78,9 @@ class WorstQuestion:
         for candidate in self.candidates:
             for trial in candidate.trials:
                 for kept in (TrialNote.of(trial) or TrialNote(0, "worst")).decided:
-                    found = WorstDecision.of(kept)
-                    if found is not None:
-                        self._decided[found.smaller, found.larger] = found
+                    decision = WorstDecision.of(kept)
+                    if decision is not None:
+                        self._decided[decision.smaller, decision.larger] = decision
 
     @property
     def candidates(self) -> Sequence[Candidate]:
@@ -132,12 +132,12 @@ class WorstQuestion:
     def _expected(self) -> dict[str, tuple[float, Array | None]]:
         """Return, for each candidate, the largest executed or predicted distance, and the task if it is predicted."""
         known = [(trial.unit_point, trajectory) for trial, trajectory in self.executions.history()]
-        found: dict[str, tuple[float, Array | None]] = {}
+        expected: dict[str, tuple[float, Array | None]] = {}
         for candidate in self.candidates:
             highest = self.predictions[candidate.name].highest(known)
             value, task = (0.0, None) if highest is None or not _trusted(candidate) else highest
-            found[candidate.name] = (max(value, candidate.largest), task if value > candidate.largest else None)
-        return found
+            expected[candidate.name] = (max(value, candidate.largest), task if value > candidate.largest else None)
+        return expected
 
     def _needs_fact(
         self, better: Candidate, worse: Candidate, expected: Mapping[str, tuple[float, Array | None]]

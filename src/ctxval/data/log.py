@@ -139,14 +139,14 @@ class Table(Log):
         else:
             times = self._seconds(time, arrays[time], time_unit)
         count = len(times)
-        found = {}
+        signals = {}
         for field, (name, unit, index) in split.items():
             values = self._oriented(name, arrays[name], count)
             if index is not None and index >= values.shape[1]:
                 raise InputError(f"{self.source}: {name} has {values.shape[1]} components, so there is no {field}.")
             chosen = values if index is None else values[:, [index]]
-            found[field] = Signal(times, chosen, self.first, self.word, unit)
-        return found
+            signals[field] = Signal(times, chosen, self.first, self.word, unit)
+        return signals
 
     def episodes(self, used: Sequence[str]) -> list[Log]:
         """Return one table for each run of rows with one number in a column such as ``episode``."""

@@ -134,9 +134,9 @@ def recordings_of(
         dt = _period(log, channels[0]) if dt is None else dt
         if chosen.longest_gap is None:
             _require_period(log, channels, dt)
-        parts, found = sampled(log.source, channels, dt, chosen.delay, chosen.longest_gap)
+        parts, gaps = sampled(log.source, channels, dt, chosen.delay, chosen.longest_gap)
         runs += [Recording(log.source, start, trajectory) for start, trajectory in parts]
-        breaks += found
+        breaks += gaps
     if dt is None or not runs:
         why = "; ".join(str(one) for one in breaks[:3])
         raise InputError(f"no log has two samples of all states and inputs in a row: {why or 'they are empty'}.")

@@ -83,13 +83,13 @@ class TopicLog(Log):
             stamps[topic] = [unsorted[k] for k in order]
             values |= {field: [values[field][k] for k in order] for field, (of, _) in split.items() if of == topic}
         chosen = ("header" if _plausible(stamps) else "log") if clock.stamp == "auto" else clock.stamp
-        times = {topic: [stamp[chosen] for stamp in own] for topic, own in stamps.items()}
-        for topic, own in times.items():
-            if None in own:
+        times = {topic: [stamp[chosen] for stamp in of_topic] for topic, of_topic in stamps.items()}
+        for topic, of_topic in times.items():
+            if None in of_topic:
                 raise InputError(
-                    f"{self.source}, message {own.index(None)} of {topic}: it has no header.stamp or timestamp."
+                    f"{self.source}, message {of_topic.index(None)} of {topic}: it has no header.stamp or timestamp."
                 )
-        origin = min((min(own) for own in times.values() if own), default=0)  # type: ignore[type-var]
+        origin = min((min(of_topic) for of_topic in times.values() if of_topic), default=0)  # type: ignore[type-var]
         return {
             field: self._signal(field, times[topic], values[field], origin, chosen)  # type: ignore[arg-type]
             for field, (topic, _) in split.items()
@@ -147,11 +147,11 @@ def _plausible(stamps: Mapping[str, Sequence[Mapping[str, int | None]]]) -> bool
     The stamps may be those of another clock, such as that of a simulator, if it is the same one for all topics.
     """
     late = list[int]()
-    for own in stamps.values():
-        headers = [stamp["header"] for stamp in own]
+    for of_topic in stamps.values():
+        headers = [stamp["header"] for stamp in of_topic]
         if None in headers or any(b <= a for a, b in pairwise(headers)):  # type: ignore[operator]
             return False
-        late += [stamp["log"] - stamp["header"] for stamp in own]  # type: ignore[operator]
+        late += [stamp["log"] - stamp["header"] for stamp in of_topic]  # type: ignore[operator]
     return bool(late) and max(late) - min(late) <= 10**9
 
 
@@ -172,7 +172,7 @@ def _resolved(content: Any, path: Sequence[str | int]) -> Any:
 
 def _first(content: Any, *paths: Sequence[str | int]) -> Any:
     """Return the first part of a message that exists; None if there is none."""
-    return next((found for path in paths if (found := _resolved(content, path)) is not None), None)
+    return next((value for path in paths if (value := _resolved(content, path)) is not None), None)
 
 
 def _leaves(content: Any, before: str = "", depth: int = 6) -> Iterator[str]:

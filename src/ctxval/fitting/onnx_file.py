@@ -109,8 +109,8 @@ def _squared_distance(graph: _Graph, source: str, centres: Array, scales: Array,
     inverse = factor / scales**2
     graph.node("Mul", [source, source], f"{output}_squares")
     graph.affine(source, (-2 * inverse * centres).T, (inverse * centres**2).sum(axis=1), f"{output}_mixed")
-    own = np.repeat(inverse[:, None], len(centres), axis=1)
-    graph.affine(f"{output}_squares", own, np.zeros(len(centres)), f"{output}_own")
+    squares = np.repeat(inverse[:, None], len(centres), axis=1)
+    graph.affine(f"{output}_squares", squares, np.zeros(len(centres)), f"{output}_own")
     graph.node("Add", [f"{output}_mixed", f"{output}_own"], f"{output}_sum")
     graph.node("Relu", [f"{output}_sum"], output)
 

@@ -112,7 +112,7 @@ class MeasuredResidual:
         return call(self, Shown(f"{self.whole.steps} steps"), regions=len(self.regions), largest=self.whole.largest)
 
 
-def measure_residual(found: HeldOut, states: dict[str, str], inputs: dict[str, str]) -> MeasuredResidual:
+def measure_residual(held: HeldOut, states: dict[str, str], inputs: dict[str, str]) -> MeasuredResidual:
     """Return the residual by regions, from errors on transitions that were held out.
 
     The regions are those of a small regression tree: each split explains most of the spread of the logarithm of the
@@ -122,14 +122,14 @@ def measure_residual(found: HeldOut, states: dict[str, str], inputs: dict[str, s
         found: the errors.
         states, inputs: the names of states and inputs with their units.
     """
-    magnitude = np.abs(found.errors)
-    sizes = np.maximum(found.changes.std(axis=0), 1e-300)
-    error = np.sqrt(((found.errors / sizes) ** 2).mean(axis=1))
+    magnitude = np.abs(held.errors)
+    sizes = np.maximum(held.changes.std(axis=0), 1e-300)
+    error = np.sqrt(((held.errors / sizes) ** 2).mean(axis=1))
     logs = np.log(np.maximum(error, 1e-12 * max(float(error.max(initial=0.0)), 1e-300)))
-    boxes = _split(found.pairs, logs)
+    boxes = _split(held.pairs, logs)
     regions = [_region(magnitude, *box) for box in boxes]
     inside = np.ones(len(magnitude), dtype=bool)
-    whole = _region(magnitude, inside, found.pairs.min(axis=0), found.pairs.max(axis=0))
+    whole = _region(magnitude, inside, held.pairs.min(axis=0), held.pairs.max(axis=0))
     ordered = sorted(regions, key=lambda region: float((region.quantile / sizes).max()))
     return MeasuredResidual(states, inputs, whole, tuple(ordered))
 

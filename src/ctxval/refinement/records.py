@@ -36,21 +36,21 @@ class Records:
     @classmethod
     def of(cls, model: Model, executed: Sequence[Trajectory]) -> Records:
         """Return the records of executions, and the data of the first model."""
-        own = getattr(model, "data", None)
-        return cls(tuple(executed), own if isinstance(own, Transitions) and len(own) else None)
+        data = getattr(model, "data", None)
+        return cls(tuple(executed), data if isinstance(data, Transitions) and len(data) else None)
 
     @property
     def transitions(self) -> Transitions:
         """All transitions, those of the first model first."""
-        own = [] if self.own is None else [self.own]
-        return Transitions.joined([*own, *(run.transitions() for run in self.executed)])
+        data = [] if self.own is None else [self.own]
+        return Transitions.joined([*data, *(run.transitions() for run in self.executed)])
 
     @property
     def sources(self) -> Rows:
         """The execution of each transition; -1 for the data of the first model."""
-        own = 0 if self.own is None else len(self.own)
+        count = 0 if self.own is None else len(self.own)
         of = np.repeat(np.arange(len(self.executed)), [run.horizon for run in self.executed])
-        return np.concatenate([np.full(own, -1), of])
+        return np.concatenate([np.full(count, -1), of])
 
     def folds(self) -> list[tuple[Records, Records]]:
         """Return pairs of records: those to learn from, and those that are held out.

@@ -79,7 +79,7 @@ class Round:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values."""
-        found = self.verdict.certificate
+        certificate = self.verdict.certificate
         return {
             "round": self.number,
             "method": self.method,
@@ -93,14 +93,14 @@ class Round:
             "reason": self.verdict.reason,
             "confidence": self.confidence,
             "bound": self.verdict.bound,
-            "certificate": None if found is None else found.to_json(),
+            "certificate": None if certificate is None else certificate.to_json(),
             "notes": list(self.notes),
             "unchanged_controllers": asdict(self.unchanged),
         }
 
     def __repr__(self) -> str:
-        found = {"executions": self.executions, "worst": self.worst}
-        return call(self, self.number, self.method, **found, verdict=Shown(self.verdict.answer))
+        numbers = {"executions": self.executions, "worst": self.worst}
+        return call(self, self.number, self.method, **numbers, verdict=Shown(self.verdict.answer))
 
 
 @dataclass(frozen=True, eq=False)

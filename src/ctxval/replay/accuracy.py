@@ -160,14 +160,14 @@ def stepped(model: Model, x: Array, u: Array) -> Array:
     """Return the next states of a model, ``(N, n)``."""
     try:
         with np.errstate(all="ignore"):
-            found = np.asarray(model.step(x, u), dtype=np.float64)
+            x_next = np.asarray(model.step(x, u), dtype=np.float64)
     except CtxvalError as error:
         raise _unusable(x, u, str(error)) from error
     except Exception as error:  # the user's model
         raise _unusable(x, u, f"{type(error).__name__}: {str(error)[:200]}") from error
-    if found.shape != x.shape:
-        raise _unusable(x, u, f"it returned the shape {found.shape}")
-    return found
+    if x_next.shape != x.shape:
+        raise _unusable(x, u, f"it returned the shape {x_next.shape}")
+    return x_next
 
 
 def _unusable(x: Array, u: Array, why: str) -> ModelError:

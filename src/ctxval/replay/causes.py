@@ -269,12 +269,12 @@ def _affine_errors(x: Array, u: Array, reached: Array, groups: Rows) -> Array:
     Z = np.column_stack([np.ones(len(x)), x, u])
     Z = Z / np.maximum(np.abs(Z).max(axis=0), 1e-12)
     odd = np.searchsorted(np.unique(groups), groups) % 2 == 1
-    found = np.zeros_like(reached)
+    errors = np.zeros_like(reached)
     for held in (odd, ~odd):
         if held.any() and (~held).sum() > Z.shape[1]:
             weights = np.linalg.lstsq(Z[~held], (reached - x)[~held], rcond=1e-10)[0]
-            found[held] = Z[held] @ weights + x[held] - reached[held]
-    return found
+            errors[held] = Z[held] @ weights + x[held] - reached[held]
+    return errors
 
 
 def _chosen(kind: str, errors: Mapping[float, Array], groups: Rows, usual: float) -> tuple[float, float, float] | None:

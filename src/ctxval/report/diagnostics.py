@@ -48,27 +48,28 @@ def _executions(context: ReportContext) -> Finding | None:
 
 
 def _certificate(context: ReportContext) -> Finding | None:
-    verdict, found = context.verdict, context.certificate
+    verdict, certificate = context.verdict, context.certificate
     if verdict is None or verdict.answer == "falsified":
         return None
-    if found is None:
+    if certificate is None:
         return Finding("Certificate", "bad", f"Refused: {verdict.reason}")
-    if found.doubt is None:
+    if certificate.doubt is None:
         return None
-    numbers = {
-        "kind": found.kind,
-        "upper_bound": found.upper_bound if np.isfinite(found.upper_bound) else None,
-        "confidence": found.confidence,
-    }
-    return Finding("Certificate", "bad", f"Withdrawn: {found.doubt}.", numbers)
+    bound = certificate.upper_bound if np.isfinite(certificate.upper_bound) else None
+    numbers = {"kind": certificate.kind, "upper_bound": bound, "confidence": certificate.confidence}
+    return Finding("Certificate", "bad", f"Withdrawn: {certificate.doubt}.", numbers)
 
 
 def _rests_on_distances(context: ReportContext) -> bool:
     """Return whether the answer depends on where the tasks lie: not a counterexample, not a bound from dynamics."""
-    verdict, found = context.verdict, context.certificate
+    verdict, certificate = context.verdict, context.certificate
     if verdict is None:
         return True
-    return verdict.answer != "falsified" and found is not None and (found.kind != "dynamics" or found.doubt is not None)
+    return (
+        verdict.answer != "falsified"
+        and certificate is not None
+        and (certificate.kind != "dynamics" or certificate.doubt is not None)
+    )
 
 
 def _covering(context: ReportContext) -> Finding | None:
@@ -118,8 +119,8 @@ def _smooth(context: ReportContext) -> Finding | None:
         "A Gaussian process of the distance predicts each trial from the others with errors of "
         f"{number(size, 2)} of its own standard deviations (root mean square; about 1 is expected)."
     )
-    found = Finding("Distance is smooth over the tasks", light, text, {"standardised_error": size})
-    return found.unless(context.designs)
+    finding = Finding("Distance is smooth over the tasks", light, text, {"standardised_error": size})
+    return finding.unless(context.designs)
 
 
 def stored_predictions(context: ReportContext) -> list[tuple[Trial, ExecutionPrediction]]:
@@ -130,30 +131,30 @@ def stored_predictions(context: ReportContext) -> list[tuple[Trial, ExecutionPre
 
 
 def _predictions(context: ReportContext) -> Finding | None:
-    found = stored_predictions(context)
-    if not found:
+    predicted = stored_predictions(context)
+    if not predicted:
         return None
     size = max(float(context.distances.max()), context.bound or 0.0)
-    held = sum(agrees(distance_of(trial), one.median, size) for trial, one in found)
+    held = sum(agrees(distance_of(trial), one.median, size) for trial, one in predicted)
     text = (
-        f"{held} of {counted(len(found), 'execution')} that were predicted beforehand came out within "
+        f"{held} of {counted(len(predicted), 'execution')} that were predicted beforehand came out within "
         f"{quantity(ACCURATE * size, context.labels.units)} of the prediction, which is {percent(ACCURATE)} of the "
         "largest distance or of the bound."
     )
-    light: Light = "good" if held == len(found) else "attention"
-    return Finding("Predictions made beforehand", light, text, {"made": len(found), "held": held})
+    light: Light = "good" if held == len(predicted) else "attention"
+    return Finding("Predictions made beforehand", light, text, {"made": len(predicted), "held": held})
 
 
 def _states_covered(context: ReportContext) -> Finding | None:
-    found = context.certificate
-    if found is None or "beyond_the_records" not in found.details:
+    certificate = context.certificate
+    if certificate is None or "beyond_the_records" not in certificate.details:
         return None
-    gap, beyond = found.details["coverage_gap"], found.details["beyond_the_records"]
+    gap, beyond = certificate.details["coverage_gap"], certificate.details["beyond_the_records"]
     text = (
         f"The closed loops of the tasks leave the recorded range of a state or an input by {percent(beyond)} of it or "
         f"less, and are never farther than {percent(gap)} of it from every record."
     )
-    light: Light = "good" if found.doubt is None else "attention"
+    light: Light = "good" if certificate.doubt is None else "attention"
     return Finding("States and inputs covered", light, text, {"beyond": beyond, "gap": gap})
 
 

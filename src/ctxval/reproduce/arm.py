@@ -117,8 +117,8 @@ class ArmModels(Study):
         worst = {m: [results[self._job("truth", m, s)]["distance"] for s in seeds] for m in MODELS}
         aspects: dict[str, list[Result]] = {m: [results[self._job("aspects", m, s)] for s in seeds] for m in MODELS}
         reached = {m: [float(np.median(a["system_error"])) for a in aspects[m]] for m in MODELS}
-        own = {m: [float(np.median(a["model_error"])) for a in aspects[m]] for m in MODELS}
-        missed, near = [spread(own[m])[0] for m in MODELS], MISSED * float(np.ptp(arm.Settings().z))
+        missed_by = {m: [float(np.median(a["model_error"])) for a in aspects[m]] for m in MODELS}
+        missed, near = [spread(missed_by[m])[0] for m in MODELS], MISSED * float(np.ptp(arm.Settings().z))
         within = {
             m: [
                 executions_within(distances_of(results[self._job("search", m, s)]), "gp-ucb", worst[m][s], 2.0)
@@ -142,17 +142,17 @@ class ArmModels(Study):
             Claim(
                 "the model itself performs its tasks (Remark 1, Aspect 1)",
                 "the model itself ends "
-                + ", ".join(f"{1000 * spread(own[m])[0]:.2f} mm ({MODELS[m][0]})" for m in MODELS)
+                + ", ".join(f"{1000 * spread(missed_by[m])[0]:.2f} mm ({MODELS[m][0]})" for m in MODELS)
                 + f" from its target, median over the table; {1000 * near:.0f} mm are {100 * MISSED:g} % of its side",
                 agreement(max(missed) < near, min(missed) < near),
-                "the other models do not even complete their own tasks, so that d* of these says little",
+                "the other models do not even complete their missed_by tasks, so that d* of these says little",
             ),
         ]
 
 
 def _order(measure: str, paper: str, values: dict[str, list[float]]) -> Claim:
-    medians = {model: spread(found)[0] for model, found in values.items()}
+    medians = {model: spread(distances)[0] for model, distances in values.items()}
     ordered = sorted(medians, key=lambda model: medians[model])
     best, worst = ordered[0] == "gp", ordered[-1] == "linear"
-    said = ", ".join(f"{MODELS[model][0]} {1000 * medians[model]:.1f} mm" for model in ordered)
-    return Claim(paper, f"{measure}, best first: {said}", agreement(best and worst, best or worst))
+    listed = ", ".join(f"{MODELS[model][0]} {1000 * medians[model]:.1f} mm" for model in ordered)
+    return Claim(paper, f"{measure}, best first: {listed}", agreement(best and worst, best or worst))

@@ -106,12 +106,12 @@ def records(distances: Array) -> list[list[float]]:
     The estimates of SC and of SD with k = 5 depend on no other distances.
     """
     largest: list[float] = []
-    found = []
+    pairs = []
     for index, distance in enumerate(distances.tolist()):
         if distance > (largest[-1] if len(largest) > DISCARDED else -np.inf):
             largest = sorted([*largest, distance], reverse=True)[: DISCARDED + 1]
-            found.append([index, distance])
-    return found
+            pairs.append([index, distance])
+    return pairs
 
 
 def distances_of(result: Result) -> Array:
@@ -144,10 +144,10 @@ def _frameworks(job: Job) -> Result:
     """Return the four frameworks of the paper's Example 1."""
     from ctxval.reproduce.frameworks import frameworks
 
-    found = frameworks(job.seed, per_axis=job.budget)
-    profiles = {name: getattr(found, name).tolist() for name in ("goals", "ccdt", "custom")}
-    restarts = {"oldt": found.oldt.restarts.tolist(), "olcd": found.olcd.restarts.tolist()}
-    return {**profiles, **restarts, "bound": found.bound, "closed_loop_torque": found.closed_loop_torque}
+    profile = frameworks(job.seed, per_axis=job.budget)
+    profiles = {name: getattr(profile, name).tolist() for name in ("goals", "ccdt", "custom")}
+    restarts = {"oldt": profile.oldt.restarts.tolist(), "olcd": profile.olcd.restarts.tolist()}
+    return {**profiles, **restarts, "bound": profile.bound, "closed_loop_torque": profile.closed_loop_torque}
 
 
 def _aspects(job: Job) -> Result:
@@ -159,8 +159,8 @@ def _aspects(job: Job) -> Result:
     if job.case == "arm":
         from ctxval.cases.arm import aspects
 
-        found = aspects(job.seed, **dict(job.options), per_axis=job.budget)
-        return {"model_error": found.model_error.tolist(), "system_error": found.system_error.tolist()}
+        errors = aspects(job.seed, **dict(job.options), per_axis=job.budget)
+        return {"model_error": errors.model_error.tolist(), "system_error": errors.system_error.tolist()}
     validation = job.experiment().validation
     points = validation.space.iid(job.budget, np.random.default_rng(job.seed))
     missed = TrackingError(components=(0, 1), over="mean")

@@ -59,13 +59,13 @@ class FourFrameworks(Study):
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
         """Draw the four profiles of the first trial."""
-        found = results[self.jobs(scale)[SHOWN]]
-        goals = np.array(found["goals"])
+        profile = results[self.jobs(scale)[SHOWN]]
+        goals = np.array(profile["goals"])
         for label, values, colour, line in (
-            ("OLDT: open loop, trajectories", np.full(len(goals), found["oldt"][0]), GREEN, "-."),
-            ("OLCD: open loop, final states", np.full(len(goals), found["olcd"][0]), PINK, ":"),
-            ("CCDT: closed loop, trajectories", found["ccdt"], ORANGE, "--"),
-            ("CuSTOM: closed loop, final states", found["custom"], BLUE, "-"),
+            ("OLDT: open loop, trajectories", np.full(len(goals), profile["oldt"][0]), GREEN, "-."),
+            ("OLCD: open loop, final states", np.full(len(goals), profile["olcd"][0]), PINK, ":"),
+            ("CCDT: closed loop, trajectories", profile["ccdt"], ORANGE, "--"),
+            ("CuSTOM: closed loop, final states", profile["custom"], BLUE, "-"),
         ):
             axes.semilogy(goals, np.maximum(values, 1e-3), color=colour, linestyle=line, linewidth=1.8, label=label)
 
@@ -77,8 +77,8 @@ class FourFrameworks(Study):
         return Columns(names, [found["goals"], *flat, found["ccdt"], found["custom"]])
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        found = [results[job] for job in self.jobs(scale)]
-        trials, biased = found[: scale.trials], found[scale.trials :]
+        stored = [results[job] for job in self.jobs(scale)]
+        trials, biased = stored[: scale.trials], stored[scale.trials :]
         profiles = [(np.array(trial["goals"]), np.array(trial["custom"])) for trial in trials]
         of_half = [(np.array(trial["points"]), np.array(trial["distances"])) for trial in biased]
         return [
@@ -123,18 +123,18 @@ def _two_regions(paper: str, profiles: list[tuple[Array, Array]]) -> Claim:
 
 
 def _ccdt_maximum(trials: list[Result]) -> Claim:
-    goals = [found["goals"][int(np.argmax(found["ccdt"]))] for found in trials]
+    goals = [trial["goals"][int(np.argmax(trial["ccdt"]))] for trial in trials]
     return Claim(
         f"CCDT is largest near a goal of {PAPERS_GOAL} rad",
-        f"largest at {ranged(goals, 2)} rad, where it is {ranged([max(found['ccdt']) for found in trials], 2)}",
+        f"largest at {ranged(goals, 2)} rad, where it is {ranged([max(trial['ccdt']) for trial in trials], 2)}",
         agreement(max(abs(goal - PAPERS_GOAL) for goal in goals) < 0.1),
     )
 
 
 def _open_loop_is_higher(trials: list[Result]) -> Claim:
-    oldt, olcd = ([found[name][0] for found in trials] for name in ("oldt", "olcd"))
+    oldt, olcd = ([trial[name][0] for trial in trials] for name in ("oldt", "olcd"))
     over = [min(o / max(f["ccdt"]), c / max(f["custom"])) for o, c, f in zip(oldt, olcd, trials, strict=True)]
-    gaps = [100 * (1 - np.median(found[name]) / found[name][0]) for found in trials for name in ("oldt", "olcd")]
+    gaps = [100 * (1 - np.median(trial[name]) / trial[name][0]) for trial in trials for name in ("oldt", "olcd")]
     return Claim(
         "OLDT and OLCD are flat, and much higher than CCDT and CuSTOM",
         f"OLDT {spread(oldt)[0]:.1f}, OLCD {spread(olcd)[0]:.1f} with |u| <= {trials[0]['bound']:g} N m, a bound of "
@@ -214,8 +214,8 @@ class Techniques(Study):
         rows = []
         for seed in range(scale.trials):
             truth = results[Job("truth", "pendulum", seed)]["distance"]
-            found = distances_of(results[Job("search", "pendulum", seed, search=search, budget=_BUDGET)])
-            rows.append(100 * (1 - running_estimate(found, search) / truth))
+            distances = distances_of(results[Job("search", "pendulum", seed, search=search, budget=_BUDGET)])
+            rows.append(100 * (1 - running_estimate(distances, search) / truth))
         return np.array(rows)
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:

@@ -148,16 +148,17 @@ def _domain(context: ReportContext) -> str:
 
 
 def _uncertainty(context: ReportContext) -> str:
-    found = context.certificate
-    if found is None:
+    certificate = context.certificate
+    if certificate is None:
         return "No certificate was computed, so no uncertainty is stated for tasks that were not executed."
-    bound = with_error(found.upper_bound, found.error)
-    said = (
-        f"By the certificate {found.kind}, d* is at most {bound} with confidence {number(found.confidence)}"
-        f"{f', except for {at_most(100 * found.volume, 3)} % of the tasks' if found.volume else ''}. The uncertainty "
-        "of the measured trajectories themselves is not part of it."
+    bound = with_error(certificate.upper_bound, certificate.error)
+    except_for = f", except for {at_most(100 * certificate.volume, 3)} % of the tasks" if certificate.volume else ""
+    withdrawn = "" if certificate.doubt is None else f" The certificate is withdrawn: {certificate.doubt}."
+    return (
+        f"By the certificate {certificate.kind}, d* is at most {bound} with confidence "
+        f"{number(certificate.confidence)}{except_for}. The uncertainty of the measured trajectories themselves is not "
+        f"part of it.{withdrawn}"
     )
-    return f"{said} The certificate is withdrawn: {found.doubt}." if found.doubt is not None else said
 
 
 def _robustness(context: ReportContext) -> str:
@@ -170,10 +171,10 @@ def _robustness(context: ReportContext) -> str:
 
 
 def _verification(context: ReportContext) -> str:
-    said = "; ".join(f"{one.name}: {WORDS[one.light]}" for one in diagnostics(context)) or "nothing is unusual"
+    lights = [f"{finding.name}: {WORDS[finding.light]}" for finding in diagnostics(context)]
     return (
         "Software and solution verification of the model itself are not part of this campaign. Diagnostics of the "
-        f"campaign: {said}."
+        f"campaign: {'; '.join(lights) or 'nothing is unusual'}."
     )
 
 
