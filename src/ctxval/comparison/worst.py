@@ -119,7 +119,12 @@ class WorstQuestion:
                 self.undecided, key=lambda pair: expected[pair[1].name][0] / max(expected[pair[0].name][0], 1e-300)
             )
             if self._needs_fact(better, worse, expected):
-                self._execute(worse, *self._raising(worse, *expected[worse.name]))
+                value, task = expected[worse.name]
+                known = np.array([trial.unit_point for trial in worse.trials])
+                if task is None or (len(known) and np.abs(known - task).max(axis=1).min() <= NEAR):
+                    self._execute(worse, Choice())  # no new task: the choice of the search
+                else:
+                    self._execute(worse, Choice(task, "covering"), value)
                 return True
             rule = IntervalSearch(better.recorder, self.options, self.budget, worse.largest)
             choice = rule.choose()
@@ -150,13 +155,6 @@ class WorstQuestion:
         untested = worse.largest < TESTED * expected[worse.name][0]
         insisted = len(_worst_trials(worse)) >= _INSIST + others
         return untested and not insisted
-
-    def _raising(self, candidate: Candidate, value: float, task: Array | None) -> tuple[Choice, float | None]:
-        """Return the predicted worst task with its prediction; the choice of the search if it is no new task."""
-        known = np.array([trial.unit_point for trial in candidate.trials])
-        if task is None or (len(known) and np.abs(known - task).max(axis=1).min() <= NEAR):
-            return Choice(), None
-        return Choice(task, "covering"), value
 
     def _certified(self, better: Candidate) -> bool:
         """Keep all decisions by the certificate of a candidate; return whether there is a new one."""

@@ -104,9 +104,10 @@ class _Checked:
             identifier = self.h5py.h5o.open(group, name)
             if isinstance(identifier, self.h5py.h5d.DatasetID):
                 self.dataset(path, identifier)
-            elif isinstance(identifier, self.h5py.h5g.GroupID) and depth:
-                if not self._has(identifier, b"MATLAB_sparse"):
-                    self.group(path, identifier, depth - 1)
+                continue
+            is_group = isinstance(identifier, self.h5py.h5g.GroupID)
+            if is_group and depth and not self._has(identifier, b"MATLAB_sparse"):
+                self.group(path, identifier, depth - 1)
 
     def dataset(self, path: str, identifier: Any) -> None:
         h5d, h5z = self.h5py.h5d, self.h5py.h5z

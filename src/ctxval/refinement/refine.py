@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 from ctxval._util.checked import PositiveFloat, PositiveInt, checked
 from ctxval._util.progress import stage
@@ -29,14 +29,8 @@ from ctxval.refinement.methods import Learned, Method, method_of
 from ctxval.refinement.records import Records
 from ctxval.refinement.rounds import Refinement, Round
 
-
-class OpensRound(Protocol):
-    """Makes the campaign of a round."""
-
-    def __call__(
-        self, validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
-    ) -> Campaign:
-        """Return the campaign of a refined model."""
+OpensRound = Callable[[Validation, Path | None, Path | None, CertificateOptions], Campaign]
+"""A function that makes the campaign of a round, from its validation, its store, the file of its model and options."""
 
 
 @checked
@@ -102,8 +96,7 @@ def refine(
         return loop.run()
 
 
-@dataclass(frozen=True, eq=False)
-class _RefinedModel:
+class _RefinedModel(NamedTuple):
     """A refined model before its first execution."""
 
     model: Refined
