@@ -53,10 +53,10 @@ def test_a_mapping_in_toml_is_that_in_python(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"states": {}}, "a mapping of a log needs at least one state"),
-        ({"dt": 0}, "dt of a mapping must be a positive number of seconds, got 0"),
-        ({"dt": True}, "dt of a mapping must be a positive number of seconds, got True"),
-        ({"longest_gap": -1}, "longest_gap of a mapping must be a positive number"),
-        ({"delay": float("inf")}, "delay of a mapping must be a finite number"),
+        ({"dt": 0}, "dt must be a positive number of seconds, got 0"),
+        ({"dt": True}, "dt must be a positive number of seconds, got True"),
+        ({"longest_gap": -1}, "longest_gap must be a positive number"),
+        ({"delay": float("inf")}, "delay must be a finite number"),
         ({"stamp": "lag"}, "no stamp is called 'lag'; did you mean 'log'"),
         ({"time_unit": "week"}, "no known factor from week to s"),
         ({"inputs": {"x": "u"}}, "x is a state and an input: give them different names"),
@@ -64,7 +64,7 @@ def test_a_mapping_in_toml_is_that_in_python(tmp_path: Path) -> None:
         ({"inputs": {"u": 3}}, "the field u must be a path or a table, got 3"),
         ({"inputs": {"u": ""}}, "the path of a field must be a text, got ''"),
         ({"inputs": {"u": {"factr": 2}}}, "entry of the field u is called 'factr'; did you mean 'factor'"),
-        ({"inputs": {"u": {"factor": "2"}}}, "factor of the field u must be a finite number, got '2'"),
+        ({"inputs": {"u": {"factor": "2"}}}, "the field u: factor must be a finite number, got '2'"),
         ({"inputs": {"u": {"recorded": "deg", "unit": "m"}}}, "the field u: there is no known factor from deg to m"),
         (
             {"inputs": {"u": {"recorded": "furlong", "unit": "m"}}},

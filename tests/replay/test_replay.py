@@ -13,8 +13,7 @@ from ctxval.cases import by_name
 from ctxval.data import LogMapping, MemoryTable, Recordings, recordings_of
 from ctxval.errors import InputError, ModelError
 from ctxval.replay import ReplayReport, replay
-from ctxval.replay.accuracy import normalised
-from ctxval.replay.steps import root_mean_square
+from ctxval.replay.accuracy import normalised, root_mean_square
 from ctxval.replay.untested import _informative
 from rig_logs import DT, run
 
@@ -314,7 +313,7 @@ def test_recordings_of_a_small_region_are_said_to_be_left() -> None:
     runs = [experiment.validation.execute(experiment.validation.plan([goal])) for goal in (2.9, 3.0, 3.1)]
     logs = [MemoryTable(f"run {k}", {"t": one.times, "x": one.states, "u": one.inputs}) for k, one in enumerate(runs)]
     report = replay(experiment.validation.model, recordings_of(logs), validation=experiment.validation)
-    assert any("lead beyond all records of" in text for text in report.insights)
+    assert any("leave the recorded range of" in text for text in report.insights)
 
 
 def test_recordings_that_the_model_explains_predict_nothing_of_the_tasks() -> None:

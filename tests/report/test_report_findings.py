@@ -15,9 +15,19 @@ from ctxval.report import ReportContext, context_of_campaign
 from ctxval.report.diagnostics import diagnostics, not_tested, share_far_from_trials
 from ctxval.report.distance_model import DistanceModel
 from ctxval.report.findings import Finding, findings_of
-from ctxval.report.insights import insights
-from ctxval.report.insights_loops import components, converged, flips, goals, saturation, unusual_motion
-from ctxval.report.insights_tasks import bias, explained, weak_region, weak_states
+from ctxval.report.insights import (
+    bias,
+    components,
+    converged,
+    explained,
+    flips,
+    goals,
+    insights,
+    saturation,
+    unusual_motion,
+    weak_region,
+    weak_states,
+)
 
 
 @pytest.fixture(scope="module")

@@ -18,9 +18,9 @@ from rig_pages import HOSTILE, hostile_store, pendulum, plane
 from ctxval import Campaign, Trial, report
 from ctxval.certificates import CertificateOptions, Region
 from ctxval.errors import InputError
-from ctxval.report import ReportContext, context_of_campaign, context_of_store
+from ctxval.report import ReportContext, context_of_campaign, context_of_store, sections
 from ctxval.report.recorded_lines import packed, recorded_lines
-from ctxval.report.sections import appendix, base
+from ctxval.report.sections import appendix
 from ctxval.report.sections.repeat import command_of, identity, python_snippet
 
 POSTERIOR = CertificateOptions.posterior()
@@ -226,11 +226,11 @@ def test_what_is_no_section_is_refused(swing: ReportContext) -> None:
 
 
 def test_installed_packages_add_sections(swing: ReportContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("weather", "test_report_page:Sunny", base.GROUP)
-    monkeypatch.setattr(base, "entry_points", lambda group: [point])
+    point = EntryPoint("weather", "test_report_page:Sunny", sections.GROUP)
+    monkeypatch.setattr(sections, "entry_points", lambda group: [point])
     assert "sunshine" in report.page(swing)
-    broken = EntryPoint("broken", "no_such_module:Nothing", base.GROUP)
-    monkeypatch.setattr(base, "entry_points", lambda group: [broken])
+    broken = EntryPoint("broken", "no_such_module:Nothing", sections.GROUP)
+    monkeypatch.setattr(sections, "entry_points", lambda group: [broken])
     with pytest.raises(InputError, match="the section 'broken' cannot be loaded"):
         report.page(swing)
 
@@ -329,8 +329,8 @@ def test_the_report_of_very_many_trials_stays_small(tmp_path: Path) -> None:
             trial = Trial(number, "iid", "completed", point, named, 1, True, float(point.sum()))
             store._insert(trial)
             if number % 5 == 0:
-                store._write_trajectory(number, "model", model)
-                store._write_trajectory(number, "system", Trajectory(model.times, rng.random((201, 3)), model.inputs))
+                store._trajectories.write(number, "model", model)
+                store._trajectories.write(number, "system", Trajectory(model.times, rng.random((201, 3)), model.inputs))
     path = report.write_page(context_of_store(store, 1.9, certificate=POSTERIOR), tmp_path / "many.html")
     assert path.stat().st_size < 1_500_000
     assert "cannot be shown" not in path.read_text(encoding="utf-8")

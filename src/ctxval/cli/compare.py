@@ -20,7 +20,8 @@ from ctxval.cli.options import AsJson, Confidence, PartOptions, named_values
 from ctxval.cli.outputs import Force, require_outputs
 from ctxval.cli.screen import line
 from ctxval.comparison.candidates import Candidate, require_comparable
-from ctxval.comparison.compare import BUDGET, race_of, store_name
+from ctxval.comparison.compare import BUDGET, store_name
+from ctxval.comparison.race import Race
 from ctxval.comparison.result import WORDS, Comparison
 from ctxval.comparison.tables import CANDIDATES, PAIRS, candidate_rows, markdown, pair_rows
 from ctxval.config.settings import Settings, read_settings
@@ -100,9 +101,9 @@ def compare(
     picture = None if out_file is None else out_file.with_suffix(".png")
     require_outputs({"--out .md": out_file, "its picture": picture}, candidates, force=force)
     made = _candidates(_named(candidates), stores, seed, named_values(option))
-    race = race_of(
+    race = Race(
         made,
-        question,
+        question,  # type: ignore[arg-type]  # the constructor refuses other words
         budget=budget,
         confidence=CONFIDENCE if confidence is None else confidence,
         seed=seed,

@@ -73,12 +73,7 @@ class TrialNote:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One model, controller or distance, with its campaign.
-
-    Attributes:
-        name: the name in the comparison.
-        campaign: the campaign, whose store has its trials.
-    """
+    """One model, controller or distance, with its campaign."""
 
     name: str
     campaign: Campaign
@@ -111,8 +106,8 @@ class Candidate:
 
     def trial_at(self, point: Array) -> Trial | None:
         """Return the last trial of a task, a point of the unit cube ``(d,)``; None if there is none."""
-        found = [trial for trial in self.trials if np.array_equal(trial.unit_point, point)]
-        return found[-1] if found else None
+        trials = [trial for trial in self.trials if np.array_equal(trial.unit_point, point)]
+        return trials[-1] if trials else None
 
     def trajectories(self) -> Iterator[tuple[Trial, Trajectory]]:
         """Yield the completed trials with a recorded trajectory; each trajectory is read once."""
@@ -137,14 +132,14 @@ def require_comparable(candidates: Mapping[str, Validation]) -> None:
     """Check that the candidates have the same system, the same tasks and distances of the same unit."""
     if len(candidates) < 2:
         raise InputError(f"a comparison needs at least two candidates, got {len(candidates)}.")
-    if any(getattr(one.system, "manual", False) for one in candidates.values()):
+    if any(getattr(candidate.system, "manual", False) for candidate in candidates.values()):
         raise InputError("candidates cannot be compared on a system that people execute.")
     (first, expected), *others = candidates.items()
     described = _comparable(expected)
     for other, validation in others:
-        found = _comparable(validation)
+        other_described = _comparable(validation)
         for part, what in (("space", "task spaces"), ("tasks", "tasks"), ("system", "systems")):
-            unequal = next(differences(described[part], found[part], part), None)
+            unequal = next(differences(described[part], other_described[part], part), None)
             if unequal is not None:
                 raise InputError(
                     f"{first} and {other} must have the same {what}, but {unequal[0]} differs: only models, "

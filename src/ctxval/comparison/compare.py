@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
 
-from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked, require
+from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, checked
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import Campaign
-from ctxval.certificates.options import CONFIDENCE, require_confidence
-from ctxval.comparison.candidates import Candidate, Question
+from ctxval.certificates.options import CONFIDENCE
+from ctxval.comparison.candidates import Candidate
 from ctxval.comparison.executions import OnTrial
-from ctxval.comparison.race import Race
+from ctxval.comparison.race import Asked, Race
 from ctxval.comparison.result import Comparison
 from ctxval.core.experiment import Experiment
 from ctxval.core.validation import Validation
@@ -23,9 +22,6 @@ BUDGET = 100
 """Default of the largest number of executions."""
 
 Compared = Validation | Experiment | Campaign
-
-
-Asked = Literal["worst", "mean", "both"]
 
 
 @checked
@@ -73,7 +69,7 @@ def compare(
         ModelError, DesignError, DistanceError: as in :meth:`ctxval.Campaign.run`; what was executed is stored.
     """
     made = [Candidate(str(name), _campaign(str(name), one, stores, seed)) for name, one in candidates.items()]
-    race = race_of(
+    race = Race(
         made,
         question,
         budget=budget,
@@ -85,39 +81,6 @@ def compare(
     )
     with progress_shown(progress):
         return race.run()
-
-
-@checked
-def race_of(
-    candidates: list[Candidate],
-    question: str,
-    *,
-    budget: PositiveInt,
-    confidence: Probability,
-    seed: NonNegativeInt,
-    largest_possible: PositiveFloat | None = None,
-    stochastic: bool = False,
-    on_trial: OnTrial | None = None,
-) -> Race:
-    """Return the comparison of campaigns; the arguments are those of :func:`compare`."""
-    require("question", Asked, question)
-    known: dict[str, tuple[Question, ...]] = {"worst": ("worst",), "mean": ("mean",), "both": ("worst", "mean")}
-    if stochastic and question != "mean":
-        raise InputError(
-            f"question must be mean for a stochastic system, got {question!r}: an execution may have a larger distance "
-            "than the largest expected one, so executed distances do not tell which d* is larger."
-        )
-    require_confidence(confidence)
-    return Race(
-        candidates,
-        known[question],
-        budget=budget,
-        confidence=float(confidence),
-        seed=seed,
-        largest_possible=largest_possible,
-        stochastic=stochastic,
-        on_trial=on_trial,
-    )
 
 
 def _campaign(name: str, candidate: Compared, stores: str | Path | None, seed: int) -> Campaign:

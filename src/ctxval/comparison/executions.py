@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,23 +22,13 @@ from ctxval.errors import CtxvalError, DistanceError
 OnTrial = Callable[[str, Trial], None]
 """Called with the name of a candidate and each of its trials that has ended."""
 
-_AGREE = 1e-9
-"""Largest difference of two inputs that are the same, as a share of the largest magnitude of each input."""
-
 NoteFor = Callable[[Candidate, Trial, TrialNote], TrialNote]
 """Returns the note of a shared trial, from the trial that was executed and its note."""
 
 
 @dataclass(eq=False)
 class Executions:
-    """Executes tasks for candidates, and records each execution for all candidates whose controllers agree.
-
-    Attributes:
-        candidates: all candidates.
-        note_for: returns the note of a shared trial.
-        on_trial: called with each trial that has ended; None if nobody listens.
-        kept: returns the decisions so far, which are stored with each trial.
-    """
+    """Executes tasks for candidates, and records each execution for all candidates whose controllers agree."""
 
     candidates: Sequence[Candidate]
     note_for: NoteFor
@@ -48,7 +39,7 @@ class Executions:
 
     def __post_init__(self) -> None:
         for candidate in self.candidates:
-            candidate.recorder.dynamics.elsewhere = _Elsewhere(self, candidate)
+            candidate.recorder.dynamics.elsewhere = partial(self.elsewhere, candidate)
 
     @property
     def count(self) -> int:
@@ -62,19 +53,14 @@ class Executions:
         return max((note.step + 1 for note in notes if note is not None), default=0)
 
     def history(self, without: Array | None = None) -> list[tuple[Trial, Trajectory]]:
-        """Return all executions in the order in which they were made, each one once.
-
-        Args:
-            without: a task that is left out, a point of the unit cube ``(d,)``.
-        """
-        found = [
-            (-1 if (note := TrialNote.of(trial)) is None else note.step, row, trial, trajectory)
+        """Return all executions in the order in which they were made, each one once."""
+        executed = [
+            ((-1 if (note := TrialNote.of(trial)) is None else note.step, row, trial.number), trial, trajectory)
             for row, candidate in enumerate(self.candidates)
             for trial, trajectory in candidate.trajectories()
             if not is_shared(trial) and (without is None or not np.array_equal(trial.unit_point, without))
         ]
-        ordered = sorted(found, key=lambda one: (one[0], one[1], one[2].number))
-        return [(trial, trajectory) for _, _, trial, trajectory in ordered]
+        return [(trial, trajectory) for _, trial, trajectory in sorted(executed, key=lambda row: row[0])]
 
     def execute(self, candidate: Candidate, choice: Choice, note: TrialNote, *, predicts: bool) -> None:
         """Execute one task, and record the execution for the others."""
@@ -130,11 +116,10 @@ class Executions:
             return
         with other.campaign.store.sole_writer(), self.hiding(trial.unit_point):
             if known is None:
-                own = replace(
-                    self.note_for(other, trial, note), shared=(candidate.name, trial.number), decided=self.kept()
-                )
+                source = candidate.name, trial.number
+                copied = replace(self.note_for(other, trial, note), shared=source, decided=self.kept()).to_note()
                 choice = Choice(
-                    trial.unit_point, trial.origin, planned_draws=0, note=own.to_note(), parameters=trial.parameters
+                    trial.unit_point, trial.origin, planned_draws=0, note=copied, parameters=trial.parameters
                 )
                 with other.recorder.predicting(note.question == "worst"):
                     known = other.recorder.open(choice).trial
@@ -155,29 +140,18 @@ class Executions:
 
     def elsewhere(self, candidate: Candidate) -> list[Trajectory]:
         """Return the executions that are in no trial of a candidate."""
-        own = {note.shared for trial in candidate.trials if (note := TrialNote.of(trial)) is not None and note.shared}
+        known = {note.shared for trial in candidate.trials if (note := TrialNote.of(trial)) is not None and note.shared}
         return [
             trajectory
             for other in self.candidates
             if other is not candidate
             for trial, trajectory in other.trajectories()
             if not is_shared(trial)
-            and (other.name, trial.number) not in own
+            and (other.name, trial.number) not in known
             and (self._hidden is None or not np.array_equal(trial.unit_point, self._hidden))
         ]
 
 
-@dataclass(frozen=True, eq=False)
-class _Elsewhere:
-    """The executions that teach the dynamics to a candidate although they are none of its trials."""
-
-    executions: Executions
-    candidate: Candidate
-
-    def __call__(self) -> Sequence[Trajectory]:
-        return self.executions.elsewhere(self.candidate)
-
-
 def agrees(plan: Plan, trajectory: Trajectory) -> bool:
     """Return whether an execution is recorded for the candidate with this plan, too."""
-    return gives_inputs(plan, trajectory, _AGREE)
+    return gives_inputs(plan, trajectory, 1e-9)  # a share of the largest magnitude of each input

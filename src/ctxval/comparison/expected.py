@@ -16,8 +16,7 @@ from ctxval.comparison.executions import Executions
 from ctxval.comparison.predictions import Predictions
 from ctxval.core.trial import Trial
 
-_DRAWS = 0x6472
-"""Identifies the random stream of the tasks of a comparison; it is none of the streams of trials."""
+_DRAWS = 0x6472  # identifies the random stream of the tasks of a comparison; it is none of the streams of trials
 
 
 @dataclass(eq=False)
@@ -26,13 +25,6 @@ class MeanQuestion:
 
     Each task is drawn from the distribution of tasks and executed with every candidate that is in an undecided pair.
     Before its draw, the distance of each candidate is predicted from all executions so far.
-
-    Attributes:
-        executions: executes the tasks.
-        predictions: for each candidate, by name.
-        confidence: the probability with which all decisions and intervals hold together.
-        seed: the seed of the draws.
-        most: a number that no distance can exceed; None if none is known.
     """
 
     executions: Executions
@@ -46,37 +38,33 @@ class MeanQuestion:
         """All candidates."""
         return self.executions.candidates
 
-    @property
-    def beta(self) -> float:
-        """The probability of an error for one pair."""
-        count = len(self.candidates)
-        return (1 - self.confidence) / (count * (count - 1) / 2)
-
     def point(self, draw: int) -> Array:
         """Return an independent draw from the distribution of tasks, a point of the unit cube ``(d,)``.
 
         It depends on all models, so that a model that is learned again with the draws is not judged by them.
         """
-        models = [one.recorder.draws.of_model() for one in self.candidates]
+        models = [candidate.recorder.draws.of_model() for candidate in self.candidates]
         rng = np.random.default_rng([self.seed, draw, _DRAWS, *models])
         space = self.candidates[0].campaign.validation.space
         return np.asarray(space.rounded(space.unit_draws(1, rng)[0]))
 
     def draws_of(self, candidate: Candidate) -> dict[int, tuple[Trial, TrialNote]]:
         """Return the trials of the draws that have ended, by the number of the draw."""
-        found = ((trial, TrialNote.of(trial)) for trial in candidate.trials if trial.state != "open")
-        return {note.draw: (trial, note) for trial, note in found if note is not None and note.draw is not None}
+        noted = ((trial, TrialNote.of(trial)) for trial in candidate.trials if trial.state != "open")
+        return {note.draw: (trial, note) for trial, note in noted if note is not None and note.draw is not None}
 
     def difference(self, a: Candidate, b: Candidate) -> MeanDifference:
         """Return the expected distance of a candidate minus that of another one."""
-        return mean_difference(self.differences(a, b), self.beta)
+        count = len(self.candidates)
+        error_of_pair = (1 - self.confidence) / (count * (count - 1) / 2)
+        return mean_difference(self.differences(a, b), error_of_pair)
 
     def differences(self, a: Candidate, b: Candidate) -> PairedDifferences:
         """Return the differences at the draws that both have, up to the first one without a usable distance."""
         first, second = self.draws_of(a), self.draws_of(b)
         values, predicted = [], []
         for draw in sorted(first.keys() & second.keys()):
-            pair = [self._known(*found[draw]) for found in (first, second)]
+            pair = [self._known(*draws[draw]) for draws in (first, second)]
             if pair[0] is None or pair[1] is None:
                 break
             values.append(pair[0][0] - pair[1][0])
@@ -105,20 +93,17 @@ class MeanQuestion:
     @property
     def undecided(self) -> list[tuple[Candidate, Candidate]]:
         """The pairs that are not decided and can still be."""
-        return [
-            (a, b)
-            for a, b in combinations(self.candidates, 2)
-            if not self.difference(a, b).sign and self.lost(a, b) is None
-        ]  # fmt: skip
+        pairs = combinations(self.candidates, 2)
+        return [(a, b) for a, b in pairs if not self.difference(a, b).sign and self.lost(a, b) is None]
 
     def step(self, left: int) -> bool:
         """Execute the next draw with one candidate; return False if there is nothing to execute."""
-        active = [one for one in self.candidates if any(one in pair for pair in self.undecided)]
+        active = [candidate for candidate in self.candidates if any(candidate in pair for pair in self.undecided)]
         if not active:
             return False
         draw = self._next_draw()
         point = self.point(draw)
-        waiting = [one for one in active if draw not in self.draws_of(one)]
+        waiting = [candidate for candidate in active if draw not in self.draws_of(candidate)]
         if not waiting:
             draw += 1
             point, waiting = self.point(draw), active
@@ -132,21 +117,16 @@ class MeanQuestion:
     def _usual_cost(self, active: int) -> int:
         """Return the number of executions that the last draw took; that of all candidates if there was none."""
         last = self._next_draw()
-        own = [
-            note.shared is None
-            for one in self.candidates
-            for draw, (_, note) in self.draws_of(one).items()
-            if draw == last
-        ]
-        return min(active, sum(own) or active)
+        notes = [self.draws_of(candidate)[last][1] for candidate in self.candidates if last in self.draws_of(candidate)]
+        return min(active, sum(note.shared is None for note in notes) or active)
 
     def _next_draw(self) -> int:
         """Return the number of the last draw that was begun; 0 if there was none."""
-        return max((draw for one in self.candidates for draw in self.draws_of(one)), default=0)
+        return max((draw for candidate in self.candidates for draw in self.draws_of(candidate)), default=0)
 
     def note_of(self, candidate: Candidate, note: TrialNote, point: Array) -> TrialNote:
         """Return the note of a draw for a candidate, with the prediction from all executions of other tasks."""
         known = [(trial.unit_point, trajectory) for trial, trajectory in self.executions.history(without=point)]
-        found = self.predictions[candidate.name].of_draw(known, point, note.draw or 0, self.most)
-        value, centre = (None, None) if found is None else found
+        prediction = self.predictions[candidate.name].of_draw(known, point, note.draw or 0, self.most)
+        value, centre = (None, None) if prediction is None else prediction
         return TrialNote(note.step, "mean", note.draw, value, centre)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctxval._util.texts import shortened
-from ctxval.comparison.result import Comparison, PairResult
+from ctxval.comparison.result import Comparison
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's colours survive colour blindness; the markers survive grey print.
 _BLUE, _ORANGE, _GREY = "#0072B2", "#D55E00", "#707070"
-_LONGEST = 24
 
 
 def picture(comparison: Comparison) -> Figure:
@@ -42,51 +41,50 @@ def _worst(ax: Axes, comparison: Comparison) -> None:
         if one.bound is not None:
             ax.plot(one.bound, row, "|", color=_ORANGE, markersize=14, markeredgewidth=2.5)
     ax.plot([], [], "|", color=_ORANGE, markersize=12, markeredgewidth=2.5, label="bound on d*")
-    _rows(ax, [one.name for one in comparison.candidates])
-    ax.set_xlabel(_label("distance", comparison.units))
-    known = [value for one in comparison.candidates for value in (one.largest, one.bound) if value is not None]
+    known = [
+        value
+        for candidate in comparison.candidates
+        for value in (candidate.largest, candidate.bound)
+        if value is not None
+    ]
     ax.set_xlim(0, 1.08 * max(known, default=1.0) or 1.0)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=2, fontsize=8, frameon=False)
+    _finish(ax, [candidate.name for candidate in comparison.candidates], "distance", comparison)
 
 
 def _mean(ax: Axes, comparison: Comparison) -> None:
     """Draw the confidence sequence of each difference of expected distances."""
-    pairs = [one for one in comparison.pairs if one.question == "mean"]
+    pairs = [pair for pair in comparison.pairs if pair.question == "mean"]
     ax.set_title("difference of expected distances")
     ax.axvline(0.0, color="black", linewidth=1)
     finite = [
-        abs(end) for one in pairs for end in (one.low, one.high, one.estimate) if end is not None and np.isfinite(end)
+        abs(end)
+        for pair in pairs
+        for end in (pair.low, pair.high, pair.estimate)
+        if end is not None and np.isfinite(end)
     ]
     reach = 1.15 * max(finite, default=1.0) or 1.0
-    for row, one in enumerate(pairs):
-        _interval(ax, row, one, reach)
-    _rows(ax, [f"{_short(one.first)} - {_short(one.second)}" for one in pairs])
-    ax.set_xlim(-reach, reach)
-    ax.locator_params(axis="x", nbins=5)
-    ax.set_xlabel(_label("difference", comparison.units))
     ax.plot([], [], "o-", color=_BLUE, label="decided")
     ax.plot([], [], "s--", color=_GREY, markerfacecolor="white", label="undecided")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=2, fontsize=8, frameon=False)
+    for row, pair in enumerate(pairs):
+        low, high = (reach if end is None else end for end in (pair.low, pair.high))
+        decided = pair.smaller is not None
+        colour, line, marker = (_BLUE, "-", "o") if decided else (_GREY, "--", "s")
+        ax.plot(np.clip([low, high], -2 * reach, 2 * reach), [row, row], line, color=colour, linewidth=2)
+        if pair.estimate is not None:
+            ax.plot(pair.estimate, row, marker, color=colour, markerfacecolor=colour if decided else "white")
+    _finish(ax, [f"{_short(pair.first)} - {_short(pair.second)}" for pair in pairs], "difference", comparison)
+    ax.set_xlim(-reach, reach)
+    ax.locator_params(axis="x", nbins=5)
 
 
-def _interval(ax: Axes, row: int, one: PairResult, reach: float) -> None:
-    low, high = (reach if end is None else end for end in (one.low, one.high))
-    decided = one.smaller is not None
-    colour, line, marker = (_BLUE, "-", "o") if decided else (_GREY, "--", "s")
-    ax.plot(np.clip([low, high], -2 * reach, 2 * reach), [row, row], line, color=colour, linewidth=2)
-    if one.estimate is not None:
-        ax.plot(one.estimate, row, marker, color=colour, markerfacecolor=colour if decided else "white")
-
-
-def _rows(ax: Axes, names: list[str]) -> None:
+def _finish(ax: Axes, names: list[str], label: str, comparison: Comparison) -> None:
+    """Name the rows and the axis, and add the legend."""
     ax.set_yticks(range(len(names)), [_short(name) for name in names])
     ax.set_ylim(len(names) - 0.5, -0.5)
     ax.grid(axis="x", alpha=0.25)
+    ax.set_xlabel(f"{label} [{comparison.units}]" if comparison.units else label)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=2, fontsize=8, frameon=False)
 
 
 def _short(name: str) -> str:
-    return shortened(name, _LONGEST)
-
-
-def _label(name: str, units: str) -> str:
-    return f"{name} [{units}]" if units else name
+    return shortened(name, 24)

@@ -13,17 +13,8 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.learning import DynamicsStudy
 from ctxval.searches import Prediction
 
-_POOL = (400, 48)
-"""Number of tasks whose largest predicted distance is looked for, if controllers are designed in batches or not."""
-
-_CENTRE = (200, 24)
-"""Number of tasks over which the prediction of a draw is averaged, likewise."""
-
-_HEADROOM = 2.0
-"""A predicted distance counts as at most this multiple of the largest executed one: learned dynamics may diverge."""
-
+# Identify random streams of tasks that are only predicted; they are none of the streams of trials.
 _POOL_STREAM, _CENTRE_STREAM = 0x706F, 0x6365
-"""Identify random streams of tasks that are only predicted; they are none of the streams of trials."""
 
 Known = Sequence[tuple[Array, Trajectory]]
 """Executed tasks, points of the unit cube ``(d,)``, with the system's trajectories."""
@@ -34,10 +25,6 @@ class Predictions:
 
     The system is the same for all candidates, so each execution teaches the residual of each model, whatever controller
     was used.
-
-    Args:
-        candidate: the candidate.
-        seed: the seed of the tasks that are predicted.
     """
 
     def __init__(self, candidate: Candidate, seed: int) -> None:
@@ -52,7 +39,8 @@ class Predictions:
         prediction = self._from(known)
         if prediction is None:
             return None
-        rng, count = np.random.default_rng([self._seed, _POOL_STREAM]), _POOL[not self._batched]
+        # With and without designs in batches.
+        rng, count = np.random.default_rng([self._seed, _POOL_STREAM]), (400, 48)[not self._batched]
         points = rng.random((count, self._space.dimension))
         snapped = rng.random(points.shape) < 0.5 * (np.arange(count) % 2)[:, None]  # maxima often lie at bounds
         points = np.where(snapped, np.round(points), points)
@@ -67,22 +55,17 @@ class Predictions:
         """Return the prediction of a draw and its mean over other tasks; None if nothing can be predicted.
 
         The mean is over new independent tasks for each draw, so that its error has the expectation 0.
-
-        Args:
-            known: executions before the draw.
-            point: the draw, a point of the unit cube ``(d,)``.
-            draw: the number of the draw.
-            most: a number that no distance can exceed; None if none is known.
         """
         prediction = self._from(known)
         if prediction is None:
             return None
         rng = np.random.default_rng([self._seed, draw, _CENTRE_STREAM])
-        others = self._space.unit_draws(_CENTRE[not self._batched], rng)
+        others = self._space.unit_draws((200, 24)[not self._batched], rng)  # with and without designs in batches
         with stage("predicting distances", len(others) + 1, "designs"):
             expected = prediction.expected(np.concatenate([others, point[None]]))[0]
         largest = max(self.candidate.largest, 0.0)
-        limit = most if most is not None else (_HEADROOM * largest if largest > 0 else np.inf)
+        # Learned dynamics may diverge.
+        limit = most if most is not None else (2.0 * largest if largest > 0 else np.inf)
         usual = 0.5 * limit if np.isfinite(limit) else 0.0
         values = np.clip(np.where(np.isfinite(expected), expected, usual), 0.0, limit)
         return float(values[-1]), float(values[:-1].mean())
@@ -91,8 +74,8 @@ class Predictions:
         key = tuple(id(trajectory) for _, trajectory in known)
         if self._last is None or self._last[0] != key:
             try:
-                found = self._study.predict(list(known))
+                prediction = self._study.predict(list(known))
             except Exception:  # the user's parts, at states that no execution has reached, must not end a comparison
-                found = None
-            self._last = key, found
+                prediction = None
+            self._last = key, prediction
         return self._last[1]

@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 
+from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked
 from ctxval._util.progress import advance, stage
+from ctxval.certificates.options import require_confidence
 from ctxval.comparison.candidates import Candidate, Question, TrialNote, require_comparable
 from ctxval.comparison.executions import Executions, OnTrial
 from ctxval.comparison.expected import MeanQuestion
@@ -20,45 +23,41 @@ from ctxval.core.task_distribution import distribution_text
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 
-_WORST_FIRST = 0.5
-"""Share of the budget that the question of d* may use before that of the expected distance is answered."""
+Asked = Literal["worst", "mean", "both"]
 
 
+@checked
 class Race:
     """A comparison in progress. What it does next follows from the stores alone, so it can be interrupted.
 
-    Args:
-        candidates: the candidates.
-        questions: the questions.
-        budget: the largest total number of executions, including earlier ones; a shared execution counts once.
-        confidence: the probability with which all decisions hold together. It is divided between the questions.
-        seed: the seed of the draws.
-        largest_possible: a number that no distance can exceed; None if none is known.
-        stochastic: whether two executions of one task may differ.
-        on_trial: called with the name of the candidate and each trial that has ended.
-
-    Raises:
-        InputError: if the candidates cannot be compared.
+    Its arguments are those of :func:`ctxval.compare`, with candidates that have campaigns.
     """
 
     def __init__(
         self,
         candidates: Sequence[Candidate],
-        questions: Sequence[Question],
+        question: Asked,
         *,
-        budget: int,
-        confidence: float,
-        seed: int,
-        largest_possible: float | None = None,
+        budget: PositiveInt,
+        confidence: Probability,
+        seed: NonNegativeInt,
+        largest_possible: PositiveFloat | None = None,
         stochastic: bool = False,
         on_trial: OnTrial | None = None,
     ) -> None:
-        require_comparable({one.name: one.campaign.validation for one in candidates})
-        self.candidates, self.questions, self.budget, self.confidence = candidates, questions, budget, confidence
+        if stochastic and question != "mean":
+            raise InputError(
+                f"question must be mean for a stochastic system, got {question!r}: an execution may have a larger "
+                "distance than the largest expected one, so executed distances do not tell which d* is larger."
+            )
+        require_confidence(confidence)
+        require_comparable({candidate.name: candidate.campaign.validation for candidate in candidates})
+        self.questions: tuple[Question, ...] = ("worst", "mean") if question == "both" else (question,)
+        self.candidates, self.budget, self.confidence = candidates, budget, confidence
         self.stochastic = stochastic
         self.executions = Executions(candidates, self._note_for, on_trial)
-        predictions = {one.name: Predictions(one, seed) for one in candidates}
-        each = 1 - (1 - confidence) / len(questions)
+        predictions = {candidate.name: Predictions(candidate, seed) for candidate in candidates}
+        each = 1 - (1 - confidence) / len(self.questions)
         self.worst = WorstQuestion(self.executions, predictions, each, budget, stochastic)
         self.mean = MeanQuestion(self.executions, predictions, each, seed, largest_possible)
         self._require_possible()
@@ -86,10 +85,11 @@ class Race:
         if left <= 0:
             return False
         worst = "worst" in self.questions and bool(self.worst.undecided)
-        notes = [TrialNote.of(trial) for one in self.candidates for trial in one.executed]
+        notes = [TrialNote.of(trial) for candidate in self.candidates for trial in candidate.executed]
         spent = sum(note is not None and note.question == "worst" for note in notes)
         last = "mean" not in self.questions
-        if worst and (last or spent < _WORST_FIRST * self.budget) and self.worst.step():
+        # Share of the budget before the other question is answered.
+        if worst and (last or spent < 0.5 * self.budget) and self.worst.step():
             return True
         if not last and self.mean.step(left):
             return True
@@ -97,7 +97,7 @@ class Race:
 
     def _require_possible(self) -> None:
         """Check that no executed distance refutes the stated largest one, with which decisions would be false."""
-        largest = max(one.largest for one in self.candidates)
+        largest = max(candidate.largest for candidate in self.candidates)
         if self.mean.most is not None and largest > self.mean.most:
             raise InputError(f"largest_possible is {self.mean.most:g}, but a distance of {largest:.6g} was executed.")
 
@@ -105,7 +105,8 @@ class Race:
 
     def result(self) -> Comparison:
         """Return what is decided so far."""
-        pairs = [self._pair(question, a, b) for question in self.questions for a, b in combinations(self.candidates, 2)]
+        decide = {"worst": self._worst_pair, "mean": self._mean_pair}
+        pairs = [decide[question](*pair) for question in self.questions for pair in combinations(self.candidates, 2)]
         return Comparison(
             tuple(map(self._candidate, self.candidates)),
             tuple(pairs),
@@ -118,7 +119,7 @@ class Race:
 
     def _candidate(self, candidate: Candidate) -> CandidateResult:
         worst = candidate.campaign.worst
-        bounds = [one.bound for one in self.worst.decisions if one.smaller == candidate.name]
+        bounds = [decision.bound for decision in self.worst.decisions if decision.smaller == candidate.name]
         drawn = [trial.distance for trial, _ in self.mean.draws_of(candidate).values() if trial.distance is not None]
         return CandidateResult(
             candidate.name,
@@ -132,53 +133,50 @@ class Race:
             float(np.mean(drawn)) if drawn else None,
         )
 
-    def _pair(self, question: Question, a: Candidate, b: Candidate) -> PairResult:
-        return self._worst_pair(a, b) if question == "worst" else self._mean_pair(a, b)
-
     def _worst_pair(self, a: Candidate, b: Candidate) -> PairResult:
-        found = next((one for one in self.worst.decisions if {one.smaller, one.larger} == {a.name, b.name}), None)
-        if found is None:
+        names = {a.name, b.name}
+        decision = next((kept for kept in self.worst.decisions if {kept.smaller, kept.larger} == names), None)
+        if decision is None:
             reason = (
                 f"the largest executed distances are {a.largest:.4g} ({a.name}) and {b.largest:.4g} ({b.name}), and no "
                 "bound separates them"
             )
             return PairResult("worst", a.name, b.name, None, reason)
         reason = (
-            f"d* of {found.smaller} is at most {found.bound:.4g} by the {found.certificate} bound, and an executed "
-            f"distance of {found.larger} is {found.distance:.4g}; decided after {found.executions} executions"
+            f"d* of {decision.smaller} is at most {decision.bound:.4g} by the {decision.certificate} bound, and an "
+            f"executed distance of {decision.larger} is {decision.distance:.4g}; decided after {decision.executions} "
+            "executions"
         )
-        return PairResult("worst", a.name, b.name, found.smaller, reason)
+        return PairResult("worst", a.name, b.name, decision.smaller, reason)
 
     def _mean_pair(self, a: Candidate, b: Candidate) -> PairResult:
-        found = self.mean.difference(a, b)
-        interval = found.estimate, found.low, found.high, found.tasks, found.variance_left
-        if found.sign:
-            smaller = b.name if found.sign > 0 else a.name
+        mean = self.mean.difference(a, b)
+        smaller = None
+        if mean.sign:
+            smaller = b.name if mean.sign > 0 else a.name
             reason = (
-                f"the expected distance of {a.name} minus that of {b.name} is between {found.low:.3g} and "
-                f"{found.high:.3g}; decided after {found.decided_after} tasks"
+                f"the expected distance of {a.name} minus that of {b.name} is between {mean.low:.3g} and "
+                f"{mean.high:.3g}; decided after {mean.decided_after} tasks"
             )
-            return PairResult("mean", a.name, b.name, smaller, reason, *interval)
-        lost = self.mean.lost(a, b)
-        reason = lost or f"after {found.tasks} tasks the confidence sequence of the difference contains 0"
-        return PairResult("mean", a.name, b.name, None, reason, *interval)
+        else:
+            undecided = f"after {mean.tasks} tasks the confidence sequence of the difference contains 0"
+            reason = self.mean.lost(a, b) or undecided
+        interval = mean.estimate, mean.low, mean.high, mean.tasks, mean.variance_left
+        return PairResult("mean", a.name, b.name, smaller, reason, *interval)
 
     def _assumptions(self) -> tuple[str, ...]:
-        said = [
-            "the candidates were fixed before the comparison, and the system does not change during it",
-        ]
+        assumed = ["the candidates were fixed before the comparison, and the system does not change during it"]
         if "worst" in self.questions:
-            kind = self.worst.options
-            said.append(
-                f"each bound on d* holds with confidence {kind.confidence:.6g} under the prior that its certificate "
-                "states (dynamics or posterior); it is a probability given the executions, so neither the changing "
-                "threshold nor the time of stopping costs confidence"
+            assumed.append(
+                f"each bound on d* holds with confidence {self.worst.options.confidence:.6g} under the prior that its "
+                "certificate states (dynamics or posterior); it is a probability given the executions, so neither the "
+                "changing threshold nor the time of stopping costs confidence"
             )
         if "mean" in self.questions:
             described = self.candidates[0].campaign.validation.space.distribution
             over = "uniform over the task space" if described is None else distribution_text(described.describe())
-            said.append(f"tasks are independent draws ({over})")
-            said.append(
+            assumed.append(f"tasks are independent draws ({over})")
+            assumed.append(
                 f"no distance can exceed {self.mean.most:g}; the decisions on expected distances are then valid for "
                 "any number of tasks"
                 if self.mean.most is not None
@@ -187,5 +185,5 @@ class Race:
                 "that were not drawn can make them wrong"
             )
         if self.stochastic:
-            said.append("executions of one task may differ, and the questions are about expected distances of tasks")
-        return tuple(said)
+            assumed.append("executions of one task may differ, and the questions are about expected distances of tasks")
+        return tuple(assumed)

@@ -73,12 +73,16 @@ class PairResult:
     variance_left: float | None = None
 
     @property
+    def larger(self) -> str:
+        """The name of the one with the larger value, if this is decided."""
+        return self.second if self.smaller == self.first else self.first
+
+    @property
     def answer(self) -> str:
         """The answer in a few words."""
         if self.smaller is None:
             return f"{self.first} or {self.second}: undecided"
-        other = self.second if self.smaller == self.first else self.first
-        return f"{self.smaller} has a smaller {WORDS[self.question]} than {other}"
+        return f"{self.smaller} has a smaller {WORDS[self.question]} than {self.larger}"
 
     def __repr__(self) -> str:
         return lines(call(self, self.question, self.first, self.second, smaller=self.smaller), line(self.reason))
@@ -117,14 +121,10 @@ class Comparison:
         return tuple(dict.fromkeys(pair.question for pair in self.pairs))
 
     def pair(self, question: Question, first: str, second: str) -> PairResult:
-        """Return the decision on a pair, named in any order.
-
-        Raises:
-            KeyError: if there is no such pair or question.
-        """
-        for one in self.pairs:
-            if one.question == question and {one.first, one.second} == {first, second}:
-                return one
+        """Return the decision on a pair, named in any order."""
+        for pair in self.pairs:
+            if pair.question == question and {pair.first, pair.second} == {first, second}:
+                return pair
         raise KeyError(f"{question}: {first}, {second}")
 
     def ranking(self, question: Question) -> tuple[tuple[str, ...], ...]:
@@ -132,9 +132,9 @@ class Comparison:
 
         A candidate stands in an earlier group than another one only if all pairs between the groups are decided.
         """
-        smaller = {(one.smaller, _other(one)) for one in self.pairs if one.question == question and one.smaller}
-        wins = {one.name: sum(first == one.name for first, _ in smaller) for one in self.candidates}
-        ordered = sorted((one.name for one in self.candidates), key=lambda name: -wins[name])
+        smaller = {(pair.smaller, pair.larger) for pair in self.pairs if pair.question == question and pair.smaller}
+        wins = {candidate.name: sum(first == candidate.name for first, _ in smaller) for candidate in self.candidates}
+        ordered = sorted((candidate.name for candidate in self.candidates), key=lambda name: -wins[name])
         groups: list[tuple[str, ...]] = []
         start = 0
         for end in range(1, len(ordered) + 1):
@@ -184,7 +184,3 @@ class Comparison:
                 *(("assumes", assumption) for assumption in self.assumptions),
             ],
         )
-
-
-def _other(pair: PairResult) -> str:
-    return pair.second if pair.smaller == pair.first else pair.first

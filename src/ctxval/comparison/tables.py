@@ -10,7 +10,7 @@ import numpy as np
 from ctxval._util.files import MADE_BY
 from ctxval._util.texts import markdown_text
 from ctxval.certificates.bounds import at_most
-from ctxval.comparison.result import WORDS, CandidateResult, Comparison, PairResult
+from ctxval.comparison.result import WORDS, Comparison
 
 CANDIDATES = ("candidate", "executions", "shared", "largest distance", "bound on d*", "draws", "mean distance")
 """The columns of the table of candidates."""
@@ -21,38 +21,29 @@ PAIRS = ("question", "smaller", "than", "difference", "interval", "tasks")
 
 def candidate_rows(comparison: Comparison) -> list[tuple[str, ...]]:
     """Return a row for each candidate, as texts."""
-    return [_candidate(one) for one in comparison.candidates]
+    rows: list[tuple[str, ...]] = []
+    for known in comparison.candidates:
+        bound = "-" if known.bound is None else _number(float(at_most(known.bound)))
+        counts = str(known.executions), str(known.shared)
+        rows.append((known.name, *counts, _number(known.largest), bound, str(known.draws), _number(known.mean)))
+    return rows
 
 
 def pair_rows(comparison: Comparison) -> list[tuple[str, ...]]:
     """Return a row for each pair and question, as texts."""
-    return [_pair(one) for one in comparison.pairs]
-
-
-def _candidate(one: CandidateResult) -> tuple[str, ...]:
-    numbers = (one.largest, one.bound if one.bound is None else float(at_most(one.bound)))
-    return (
-        one.name,
-        str(one.executions),
-        str(one.shared),
-        *map(_number, numbers),
-        str(one.draws),
-        _number(one.mean),
-    )
-
-
-def _pair(one: PairResult) -> tuple[str, ...]:
-    if one.smaller is None:
-        names = (f"{one.first} ? {one.second}", "undecided")
-    else:
-        names = (one.smaller, one.second if one.smaller == one.first else one.first)
-    if one.question == "worst":
-        return (WORDS[one.question], *names, "-", "-", "-")
-    sign = -1 if one.smaller is not None and one.smaller == one.second else 1
-    ends = sorted(sign * end for end in (one.low, one.high) if end is not None)
-    interval = f"{_number(ends[0])} to {_number(ends[1])}" if len(ends) == 2 else "-"
-    estimate = None if one.estimate is None else sign * one.estimate
-    return (WORDS[one.question], *names, _number(estimate), interval, str(one.tasks))
+    rows: list[tuple[str, ...]] = []
+    for pair in comparison.pairs:
+        names = (f"{pair.first} ? {pair.second}", "undecided")
+        if pair.smaller is not None:
+            names = (pair.smaller, pair.larger)
+        cells = ("-", "-", "-")
+        if pair.question == "mean":
+            sign = -1 if pair.smaller == pair.second else 1  # of the smaller one minus the other one
+            ends = sorted(sign * end for end in (pair.low, pair.high) if end is not None)
+            interval = f"{_number(ends[0])} to {_number(ends[1])}" if len(ends) == 2 else "-"
+            cells = (_number(None if pair.estimate is None else sign * pair.estimate), interval, str(pair.tasks))
+        rows.append((WORDS[pair.question], *names, *cells))
+    return rows
 
 
 def _number(value: Any) -> str:

@@ -29,11 +29,8 @@ from ctxval.comparison.candidates import Candidate, TrialNote
 from ctxval.comparison.executions import Executions
 from ctxval.comparison.predictions import Predictions
 
-_MARGIN = 1.02
-"""A fact must exceed what is expected of the better candidate by this factor before its bound is worth executions."""
-
+# So many more executions than the better candidate the worse one may have to come near its predicted largest one.
 _INSIST = 3
-"""So many more executions than the better candidate the worse one may have to come near its predicted largest one."""
 
 
 @dataclass(frozen=True)
@@ -59,29 +56,15 @@ class WorstDecision:
     def of(cls, kept: Mapping[str, Any]) -> WorstDecision | None:
         """Return the decision that a trial's note has; None if it is none."""
         try:
-            return cls(
-                str(kept["smaller"]),
-                str(kept["larger"]),
-                float(kept["bound"]),
-                float(kept["distance"]),
-                str(kept["certificate"]),
-                int(kept["executions"]),
-            )
+            names, bounds = (str(kept["smaller"]), str(kept["larger"])), (float(kept["bound"]), float(kept["distance"]))
+            return cls(*names, *bounds, str(kept["certificate"]), int(kept["executions"]))
         except (KeyError, TypeError, ValueError):
             return None
 
 
 @dataclass(eq=False)
 class WorstQuestion:
-    """Decides which candidates have the smaller d*, and chooses the executions for it.
-
-    Attributes:
-        executions: executes the tasks.
-        predictions: for each candidate, by name.
-        confidence: the probability with which all decisions hold together.
-        budget: the largest total number of executions.
-        stochastic: whether two executions of one task may differ.
-    """
+    """Decides which candidates have the smaller d*, and chooses the executions for it."""
 
     executions: Executions
     predictions: Mapping[str, Predictions]
@@ -95,9 +78,9 @@ class WorstQuestion:
         for candidate in self.candidates:
             for trial in candidate.trials:
                 for kept in (TrialNote.of(trial) or TrialNote(0, "worst")).decided:
-                    found = WorstDecision.of(kept)
-                    if found is not None:
-                        self._decided[found.smaller, found.larger] = found
+                    decision = WorstDecision.of(kept)
+                    if decision is not None:
+                        self._decided[decision.smaller, decision.larger] = decision
 
     @property
     def candidates(self) -> Sequence[Candidate]:
@@ -117,16 +100,16 @@ class WorstQuestion:
     @property
     def decisions(self) -> tuple[WorstDecision, ...]:
         """All decisions that no executed distance contradicts."""
-        largest = {one.name: one.largest for one in self.candidates}
-        return tuple(one for one in self._decided.values() if largest.get(one.smaller, np.inf) <= one.bound)
+        largest = {candidate.name: candidate.largest for candidate in self.candidates}
+        return tuple(
+            decision for decision in self._decided.values() if largest.get(decision.smaller, np.inf) <= decision.bound
+        )
 
     @property
     def undecided(self) -> list[tuple[Candidate, Candidate]]:
         """The pairs that are not decided, each in both orders."""
-        known = {frozenset((one.smaller, one.larger)) for one in self.decisions}
-        return [
-            (a, b) for a, b in permutations(self.candidates, 2) if frozenset((a.name, b.name)) not in known
-        ]  # fmt: skip
+        known = {frozenset((decision.smaller, decision.larger)) for decision in self.decisions}
+        return [(a, b) for a, b in permutations(self.candidates, 2) if frozenset((a.name, b.name)) not in known]
 
     def step(self) -> bool:
         """Execute the task that is expected to decide first; return False if all pairs are decided."""
@@ -136,7 +119,12 @@ class WorstQuestion:
                 self.undecided, key=lambda pair: expected[pair[1].name][0] / max(expected[pair[0].name][0], 1e-300)
             )
             if self._needs_fact(better, worse, expected):
-                self._execute(worse, *self._raising(worse, *expected[worse.name]))
+                value, task = expected[worse.name]
+                known = np.array([trial.unit_point for trial in worse.trials])
+                if task is None or (len(known) and np.abs(known - task).max(axis=1).min() <= NEAR):
+                    self._execute(worse, Choice())  # no new task: the choice of the search
+                else:
+                    self._execute(worse, Choice(task, "covering"), value)
                 return True
             rule = IntervalSearch(better.recorder, self.options, self.budget, worse.largest)
             choice = rule.choose()
@@ -149,53 +137,38 @@ class WorstQuestion:
     def _expected(self) -> dict[str, tuple[float, Array | None]]:
         """Return, for each candidate, the largest executed or predicted distance, and the task if it is predicted."""
         known = [(trial.unit_point, trajectory) for trial, trajectory in self.executions.history()]
-        found: dict[str, tuple[float, Array | None]] = {}
+        expected: dict[str, tuple[float, Array | None]] = {}
         for candidate in self.candidates:
             highest = self.predictions[candidate.name].highest(known)
             value, task = (0.0, None) if highest is None or not _trusted(candidate) else highest
-            found[candidate.name] = (max(value, candidate.largest), task if value > candidate.largest else None)
-        return found
+            expected[candidate.name] = (max(value, candidate.largest), task if value > candidate.largest else None)
+        return expected
 
     def _needs_fact(
         self, better: Candidate, worse: Candidate, expected: Mapping[str, tuple[float, Array | None]]
     ) -> bool:
         """Return whether the candidate that seems worse is executed, to raise its largest executed distance."""
         others = len(_worst_trials(better))
-        if worse.largest <= _MARGIN * max(better.largest, expected[better.name][0]):
+        # So far above that its bound is worth executions.
+        if worse.largest <= 1.02 * max(better.largest, expected[better.name][0]):
             return len(_worst_trials(worse)) <= others  # neither is clearly worse: they are executed in turn
         untested = worse.largest < TESTED * expected[worse.name][0]
         insisted = len(_worst_trials(worse)) >= _INSIST + others
         return untested and not insisted
 
-    def _raising(self, candidate: Candidate, value: float, task: Array | None) -> tuple[Choice, float | None]:
-        """Return the predicted worst task with its prediction; the choice of the search if it is no new task."""
-        known = np.array([trial.unit_point for trial in candidate.trials])
-        if task is None or (len(known) and np.abs(known - task).max(axis=1).min() <= NEAR):
-            return Choice(), None
-        return Choice(task, "covering"), value
-
     def _certified(self, better: Candidate) -> bool:
         """Keep all decisions by the certificate of a candidate; return whether there is a new one."""
-        above = [
-            other
-            for one, other in self.undecided
-            if one is better and other.largest > max(better.largest, 0.0)
-        ]  # fmt: skip
-        found = False
+        above = [other for one, other in self.undecided if one is better and other.largest > max(better.largest, 0.0)]
+        new = False
         for other in above:
             verdict = better.campaign.verdict(other.largest, certificate=self.options, progress=False)
             if verdict.answer == "validated" and verdict.certificate is not None:
-                certificate = verdict.certificate
-                self._decided[better.name, other.name] = WorstDecision(
-                    better.name,
-                    other.name,
-                    certificate.upper_bound + ERRORS * certificate.error,
-                    other.largest,
-                    certificate.kind,
-                    self.executions.count,
-                )
-                found = True
-        return found
+                names, certificate = (better.name, other.name), verdict.certificate
+                bound = certificate.upper_bound + ERRORS * certificate.error
+                executions = self.executions.count
+                self._decided[names] = WorstDecision(*names, bound, other.largest, certificate.kind, executions)
+                new = True
+        return new
 
     def _execute(self, candidate: Candidate, choice: Choice, predicted: float | None = None) -> None:
         note = TrialNote(self.executions.steps, "worst", predicted=predicted)
@@ -204,7 +177,7 @@ class WorstQuestion:
 
     def kept(self) -> tuple[dict[str, Any], ...]:
         """Return all decisions as the note of the next trial keeps them."""
-        return tuple(dict(vars(one)) for one in self._decided.values())
+        return tuple(dict(vars(decision)) for decision in self._decided.values())
 
 
 def _trusted(candidate: Candidate) -> bool:

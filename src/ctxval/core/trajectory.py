@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, as_floats, held_means, rows_of
+from ctxval._util.arrays import Array, Mask, Rows, as_floats, held_means, rows_of
 from ctxval._util.columns import FAR, unit_advice
 from ctxval._util.files import MOST_BYTES, read_bytes
 from ctxval._util.npz import Archive
@@ -45,6 +45,9 @@ class Transitions(ShortRepr):
                 "transitions need x (N, n), u (N, m) and x_next (N, n), "
                 f"got {self.x.shape}, {self.u.shape} and {self.x_next.shape}."
             )
+
+    def __getitem__(self, rows: slice | Rows | Mask) -> Transitions:
+        return Transitions(self.x[rows], self.u[rows], self.x_next[rows])
 
     def __len__(self) -> int:
         return len(self.x)

@@ -70,9 +70,11 @@ class Log(ShortRepr, ABC):
 
     Attributes:
         source: the file, and the episode in it, for messages.
+        period: seconds between two samples, if the log states it.
     """
 
     source: str
+    period: float | None = None
 
     @abstractmethod
     def fields(self) -> tuple[str, ...]:
@@ -90,17 +92,8 @@ class Log(ShortRepr, ABC):
             InputError: if there is no such field, or it does not hold numbers; the message names file, field and row.
         """
 
-    @property
-    def period(self) -> float | None:
-        """Seconds between two samples, if the log states it."""
-        return None
-
     def episodes(self, used: Sequence[str]) -> list[Log]:
-        """Return the recordings in this log, one for each number in a column such as ``episode``.
-
-        Args:
-            used: the fields that are states or inputs.
-        """
+        """Return the recordings in this log, one for each number in a column such as ``episode``."""
         return [self]
 
     def missing(self, field: str) -> InputError:
@@ -120,11 +113,7 @@ class Table(Log):
 
     @abstractmethod
     def columns(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return columns, each with shape ``(N,)``, or ``(N, k)`` for vectors.
-
-        Raises:
-            InputError: if a column does not hold numbers.
-        """
+        """Return columns, each with shape ``(N,)``, or ``(N, k)`` for vectors."""
 
     def fields(self) -> tuple[str, ...]:
         """Return the names of the columns."""
@@ -144,14 +133,14 @@ class Table(Log):
         else:
             times = self._seconds(time, arrays[time], time_unit)
         count = len(times)
-        found = {}
+        signals = {}
         for field, (name, unit, index) in split.items():
             values = self._oriented(name, arrays[name], count)
             if index is not None and index >= values.shape[1]:
                 raise InputError(f"{self.source}: {name} has {values.shape[1]} components, so there is no {field}.")
             chosen = values if index is None else values[:, [index]]
-            found[field] = Signal(times, chosen, self.first, self.word, unit)
-        return found
+            signals[field] = Signal(times, chosen, self.first, self.word, unit)
+        return signals
 
     def episodes(self, used: Sequence[str]) -> list[Log]:
         """Return one table for each run of rows with one number in a column such as ``episode``."""
@@ -159,7 +148,7 @@ class Table(Log):
         marks = [values for values in map(self.marks, counters) if values.ndim == 1 and len(values) > 1]
         if not marks or len({len(values) for values in marks}) > 1:
             return [self]
-        changed = np.any([one[1:] != one[:-1] for one in marks], axis=0)
+        changed = np.any([mark[1:] != mark[:-1] for mark in marks], axis=0)
         ends = [*(np.flatnonzero(changed) + 1).tolist(), len(marks[0])]
         kind = counters[0].partition("_")[0]
         names = [f"{kind} {str(marks[0][start]).removesuffix('.0')}" for start in (0, *ends[:-1])]
@@ -228,13 +217,8 @@ class MemoryTable(Table):
     """
 
     def __init__(self, source: str, columns: Mapping[str, Array], first: int = 0, period: float | None = None) -> None:
-        self.source, self.first = source, first
-        self._columns, self._period = dict(columns), period
-
-    @property
-    def period(self) -> float | None:
-        """Seconds between two rows, if the file states it."""
-        return self._period
+        self.source, self.first, self.period = source, first, period
+        self._columns = dict(columns)
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the columns."""
@@ -246,24 +230,12 @@ class MemoryTable(Table):
 
 
 class Rows(Table):
-    """Some rows of a table, such as one episode.
-
-    Args:
-        table: the table.
-        name: what the rows are, for messages.
-        start, stop: the numbers of the first row and of the row after the last.
-        count: the number of rows of the table.
-        read: the columns that other parts of the table have read.
-    """
+    """Some rows of a table, such as one episode; ``read`` has the columns that other parts of the table have read."""
 
     def __init__(self, table: Table, name: str, start: int, stop: int, count: int, read: dict[str, Array]) -> None:
         self.source, self.word, self.first = f"{table.source}, {name}", table.word, table.first + start
         self._table, self._rows, self._count, self._read = table, slice(start, stop), count, read
-
-    @property
-    def period(self) -> float | None:
-        """Seconds between two rows, if the file states it."""
-        return self._table.period
+        self.period = table.period
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the columns."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
+from ctxval._util.checked import FiniteFloat, Seconds, checked, require
 from ctxval._util.columns import column_of
 from ctxval._util.files import read_bytes
 from ctxval._util.representation import ShortRepr
@@ -23,10 +23,10 @@ Stamp = Literal["auto", "log", "publish", "header"]
 _VALID = re.compile(r"\s*(\S.*?)\s*(==|!=)\s*([+-]?\d+(?:\.\d*)?)\s*")
 
 _STATES = ("states", "x", "observation.state")
-_INPUTS = ("inputs", "u", "action")
-"""Names of whole vectors that are looked for if there is no mapping."""
+_INPUTS = ("inputs", "u", "action")  # names of whole vectors that are looked for if there is no mapping
 
 
+@checked
 @dataclass(frozen=True)
 class Field:
     """Where one state or input is in a log; the value is ``factor * recorded + offset``.
@@ -42,40 +42,23 @@ class Field:
         angle: whether it is an angle in radians that the log may keep between -pi and pi: it is continued over turns.
         held: whether a value holds until the next one is logged, however long that takes, such as that of a command
             that is sent only if it changes.
-
-    Raises:
-        InputError: if the path is empty, or the units cannot be converted.
     """
 
     path: str
     unit: str = ""
     recorded: str = ""
-    factor: float | None = None
-    offset: float = 0.0
+    factor: FiniteFloat | None = None
+    offset: FiniteFloat = 0.0
     angle: bool = False
     held: bool = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.path, str) or not self.path.strip():
+        if not self.path.strip():
             raise InputError(f"the path of a field must be a text, got {self.path!r}.")
-        for name in ("unit", "recorded"):
-            if not isinstance(getattr(self, name), str):
-                raise InputError(f"{name} of the field {self.path} must be a text, got {getattr(self, name)!r}.")
-        for name in ("factor", "offset"):
-            value = getattr(self, name)
-            if value is not None and not _is_number(value):
-                raise InputError(f"{name} of the field {self.path} must be a finite number, got {value!r}.")
-        _ = self.scale("")
+        self.scale("")
 
     def scale(self, stated: str) -> float:
-        """Return the factor of the recorded value.
-
-        Args:
-            stated: the unit that the log itself states; empty if it states none.
-
-        Raises:
-            InputError: if the log states another unit than the mapping, or the units cannot be converted.
-        """
+        """Return the factor of the recorded value; ``stated`` is the unit that the log itself states, if any."""
         if self.factor is not None:
             return float(self.factor)
         try:
@@ -95,18 +78,13 @@ class LogMapping(ShortRepr):
         states, inputs: the fields of the states and inputs by name, in the order of the model.
         time: the column of the times of a table; None to look for ``t``, ``time``, ``times`` or ``timestamp``.
         time_unit: the unit of this column, s, ms, us, ns, min or h, if its name does not state it; seconds by default.
-        stamp: the time of a message: ``log``, when it was recorded; ``publish``, when it was sent; ``header``, the
-            ``header.stamp`` in it; or ``auto``, ``header`` if all messages have plausible ones, else ``log``.
+        stamp: the time of a message, as in :class:`Clock`.
         dt: length of a step in seconds; None for the median period of the first state. A table without times has one
             row for each step.
         delay: seconds between the time at which an input is logged and the time from which it acts on the states.
         longest_gap: longest time in seconds between two samples of one field over which it is interpolated or held;
             None for 1.5 median periods of the field. A recording is split at longer gaps and at missing values.
         valid: which rows count, such as ``status == 0``: a field, ``==`` or ``!=``, and a number; None for all rows.
-
-    Raises:
-        InputError: if there is no state, or a number is not allowed.
-        UnknownNameError: if there is no such stamp.
     """
 
     states: Mapping[str, Field]
@@ -129,14 +107,10 @@ class LogMapping(ShortRepr):
         conversion(self.time_unit or "s", "s")
         if self.valid is not None and _VALID.fullmatch(str(self.valid)) is None:
             raise InputError(f"valid must be a field and a number, such as 'status == 0', got {self.valid!r}.")
-        if self.stamp not in get_args(Stamp):
-            raise UnknownNameError.among("stamp", str(self.stamp), get_args(Stamp))
-        for name in ("dt", "longest_gap"):
-            value = getattr(self, name)
-            if value is not None and not (_is_number(value) and value > 0):
-                raise InputError(f"{name} of a mapping must be a positive number of seconds, got {value!r}.")
-        if not _is_number(self.delay):
-            raise InputError(f"delay of a mapping must be a finite number of seconds, got {self.delay!r}.")
+        require("stamp", Stamp, self.stamp)
+        require("dt", Seconds | None, self.dt)
+        require("longest_gap", Seconds | None, self.longest_gap)
+        require("delay", FiniteFloat, self.delay)
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -164,12 +138,8 @@ class LogMapping(ShortRepr):
 
         A field is a path, or a table with the attributes of :class:`Field`. ``states`` and ``inputs`` may also be lists
         of paths.
-
-        Raises:
-            UnknownNameError: if there is no such key.
-            InputError: if a value is not allowed.
         """
-        known = [one.name for one in fields(LogMapping)]
+        known = [field.name for field in fields(LogMapping)]
         for key in table:
             if key not in known:
                 raise UnknownNameError.among("entry of the mapping of recordings", key, known)
@@ -180,11 +150,7 @@ class LogMapping(ShortRepr):
 
     @staticmethod
     def from_toml(path: str | Path) -> LogMapping:
-        """Return the mapping in a TOML file, or in the table ``[recordings]`` of an experiment file.
-
-        Raises:
-            InputError: if the file cannot be read, is not TOML, or a value is not allowed.
-        """
+        """Return the mapping in a TOML file, or in the table ``[recordings]`` of an experiment file."""
         try:
             content = tomllib.loads(read_bytes(path).decode("utf-8"))
         except InputError as error:
@@ -206,9 +172,6 @@ class LogMapping(ShortRepr):
         Args:
             log: the log.
             states, inputs: names with their units that are looked for before these.
-
-        Raises:
-            InputError: if the log has none of them; the message lists its fields.
         """
         known = log.fields()
         wanted = {**(states or {}), **(inputs or {})}
@@ -216,20 +179,20 @@ class LogMapping(ShortRepr):
             named = {name: Field(name, unit) for name, unit in wanted.items()}
             outputs = {name: one for name, one in named.items() if name not in (inputs or {})}
             return LogMapping(outputs, {name: named[name] for name in inputs or {}}, dt=log.period)
-        found = _usual(known, _STATES, "x"), _usual(known, _INPUTS, "u")
-        if not found[0]:
+        usual = _usual(known, _STATES, "x"), _usual(known, _INPUTS, "u")
+        if not usual[0]:
             raise InputError(
                 f"{log.source} has no states under a usual name ({', '.join(_STATES)}, x0): name the states and inputs "
                 f"with --state and --input or in a mapping; the fields are {enumerated(known, LISTED)}."
             )
-        return LogMapping(*found, dt=log.period)
+        return LogMapping(*usual, dt=log.period)
 
 
-def _in_units(own: Mapping[str, Field], units: Mapping[str, str]) -> dict[str, Field]:
-    by_place = units.values() if len(units) == len(own) else [""] * len(own)
+def _in_units(fields: Mapping[str, Field], units: Mapping[str, str]) -> dict[str, Field]:
+    by_place = units.values() if len(units) == len(fields) else [""] * len(fields)
     return {
-        name: replace(one, unit=one.unit or units.get(name, unit)) if one.factor is None else one
-        for (name, one), unit in zip(own.items(), by_place, strict=True)
+        name: replace(field, unit=field.unit or units.get(name, unit)) if field.factor is None else field
+        for (name, field), unit in zip(fields.items(), by_place, strict=True)
     }
 
 
@@ -237,11 +200,11 @@ def _usual(known: Sequence[str], vectors: Sequence[str], letter: str) -> dict[st
     for name in vectors:
         if name in known:
             return {letter: Field(name)}
-    found: dict[str, Field] = {}
+    columns: dict[str, Field] = {}
     plain = {named_unit(name)[0] for name in known}
-    while f"{letter}{len(found)}" in plain:
-        found[f"{letter}{len(found)}"] = Field(f"{letter}{len(found)}")
-    return found
+    while (name := f"{letter}{len(columns)}") in plain:
+        columns[name] = Field(name)
+    return columns
 
 
 def _field(name: str, given: Any) -> Field:
@@ -250,12 +213,15 @@ def _field(name: str, given: Any) -> Field:
     if isinstance(given, str):
         return Field(given)
     if isinstance(given, Mapping):
-        known = [one.name for one in fields(Field)]
+        known = [field.name for field in fields(Field)]
         table = {("path" if key == "field" else key): value for key, value in given.items()}
         for key in table:
             if key not in known:
                 raise UnknownNameError.among(f"entry of the field {name}", key, known)
-        return Field(**{"path": name, **table})
+        try:
+            return Field(**{"path": name, **table})
+        except InputError as error:
+            raise InputError(f"the field {name}: {error}") from error
     raise InputError(f"the field {name} must be a path or a table, got {given!r}.")
 
 
@@ -267,7 +233,3 @@ def _named(kind: str, given: Any) -> dict[str, Any]:
     if not isinstance(given, Mapping):
         raise InputError(f"{kind} must be a table of fields or a list of paths, got {given!r}.")
     return {name: replace(_field(name, one)) for name, one in given.items()}
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -17,15 +17,13 @@ from ctxval._util.texts import quoted, reason_of
 from ctxval.data.log import Log, MemoryTable
 from ctxval.errors import InputError
 
-_DEPTH = 6
-"""Largest depth of structures in structures."""
+_DEPTH = 6  # largest depth of structures in structures
 
-_MOST_OBJECTS = 10_000
-"""Largest number of variables and fields in a file of version 7.3."""
+_MOST_OBJECTS = 10_000  # largest number of variables and fields in a file of version 7.3
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
+# The filters of HDF5 that MATLAB uses; others may be code in a library that a path in the environment names.
 _FILTERS = ("FILTER_DEFLATE", "FILTER_SHUFFLE", "FILTER_FLETCHER32")
-"""The filters of HDF5 that MATLAB uses; others may be code in a library that a path in the environment names."""
 
 
 def read_mat(path: Path) -> list[Log]:
@@ -80,22 +78,15 @@ def _version_7_3(path: Path) -> dict[str, Array]:
     with h5py.File(path, "r") as file:
         checked = _Checked(h5py)
         checked.group("", file.id, _DEPTH)
-        return {name: _array(h5py.Dataset(found)) for name, found in checked.arrays.items()}
-
-
-def _array(dataset: Any) -> Array:
-    values = np.squeeze(np.asarray(dataset[()], dtype=np.float64)).T  # MATLAB counts the first index fastest
-    return np.asarray(values)
+        arrays = {name: h5py.Dataset(identifier)[()] for name, identifier in checked.arrays.items()}
+        # MATLAB counts the first index fastest.
+        return {name: np.squeeze(np.asarray(values, dtype=np.float64)).T for name, values in arrays.items()}
 
 
 class _Checked:
     """The numeric arrays of an HDF5 file by their paths, before anything of them is read.
 
-    Args:
-        h5py: the library.
-
-    Raises:
-        InputError: if the file leads to another one, or declares more than may be read.
+    A file that leads to another one, or declares more than may be read, is refused.
     """
 
     def __init__(self, h5py: Any) -> None:
@@ -110,21 +101,23 @@ class _Checked:
             if group.links.get_info(name).type != self.h5py.h5l.TYPE_HARD:
                 raise InputError(f"{quoted(name.decode(errors='replace'))} is a link, which could lead to any file")
             path = f"{before}.{name.decode(errors='replace')}".removeprefix(".")
-            found = self.h5py.h5o.open(group, name)
-            if isinstance(found, self.h5py.h5d.DatasetID):
-                self.dataset(path, found)
-            elif isinstance(found, self.h5py.h5g.GroupID) and depth and not self._has(found, b"MATLAB_sparse"):
-                self.group(path, found, depth - 1)
+            identifier = self.h5py.h5o.open(group, name)
+            if isinstance(identifier, self.h5py.h5d.DatasetID):
+                self.dataset(path, identifier)
+                continue
+            is_group = isinstance(identifier, self.h5py.h5g.GroupID)
+            if is_group and depth and not self._has(identifier, b"MATLAB_sparse"):
+                self.group(path, identifier, depth - 1)
 
-    def dataset(self, path: str, found: Any) -> None:
+    def dataset(self, path: str, identifier: Any) -> None:
         h5d, h5z = self.h5py.h5d, self.h5py.h5z
-        plan = found.get_create_plist()
+        plan = identifier.get_create_plist()
         if plan.get_layout() == h5d.VIRTUAL or plan.get_external_count():
             raise InputError(f"the values of {quoted(path)} are in another file")
-        shape = found.shape  # only now: the shape of a virtual data set may depend on other files
+        shape = identifier.shape  # only now: the shape of a virtual data set may depend on other files
         kind = self.h5py.h5t
-        numeric = found.get_type().get_class() in (kind.INTEGER, kind.FLOAT, kind.ENUM)
-        if not numeric or math.prod(shape) == 0 or self._has(found, b"MATLAB_empty") or self._is_text(found):
+        numeric = identifier.get_type().get_class() in (kind.INTEGER, kind.FLOAT, kind.ENUM)
+        if not numeric or math.prod(shape) == 0 or self._has(identifier, b"MATLAB_empty") or self._is_text(identifier):
             return
         if sum(extent > 1 for extent in shape) > 2:
             return
@@ -134,15 +127,15 @@ class _Checked:
         filters = {plan.get_filter(i)[0] for i in range(plan.get_nfilters())}
         if not filters <= {getattr(h5z, name) for name in _FILTERS}:
             raise InputError(f"{quoted(path)} is compressed in a way that MATLAB does not use")
-        self.arrays[path] = found
+        self.arrays[path] = identifier
 
-    def _has(self, found: Any, attribute: bytes) -> bool:
-        return bool(self.h5py.h5a.exists(found, attribute))
+    def _has(self, identifier: Any, attribute: bytes) -> bool:
+        return bool(self.h5py.h5a.exists(identifier, attribute))
 
-    def _is_text(self, found: Any) -> bool:
-        if not self._has(found, b"MATLAB_class"):
+    def _is_text(self, identifier: Any) -> bool:
+        if not self._has(identifier, b"MATLAB_class"):
             return False
-        attribute = self.h5py.h5a.open(found, b"MATLAB_class")
+        attribute = self.h5py.h5a.open(identifier, b"MATLAB_class")
         kind = attribute.get_type()
         if kind.get_class() != self.h5py.h5t.STRING or kind.is_variable_str() or attribute.shape not in ((), (1,)):
             raise InputError("its classes must be texts")

@@ -1,18 +1,14 @@
-"""Logs of messages: MCAP files and bags of ROS 1 and 2. Needs the extra ``logs``, and no ROS.
-
-Messages of ROS 2 are decoded by mcap-ros2-support, also those of bags: its decoder interprets the message definitions
-in a file, whereas that of rosbags compiles Python code from them. Those of ROS 1 are decoded in the same way by
-``ros1.py``.
-"""
+"""Logs of messages: MCAP files and bags of ROS 1 and 2. Needs the extra ``logs``, and no ROS."""
 
 from __future__ import annotations
 
 import bz2
 import io
+import itertools
 import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,51 +16,56 @@ from typing import Any
 from ctxval._util.extras import require_extra
 from ctxval._util.files import open_regular
 from ctxval._util.texts import quoted, reason_of
-from ctxval.data.log import Log
-from ctxval.data.protobuf import protobuf_decoder
-from ctxval.data.ros1 import ros1_decoder
+from ctxval.data.decoders import Decoder, protobuf_decoder, ros1_decoder, ros2_decoder
 from ctxval.data.topics import Message, TopicLog
 from ctxval.errors import InputError
 
-_MOST_FILE = 64 * 2**30
-"""Largest size of a file in bytes. It is read message by message."""
-
-_MOST_CHUNK = 128 * 2**20
-"""Largest size of a record, and of a chunk of records after it is decompressed, in bytes."""
-
-_MOST_TOPICS = 10_000
+_MOST_CHUNK = 128 * 2**20  # largest size of a record, and of a chunk of records after it is decompressed, in bytes
 
 _PURPOSE = "logs of messages"
 
 
-class McapLog(TopicLog):
-    """An MCAP file with messages in JSON, in protobuf or of ROS 1 and 2.
-
-    Args:
-        path: the file.
-
-    Raises:
-        InputError: if the file is not an MCAP file.
-    """
+class _FileOfMessages(TopicLog):
+    """A log of messages in a file or a folder; each of its channels has a decoder."""
 
     def __init__(self, path: Path) -> None:
         self.source, self._path = str(path), path
-        self._decoders: dict[int, Callable[[bytes], Any]] = {}
+        self._topics: dict[str, Any] = {}
+        self._decoders: dict[Any, Decoder] = {}
+
+    def topics(self) -> tuple[str, ...]:
+        """Return the names of the topics."""
+        return tuple(self._topics)
+
+    def _decoded(self, channel: Any, decoder: Callable[[], Decoder], data: bytes, message: str) -> Any:
+        if channel not in self._decoders:
+            self._decoders[channel] = decoder()
+        try:
+            return self._decoders[channel](data)
+        except Exception as error:  # decoders raise many kinds
+            why = quoted(reason_of(error))
+            raise InputError(f"{self.source}, message {message}: it cannot be decoded ({why}).") from error
+
+
+class McapLog(_FileOfMessages):
+    """An MCAP file with messages in JSON, in protobuf or of ROS 1 and 2."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
         with self._opened() as file, _damage(path, "an MCAP file"):
-            file.seek(-_MCAP_END, io.SEEK_END)
+            file.seek(-(8 + 29), io.SEEK_END)  # the footer and the magic bytes, https://mcap.dev/spec
             summary = next(self._records(file)).summary_start  # 0 if there is none
             file.seek(summary)
-            self._topics = dict[str, None]()
             for record in self._records(file):
                 if type(record).__name__ == "Channel":
                     self._topics[record.topic] = None
-                if len(self._topics) > _MOST_TOPICS:
-                    raise InputError(f"{path} has more than {_MOST_TOPICS} topics.")
+                if len(self._topics) > 10_000:
+                    raise InputError(f"{path} has more than 10000 topics.")
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
         try:
-            file = open_regular(self._path, _MOST_FILE)
+            file = open_regular(self._path, 64 * 2**30)  # it is read message by message
         except InputError as error:
             raise InputError(f"{self._path} cannot be read: {error}.") from error
         with file:
@@ -85,10 +86,6 @@ class McapLog(TopicLog):
             with suppress(ended):  # a chunk has no record that says where it ends
                 yield from library.StreamReader(chunk, **{**inside, "skip_magic": True}).records
 
-    def topics(self) -> tuple[str, ...]:
-        """Return the names of the topics."""
-        return tuple(self._topics)
-
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
         """Yield decoded messages; see :meth:`TopicLog.messages`."""
         wanted = set(topics)
@@ -104,32 +101,23 @@ class McapLog(TopicLog):
                     case "Channel":
                         channels[record.id] = record
                     case "Message" if (channel := channels.get(record.channel_id)) and channel.topic in wanted:
-                        content = self._decoded(schemas.get(channel.schema_id), channel, record)
+                        decoder = partial(self._decoder, schemas.get(channel.schema_id), channel)
+                        message = f"{record.sequence} of {channel.topic}"
+                        content = self._decoded(channel.id, decoder, record.data, message)
                         yield Message(channel.topic, record.log_time, record.publish_time, content)
                     case "NoneType":
                         return
 
-    def _decoded(self, schema: Any, channel: Any, raw: Any) -> Any:
-        decoder = self._decoders.get(channel.id)
-        if decoder is None:
-            decoder = self._decoders[channel.id] = self._decoder(schema, channel)
-        try:
-            return decoder(raw.data)
-        except Exception as error:  # decoders raise many kinds
-            raise InputError(
-                f"{self.source}, message {raw.sequence} of {channel.topic}: it cannot be decoded "
-                f"({quoted(reason_of(error))})."
-            ) from error
-
-    def _decoder(self, schema: Any, channel: Any) -> Callable[[bytes], Any]:
-        if channel.message_encoding == "json":
-            return lambda data: json.loads(data, object_pairs_hook=_distinct)
-        if channel.message_encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
-            return ros2_decoder(self.source, channel.topic, schema.name, schema.data.decode("utf-8", "replace"))
-        if channel.message_encoding == "ros1" and schema is not None and schema.encoding == "ros1msg":
-            return ros1_decoder(self.source, channel.topic, schema.name, schema.data.decode("utf-8", "replace"))
-        if channel.message_encoding == "protobuf" and schema is not None and schema.encoding == "protobuf":
-            return protobuf_decoder(self.source, channel.topic, schema)
+    def _decoder(self, schema: Any, channel: Any) -> Decoder:
+        match channel.message_encoding, getattr(schema, "encoding", None):
+            case "json", _:
+                return lambda data: json.loads(data, object_pairs_hook=_distinct)
+            case "cdr", "ros2msg":
+                return ros2_decoder(self.source, channel.topic, schema.name, schema.data.decode("utf-8", "replace"))
+            case "ros1", "ros1msg":
+                return ros1_decoder(self.source, channel.topic, schema.name, schema.data.decode("utf-8", "replace"))
+            case "protobuf", "protobuf":
+                return protobuf_decoder(self.source, channel.topic, schema)
         of = f" with a schema in {schema.encoding}" if schema is not None else ""
         raise InputError(
             f"{self.source}: the messages of {channel.topic} are in {channel.message_encoding}{of}; messages in json, "
@@ -137,21 +125,13 @@ class McapLog(TopicLog):
         )
 
 
-class BagLog(TopicLog):
-    """A bag: one of ROS 2, a folder with ``metadata.yaml`` or one of its ``.db3`` files, or one of ROS 1, ``.bag``.
-
-    Args:
-        path: the folder or the file.
-
-    Raises:
-        InputError: if it is not a bag.
-    """
+class BagLog(_FileOfMessages):
+    """A bag: one of ROS 2, a folder with ``metadata.yaml`` or one of its ``.db3`` files, or one of ROS 1, ``.bag``."""
 
     def __init__(self, path: Path) -> None:
-        self.source, self._path = str(path), path
-        self._decoders: dict[str, Callable[[bytes], Any]] = {}
+        super().__init__(path)
         with self._reader() as reader:
-            self._topics = {one.topic: one for one in reader.connections}
+            self._topics = {connection.topic: connection for connection in reader.connections}
 
     @contextmanager
     def _reader(self) -> Iterator[Any]:
@@ -169,38 +149,21 @@ class BagLog(TopicLog):
         finally:
             reader.close()
 
-    def topics(self) -> tuple[str, ...]:
-        """Return the names of the topics."""
-        return tuple(self._topics)
-
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
         """Yield decoded messages; see :meth:`TopicLog.messages`."""
         wanted = set(topics)
         with self._reader() as reader:
-            found = reader.messages([one for one in reader.connections if one.topic in wanted])
-            number = 0
-            while True:
+            records = reader.messages([connection for connection in reader.connections if connection.topic in wanted])
+            for number in itertools.count():
                 with _damage(self._path, self._kind):
-                    one = next(found, None)
-                if one is None:
+                    record = next(records, None)
+                if record is None:
                     return
-                connection, time, raw = one
-                yield Message(connection.topic, time, time, self._decoded(connection, raw, number))
-                number += 1
+                connection, time, raw = record
+                message, decoder = f"{number}, of {connection.topic}", partial(self._decoder, connection)
+                yield Message(connection.topic, time, time, self._decoded(connection.topic, decoder, raw, message))
 
-    def _decoded(self, connection: Any, raw: bytes, number: int) -> Any:
-        decoder = self._decoders.get(connection.topic)
-        if decoder is None:
-            decoder = self._decoders[connection.topic] = self._decoder(connection)
-        try:
-            return decoder(raw)
-        except Exception as error:
-            raise InputError(
-                f"{self.source}, message {number}, of {connection.topic}: it cannot be decoded "
-                f"({quoted(reason_of(error))})."
-            ) from error
-
-    def _decoder(self, connection: Any) -> Callable[[bytes], Any]:
+    def _decoder(self, connection: Any) -> Decoder:
         definition = connection.msgdef
         if self._kind.endswith("1"):
             return ros1_decoder(self.source, connection.topic, connection.msgtype, definition.data)
@@ -224,35 +187,6 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(content) != len(pairs):
         raise ValueError("a name is there twice")
     return content
-
-
-def ros2_decoder(source: str, topic: str, name: str, definition: str) -> Callable[[bytes], Any]:
-    """Return the decoder of ROS 2 messages with a definition."""
-    decoding = require_extra("mcap_ros2.decoder", "logs", _PURPOSE)
-    records = require_extra("mcap.records", "logs", _PURPOSE)
-    schema = records.Schema(id=1, name=name, encoding="ros2msg", data=definition.encode())
-    try:
-        with redirect_stderr(io.StringIO()):  # the parser prints the text of the file
-            decoder: Callable[[bytes], Any] | None = decoding.DecoderFactory().decoder_for("cdr", schema)
-        if decoder is None:
-            raise ValueError(name)
-        return decoder
-    except Exception as error:
-        raise InputError(f"{source}: the definition of the messages of {topic}, {name}, cannot be read.") from error
-
-
-def read_mcap(path: Path) -> list[Log]:
-    """Return the log in an MCAP file."""
-    return [McapLog(path)]
-
-
-def read_bag(path: Path) -> list[Log]:
-    """Return the log in a bag of ROS 1 or 2."""
-    return [BagLog(path)]
-
-
-_MCAP_END = 8 + 29
-"""Size of the footer and the magic bytes at the end of an MCAP file, https://mcap.dev/spec."""
 
 
 def _decompressed(kind: str, data: bytes) -> bytes:

@@ -23,7 +23,7 @@ class ParquetTable(Table):
     """A Parquet file, each column of which is read when it is needed."""
 
     def __init__(self, path: Path, period: float | None = None) -> None:
-        self.source, self._period = str(path), period
+        self.source, self.period = str(path), period
         library = require_extra("pyarrow.parquet", "logs", "Parquet files")
         try:
             require_regular_file(path)
@@ -33,11 +33,6 @@ class ParquetTable(Table):
         except Exception as error:  # pyarrow raises many kinds
             raise InputError(f"{path} cannot be read as Parquet ({quoted(reason_of(error))}).") from error
         self._read: dict[str, Array] = {}
-
-    @property
-    def period(self) -> float | None:
-        """Seconds between two rows, if the data set states it."""
-        return self._period
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the columns."""
@@ -76,11 +71,6 @@ class ParquetTable(Table):
             raise InputError(f"{self.source}: {name} does not hold numbers ({quoted(reason_of(error))}).") from error
 
 
-def read_parquet(path: Path) -> list[Log]:
-    """Return the log in a Parquet file."""
-    return [ParquetTable(path)]
-
-
 def read_lerobot(path: Path) -> list[Log]:
     """Return the episodes of a LeRobot data set, a folder with ``meta/info.json`` and ``data/chunk-*/*.parquet``."""
     info = path / "meta" / "info.json"
@@ -100,11 +90,11 @@ def read_lerobot(path: Path) -> list[Log]:
 def lerobot_names(path: Path) -> Mapping[str, list[str]]:
     """Return the names of the components of states and actions that a LeRobot data set states, if it states them."""
     features: Any = read_json(path / "meta" / "info.json").get("features", {})
-    found = {}
+    stated = {}
     for column in (STATE, ACTION):
         names = features.get(column, {}).get("names")
         while isinstance(names, Mapping):  # version 2.0 has a level such as "motors"
             names = next(iter(names.values()), None)
         if isinstance(names, list) and len(set(map(str, names))) == len(names):
-            found[column] = [str(name) for name in names]
-    return found
+            stated[column] = [str(name) for name in names]
+    return stated

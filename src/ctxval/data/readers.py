@@ -7,19 +7,19 @@ from pathlib import Path
 
 from ctxval.data.log import Log
 from ctxval.data.matlab import read_mat
-from ctxval.data.messages import read_bag, read_mcap
-from ctxval.data.parquet import read_lerobot, read_parquet
-from ctxval.data.tables import read_csv, read_npz
+from ctxval.data.messages import BagLog, McapLog
+from ctxval.data.parquet import ParquetTable, read_lerobot
+from ctxval.data.tables import CsvLog, read_npz
 from ctxval.errors import InputError
 
 READERS: dict[str, Callable[[Path], list[Log]]] = {
-    ".csv": read_csv,
+    ".csv": lambda path: [CsvLog(path)],
     ".npz": read_npz,
     ".mat": read_mat,
-    ".parquet": read_parquet,
-    ".mcap": read_mcap,
-    ".db3": read_bag,
-    ".bag": read_bag,
+    ".parquet": lambda path: [ParquetTable(path)],
+    ".mcap": lambda path: [McapLog(path)],
+    ".db3": lambda path: [BagLog(path)],
+    ".bag": lambda path: [BagLog(path)],
 }
 """The reader of each suffix."""
 
@@ -29,9 +29,6 @@ def read_logs(paths: Sequence[str | Path]) -> list[Log]:
 
     A folder is a bag of ROS 2 if it has a file ``metadata.yaml``, a LeRobot data set if it has ``meta/info.json``, and
     otherwise all logs in it are read, in the order of their names.
-
-    Raises:
-        InputError: if there is no such file, if it has another suffix, or if it cannot be read.
     """
     logs = [log for path in paths for log in _logs(Path(path))]
     if not logs:
@@ -54,13 +51,13 @@ def is_lerobot(path: Path) -> bool:
 def _logs(path: Path) -> list[Log]:
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
-            return read_bag(path)
+            return [BagLog(path)]
         if is_lerobot(path):
             return read_lerobot(path)
-        found = [one for one in sorted(path.iterdir()) if one.suffix.lower() in READERS]
-        if not found:
+        files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in READERS]
+        if not files:
             raise InputError(f"the folder {path} has no log: {_KINDS}.")
-        return [log for one in found for log in _logs(one)]
+        return [log for file in files for log in _logs(file)]
     if not path.exists():
         raise InputError(f"there is no file {path}.")
     reader = READERS.get(path.suffix.lower())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,12 @@ from ctxval._util.units import conversion
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.log import Log, Table
 from ctxval.data.mapping import LogMapping
-from ctxval.data.parquet import ACTION, STATE, lerobot_names
+from ctxval.data.parquet import lerobot_names
 from ctxval.data.readers import is_lerobot, read_logs
 from ctxval.data.sampling import Break, Channel, sampled
 from ctxval.errors import InputError
 
-_LARGEST = 1e100
-"""Largest size of a recorded value: squares of errors must be finite."""
+_LARGEST = 1e100  # largest size of a recorded value: squares of errors must be finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +65,7 @@ class Recordings(ShortRepr):
         return sum(run.trajectory.horizon for run in self.runs)
 
     def transitions(self, runs: Iterable[int] | None = None) -> tuple[Transitions, Rows]:
-        """Return the steps of some recordings as transitions, and the number of the recording of each.
-
-        Args:
-            runs: the numbers of the recordings; all of them by default.
-        """
+        """Return the steps of some recordings as transitions, and the number of the recording of each."""
         numbers = list(range(len(self.runs)) if runs is None else runs)
         parts = [self.runs[number].trajectory.transitions() for number in numbers]
         return replace(Transitions.joined(parts), dt=self.dt), np.repeat(
@@ -98,7 +94,10 @@ def read_recordings(
     """
     logs = read_logs(paths)
     chosen = LogMapping.usual(logs[0], states, inputs) if mapping is None else mapping
-    names = _stated_names(paths) if mapping is None else {}
+    names: dict[str, list[str]] = {}
+    if mapping is None and len(paths) == 1 and is_lerobot(Path(paths[0])):
+        with suppress(InputError, AttributeError, TypeError):  # names are only labels
+            names = dict(lerobot_names(Path(paths[0])))
     return recordings_of(logs, replace(chosen.in_units(states or {}, inputs or {}), **changes), names)
 
 
@@ -111,16 +110,13 @@ def recordings_of(
         logs: the logs.
         mapping: which fields are states and inputs; by default, they are found by usual names.
         names: names of the components of vector fields, if they are known.
-
-    Raises:
-        InputError: if a log lacks a field, if logs differ in their fields, or if nothing can be used.
     """
     chosen = LogMapping.usual(logs[0]) if mapping is None else mapping
     runs: list[Recording] = []
     breaks: list[Break] = []
     notes: list[str] = []
     dt, first = chosen.dt, list[Channel]()
-    used = [one.path for one in chosen.fields.values()]
+    used = [field.path for field in chosen.fields.values()]
     for log in (part for whole in logs for part in whole.episodes(used)):
         channels = _channels(log, chosen, names or {}, notes)
         labels = [(channel.name, channel.of_input) for channel in channels]
@@ -131,9 +127,9 @@ def recordings_of(
         dt = _period(log, channels[0]) if dt is None else dt
         if chosen.longest_gap is None:
             _require_period(log, channels, dt)
-        parts, found = sampled(log.source, channels, dt, chosen.delay, chosen.longest_gap)
+        parts, gaps = sampled(log.source, channels, dt, chosen.delay, chosen.longest_gap)
         runs += [Recording(log.source, start, trajectory) for start, trajectory in parts]
-        breaks += found
+        breaks += gaps
     if dt is None or not runs:
         why = "; ".join(str(one) for one in breaks[:3])
         raise InputError(f"no log has two samples of all states and inputs in a row: {why or 'they are empty'}.")
@@ -156,10 +152,10 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
         clock = replace(clock, period=mapping.dt)
     condition = mapping.condition
     fields = mapping.fields
-    signals = log.signals([one.path for one in fields.values()] + ([condition[0]] if condition else []), clock)
+    signals = log.signals([field.path for field in fields.values()] + ([condition[0]] if condition else []), clock)
     channels = []
-    for name, one in fields.items():
-        signal = signals[one.path]
+    for name, field in fields.items():
+        signal = signals[field.path]
         values = signal.values.copy()
         if condition is not None:
             status, equal, number = signals[condition[0]], condition[1], condition[2]
@@ -168,8 +164,8 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
             values[(status.values[rows, 0] == number) != equal] = np.nan
         if signal.clock:
             notes.append(f"the times of messages are {_CLOCKS[signal.clock]}")
-        components = names.get(one.path, [])
-        width, scale = values.shape[1], one.scale(signal.unit)
+        components = names.get(field.path, [])
+        width, scale = values.shape[1], field.scale(signal.unit)
         for k in range(width):
             label = components[k] if len(components) == width else (name if width == 1 else f"{name}{k}")
             for value in sentinels(values[:, k], scale):
@@ -187,17 +183,22 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
             channels.append(
                 Channel(
                     label,
-                    one.unit or (signal.unit if one.factor is None else ""),
+                    field.unit or (signal.unit if field.factor is None else ""),
                     name in mapping.inputs,
                     signal.times,
-                    scale * values[:, k] + one.offset,
-                    angle=one.angle,
-                    held=one.held,
-                    path=one.path,
+                    scale * values[:, k] + field.offset,
+                    angle=field.angle,
+                    held=field.held,
+                    path=field.path,
                     place=(signal.word, signal.first),
                 )
             )
-    return _distinct(channels)
+    # In LeRobot data sets, states and actions have the same names.
+    states = {channel.name for channel in channels if not channel.of_input}
+    return [
+        replace(channel, name=f"{channel.name} command") if channel.of_input and channel.name in states else channel
+        for channel in channels
+    ]
 
 
 _CLOCKS = {
@@ -222,21 +223,13 @@ def _in_unit_of(log: Log, channel: Channel, first: Channel) -> Channel:
 
 def _require_period(log: Log, channels: Sequence[Channel], dt: float) -> None:
     """Refuse states that are recorded much less often than every step, or whose times have another unit."""
-    period = min((one.period for one in channels if not one.of_input and one.period), default=dt)
+    period = min((channel.period for channel in channels if not channel.of_input and channel.period), default=dt)
     advice = unit_advice(period, dt)
     if period > FAR * dt or advice:
         raise InputError(
             f"{log.source} has a sample of {channels[0].name} every {period:g} s, and a step takes {dt:g} s: "
             f"{advice or f'give dt = {period:g}, or longest_gap if states are to be interpolated over so many steps'}."
         )
-
-
-def _distinct(channels: list[Channel]) -> list[Channel]:
-    """Return channels with distinct names: in LeRobot data sets, states and actions have the same ones."""
-    states = {channel.name for channel in channels if not channel.of_input}
-    return [
-        replace(one, name=f"{one.name} command") if one.of_input and one.name in states else one for one in channels
-    ]
 
 
 def _period(log: Log, channel: Channel) -> float:
@@ -264,14 +257,3 @@ def _notes(mapping: LogMapping, dt: float, channels: Sequence[Channel]) -> Itera
             )
     if mapping.delay:
         yield f"inputs act {mapping.delay:g} s after they are logged"
-
-
-def _stated_names(paths: Sequence[str | Path]) -> dict[str, list[str]]:
-    """Return the names of the components of states and actions, if one LeRobot data set is read."""
-    if len(paths) != 1 or not is_lerobot(Path(paths[0])):
-        return {}
-    try:
-        stated = lerobot_names(Path(paths[0]))
-    except (InputError, AttributeError, TypeError):  # names are only labels
-        return {}
-    return {column: stated[column] for column in (STATE, ACTION) if column in stated}

@@ -8,19 +8,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, held_means
+from ctxval._util.arrays import Array, held_means
 from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
 
-_LONGEST = 1.5
-"""Longest time between two samples without a gap, in median periods of the field."""
-_SLACK = 1e-3
-"""A sample within this share of a period of a wanted time belongs to it, because times are rounded."""
-_MOST_STEPS = 20_000_000
-"""Largest number of steps of one recording."""
-_MOST_STILL = 0.1
-"""Largest share of rows, besides one, with the time of the row before."""
+_SLACK = 1e-3  # a sample within this share of a period of a wanted time belongs to it, because times are rounded
+_MOST_STEPS = 20_000_000  # largest number of steps of one recording
 
 Interval = tuple[float, float]
 
@@ -82,22 +76,18 @@ class Channel(ShortRepr):
 def sampled(
     source: str, channels: Sequence[Channel], dt: float, delay: float, longest_gap: float | None
 ) -> tuple[list[tuple[float, Trajectory]], list[Break]]:
-    """Return the parts of a log in which all channels have values, at equal steps, and where it was split.
-
-    Returns:
-        The start of each part in seconds with its trajectory, and the breaks.
-    """
+    """Return the parts of a log in which all channels have values, at equal steps, and where it was split."""
     parts: list[tuple[float, Trajectory]] = []
     breaks: list[Break] = []
     for pieces in _forward_pieces(source, channels, breaks):
-        moved = [_moved(one, delay) if one.of_input else one for one in pieces]
+        moved = [replace(channel, times=channel.times + delay) if channel.of_input else channel for channel in pieces]
         common: list[Interval] = [(-np.inf, np.inf)]
-        for one in moved:
-            common = _intersection(common, _intervals(source, one, longest_gap, breaks))
+        for channel in moved:
+            common = _intersection(common, _intervals(source, channel, longest_gap, breaks))
         for interval in common:
-            made = _part(source, moved, interval, dt)
-            if made is not None:
-                parts.append(made)
+            part = _part(source, moved, interval, dt)
+            if part is not None:
+                parts.append(part)
             elif np.isfinite(interval).all():
                 length = interval[1] - interval[0]
                 breaks.append(Break(source, interval[0], length, "a part", f"of {length:.3g} s is shorter than a step"))
@@ -106,53 +96,41 @@ def sampled(
 
 def _forward_pieces(source: str, channels: Sequence[Channel], breaks: list[Break]) -> list[list[Channel]]:
     """Return the channels in pieces in which times increase; channels with times of their own must increase."""
-    together = all(one.times is channels[0].times or np.array_equal(one.times, channels[0].times) for one in channels)
-    if not together:
-        for one in channels:
-            _require_forward(source, one)
+    first = channels[0]
+    steps = np.diff(first.times)
+    word, line = first.place
+    if not all(channel.times is first.times or np.array_equal(channel.times, first.times) for channel in channels):
+        for channel in channels:
+            back = np.flatnonzero(np.diff(channel.times) <= 0)
+            if len(back):
+                k, (word, line) = int(back[0]), channel.place
+                raise InputError(
+                    f"{source}, {word} {line + k + 1} of {channel.path}: its time must be after that of the one "
+                    f"before, {channel.times[k]:.9g} s, got {channel.times[k + 1]:.9g} s."
+                )
         return [list(channels)]
-    _require_resolution(source, channels[0])
-    ends = np.flatnonzero(np.diff(channels[0].times) <= 0)
-    bounds = [0, *(ends + 1).tolist(), len(channels[0].times)]
-    for end in ends.tolist():
-        word, first = channels[0].place
-        reason = f"go back from {channels[0].times[end]:g} s to {channels[0].times[end + 1]:g} s at {word}"
-        breaks.append(Break(source, float(channels[0].times[end]), 0.0, "times", f"{reason} {first + end + 1}"))
-    return [[_between(one, start, stop) for one in channels] for start, stop in pairwise(bounds)]
-
-
-def _require_forward(source: str, channel: Channel) -> None:
-    back = np.flatnonzero(np.diff(channel.times) <= 0)
-    if len(back):
-        k, (word, first) = int(back[0]), channel.place
+    still = np.flatnonzero(steps == 0)
+    if len(still) > 1 + 0.1 * len(first.times):  # single rows may be written twice
         raise InputError(
-            f"{source}, {word} {first + k + 1} of {channel.path}: its time must be after that of the one before, "
-            f"{channel.times[k]:.9g} s, got {channel.times[k + 1]:.9g} s."
+            f"{source}: {len(still)} of {len(first.times)} {word}s have the time of the {word} before, the first "
+            f"{word} {line + int(still[0]) + 1}, {first.times[still[0]]:.9g} s: give times with more digits."
         )
-
-
-def _require_resolution(source: str, channel: Channel) -> None:
-    """Refuse times that are rounded so far that they do not tell rows apart; single rows may be written twice."""
-    still = np.flatnonzero(np.diff(channel.times) == 0)
-    if len(still) > 1 + _MOST_STILL * len(channel.times):
-        word, first = channel.place
-        raise InputError(
-            f"{source}: {len(still)} of {len(channel.times)} {word}s have the time of the {word} before, the first "
-            f"{word} {first + int(still[0]) + 1}, {channel.times[still[0]]:.9g} s: give times with more digits."
-        )
-
-
-def _between(channel: Channel, start: int, stop: int) -> Channel:
-    return _replaced(channel, channel.times[start:stop], channel.values[start:stop], start)
-
-
-def _moved(channel: Channel, delay: float) -> Channel:
-    return _replaced(channel, channel.times + delay, channel.values, 0)
-
-
-def _replaced(channel: Channel, times: Array, values: Array, skipped: int) -> Channel:
-    word, first = channel.place
-    return replace(channel, times=times, values=values, place=(word, first + skipped))
+    ends = np.flatnonzero(steps <= 0).tolist()
+    for end in ends:
+        reason = f"go back from {first.times[end]:g} s to {first.times[end + 1]:g} s at {word} {line + end + 1}"
+        breaks.append(Break(source, float(first.times[end]), 0.0, "times", reason))
+    return [
+        [
+            replace(
+                channel,
+                times=channel.times[start:stop],
+                values=channel.values[start:stop],
+                place=(channel.place[0], channel.place[1] + start),
+            )
+            for channel in channels
+        ]
+        for start, stop in pairwise([0, *(end + 1 for end in ends), len(first.times)])
+    ]
 
 
 def _intervals(source: str, channel: Channel, longest_gap: float | None, breaks: list[Break]) -> list[Interval]:
@@ -165,11 +143,17 @@ def _intervals(source: str, channel: Channel, longest_gap: float | None, breaks:
     period = channel.period
     if channel.held:
         return [(float(times[good][0]), np.inf)]
-    # The input of the last row of a trajectory is not needed.
-    _report_missing(source, channel, good, breaks)
-    longest = _LONGEST * period if longest_gap is None else longest_gap
-    kept = times[good]
     rows = np.flatnonzero(good)
+    word, first = channel.place
+    # Each run of samples without a value between two with one; the input of the last row of a trajectory is not needed.
+    for before, after in ((int(rows[k]), int(rows[k + 1])) for k in np.flatnonzero(np.diff(rows) > 1)):
+        where = f"{word} {first + before + 1}"
+        if after - before > 2:
+            where = f"{word}s {first + before + 1} to {first + after - 1}"
+        gap = float(times[after] - times[before])
+        breaks.append(Break(source, float(times[before]), gap, channel.name, f"has no value in {where}"))
+    longest = 1.5 * period if longest_gap is None else longest_gap  # median periods without a gap
+    kept = times[good]
     cut = (np.diff(rows) > 1) | (np.diff(kept) > longest * (1 + 1e-9))
     for k in np.flatnonzero(cut & (np.diff(rows) == 1)).tolist():
         gap = float(kept[k + 1] - kept[k])
@@ -179,29 +163,17 @@ def _intervals(source: str, channel: Channel, longest_gap: float | None, breaks:
     return [(float(a), float(b) + reach) for a, b in zip(starts, ends, strict=True)]
 
 
-def _report_missing(source: str, channel: Channel, good: Mask, breaks: list[Break]) -> None:
-    """Add each run of samples without a value between two with one to the breaks."""
-    rows = np.flatnonzero(good)
-    word, first = channel.place
-    for before, after in ((int(rows[k]), int(rows[k + 1])) for k in np.flatnonzero(np.diff(rows) > 1)):
-        where = f"{word} {first + before + 1}"
-        if after - before > 2:
-            where = f"{word}s {first + before + 1} to {first + after - 1}"
-        gap = float(channel.times[after] - channel.times[before])
-        breaks.append(Break(source, float(channel.times[before]), gap, channel.name, f"has no value in {where}"))
-
-
 def _intersection(first: list[Interval], second: list[Interval]) -> list[Interval]:
-    found, i, j = list[Interval](), 0, 0
+    both, i, j = list[Interval](), 0, 0
     while i < len(first) and j < len(second):
         start, end = max(first[i][0], second[j][0]), min(first[i][1], second[j][1])
         if start <= end:
-            found.append((start, end))
+            both.append((start, end))
         if first[i][1] < second[j][1]:
             i += 1
         else:
             j += 1
-    return found
+    return both
 
 
 def _part(source: str, channels: Sequence[Channel], interval: Interval, dt: float) -> tuple[float, Trajectory] | None:
@@ -216,30 +188,29 @@ def _part(source: str, channels: Sequence[Channel], interval: Interval, dt: floa
     if steps > _MOST_STEPS:
         raise InputError(f"{source} has {steps:.3g} steps of {dt:g} s, more than {_MOST_STEPS}: give a larger dt.")
     times: Array = np.asarray(dt * np.arange(int(steps) + 1), dtype=np.float64)
-    states = [_interpolated(one, start + times) for one in channels if not one.of_input]
-    inputs = [_averaged(one, start + times, dt) for one in channels if one.of_input]
+    states = [_interpolated(channel, start + times) for channel in channels if not channel.of_input]
+    inputs = []
+    for channel in channels:
+        if channel.of_input:  # it holds until the next sample, which may come within a step
+            good = np.isfinite(channel.values)
+            means = held_means(channel.times[good], channel.values[good, None], start + times, _SLACK * dt)
+            inputs.append(means[:, 0])
     columns = np.stack(inputs, axis=-1) if inputs else np.empty((int(steps), 0))
     return start, Trajectory(times, np.stack(states, axis=-1), columns)
 
 
 def _interpolated(channel: Channel, times: Array) -> Array:
     good = np.isfinite(channel.values)
-    own, values = channel.times[good], channel.values[good]
-    first = max(int(np.searchsorted(own, times[0] + _SLACK * channel.period, side="right")) - 1, 0)
-    last = int(np.searchsorted(own, times[-1] - _SLACK * channel.period)) + 1
-    own, values = own[first:last], values[first:last]
+    at, values = channel.times[good], channel.values[good]
+    first = max(int(np.searchsorted(at, times[0] + _SLACK * channel.period, side="right")) - 1, 0)
+    last = int(np.searchsorted(at, times[-1] - _SLACK * channel.period)) + 1
+    at, values = at[first:last], values[first:last]
     if channel.angle:
         values = np.unwrap(values)
-    found = np.interp(times, own, values)
+    states = np.interp(times, at, values)
     # Times of equal steps differ from recorded ones by rounding; the recorded value is then meant.
-    after = np.clip(np.searchsorted(own, times), 0, len(own) - 1)
+    after = np.clip(np.searchsorted(at, times), 0, len(at) - 1)
     for row in (after, np.maximum(after - 1, 0)):
-        same = np.abs(own[row] - times) <= _SLACK * channel.period
-        found[same] = values[row][same]
-    return np.asarray(found)
-
-
-def _averaged(channel: Channel, edges: Array, dt: float) -> Array:
-    """Return the mean input of each step: an input holds until the next sample, which may come within a step."""
-    good = np.isfinite(channel.values)
-    return held_means(channel.times[good], channel.values[good, None], edges, _SLACK * dt)[:, 0]
+        same = np.abs(at[row] - times) <= _SLACK * channel.period
+        states[same] = values[row][same]
+    return np.asarray(states)

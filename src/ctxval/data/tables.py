@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from ctxval._util.arrays import Array
@@ -14,11 +15,7 @@ from ctxval.errors import InputError
 
 
 class CsvLog(Table):
-    """A CSV file with a header, whose columns may state their units.
-
-    Args:
-        path: the file.
-    """
+    """A CSV file with a header, whose columns may state their units."""
 
     word = "line"
 
@@ -42,18 +39,19 @@ class CsvLog(Table):
 
 
 class NpzTable(Table):
-    """An NPZ file: arrays with one row for each time. Nothing in it is ever run.
-
-    Args:
-        path: the file.
-    """
+    """An NPZ file: arrays with one row for each time. Nothing in it is ever run."""
 
     def __init__(self, path: Path) -> None:
         self.source = str(path)
-        try:
+        with self._reading():
             self._archive = Archive(read_bytes(path))
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            yield
         except InputError as error:
-            raise InputError(f"{path} cannot be read as NPZ: {error}.") from error
+            raise InputError(f"{self.source} cannot be read as NPZ: {error}.") from error
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the arrays."""
@@ -61,15 +59,8 @@ class NpzTable(Table):
 
     def columns(self, names: Sequence[str]) -> dict[str, Array]:
         """Return arrays of numbers."""
-        try:
+        with self._reading():
             return {name: self._archive.numbers(name) for name in names}
-        except InputError as error:
-            raise InputError(f"{self.source} cannot be read as NPZ: {error}.") from error
-
-
-def read_csv(path: Path) -> list[Log]:
-    """Return the log in a CSV file."""
-    return [CsvLog(path)]
 
 
 def read_npz(path: Path) -> list[Log]:

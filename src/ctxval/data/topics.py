@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -16,8 +17,7 @@ from ctxval._util.units import named_unit
 from ctxval.data.log import Clock, Log, Signal
 from ctxval.errors import InputError
 
-_MOST_MEMORY = 2**30
-"""Largest size of the numbers of a log in bytes; each message needs :data:`_OBJECT` bytes more."""
+_MOST_MEMORY = 2**30  # largest size of the numbers of a log in bytes; each message needs :data:`_OBJECT` bytes more
 
 _OBJECT = 256
 
@@ -47,23 +47,16 @@ class TopicLog(Log):
 
     @abstractmethod
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
-        """Yield the messages of some topics in the order of their log times.
-
-        Raises:
-            InputError: if a message cannot be decoded.
-        """
+        """Yield the messages of some topics in the order of their log times."""
 
     def fields(self) -> tuple[str, ...]:
         """Return the names of the fields that hold numbers in the first message of each topic."""
-        left, found = set(self.topics()), list[str]()
+        names: list[str] = []
         for topic in self.topics():
-            try:
+            with suppress(InputError):  # the topic has another encoding
                 first = next(iter(self.messages([topic])), None)
-            except InputError:
-                continue  # the topic has another encoding
-            left.discard(topic)
-            found += [] if first is None else [f"{topic}.{path}" for path in _leaves(first.content)]
-        return tuple(found)
+                names += [] if first is None else [f"{topic}.{path}" for path in _leaves(first.content)]
+        return tuple(names)
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         """Return fields over time; see :meth:`Log.signals`."""
@@ -87,13 +80,13 @@ class TopicLog(Log):
             stamps[topic] = [unsorted[k] for k in order]
             values |= {field: [values[field][k] for k in order] for field, (of, _) in split.items() if of == topic}
         chosen = ("header" if _plausible(stamps) else "log") if clock.stamp == "auto" else clock.stamp
-        times = {topic: [stamp[chosen] for stamp in own] for topic, own in stamps.items()}
-        for topic, own in times.items():
-            if None in own:
+        times = {topic: [stamp[chosen] for stamp in of_topic] for topic, of_topic in stamps.items()}
+        for topic, of_topic in times.items():
+            if None in of_topic:
                 raise InputError(
-                    f"{self.source}, message {own.index(None)} of {topic}: it has no header.stamp or timestamp."
+                    f"{self.source}, message {of_topic.index(None)} of {topic}: it has no header.stamp or timestamp."
                 )
-        origin = min((min(own) for own in times.values() if own), default=0)  # type: ignore[type-var]
+        origin = min((min(of_topic) for of_topic in times.values() if of_topic), default=0)  # type: ignore[type-var]
         return {
             field: self._signal(field, times[topic], values[field], origin, chosen)  # type: ignore[arg-type]
             for field, (topic, _) in split.items()
@@ -116,20 +109,25 @@ class TopicLog(Log):
     def _split(self, field: str) -> tuple[str, tuple[str | int, ...]]:
         for topic in sorted(self.topics(), key=len, reverse=True):
             if field.startswith(f"{topic}."):
-                return topic, _path(field[len(topic) + 1 :])
+                steps: list[str | int] = []  # such as pose.position[2].x
+                for part in field[len(topic) + 1 :].split("."):
+                    name, *indices = part.replace("]", "").split("[")
+                    steps += [name, *(int(index) if index.isdigit() else index for index in indices)]
+                return topic, tuple(step for step in steps if step != "")
         raise self.missing(field)
 
     def _value(self, message: Message, number: int, path: tuple[str | int, ...]) -> Array:
-        found = _resolved(message.content, path)
+        value = _resolved(message.content, path)
         try:
-            if found is None or isinstance(found, str | bytes):
+            if value is None or isinstance(value, str | bytes):
                 raise TypeError
-            return np.asarray(found, dtype=np.float64).reshape(-1)
+            return np.asarray(value, dtype=np.float64).reshape(-1)
         except (TypeError, ValueError):
-            shown = "nothing" if found is None else repr(found)[:60]
+            shown = "nothing" if value is None else repr(value)[:60]
+            name = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path).removeprefix(".")
             raise InputError(
-                f"{self.source}, message {number} of {message.topic}: {_joined(path)} must be a number or a list of "
-                f"numbers, got {shown}."
+                f"{self.source}, message {number} of {message.topic}: {name} must be a number or a list of numbers, "
+                f"got {shown}."
             ) from None
 
 
@@ -146,25 +144,12 @@ def _plausible(stamps: Mapping[str, Sequence[Mapping[str, int | None]]]) -> bool
     The stamps may be those of another clock, such as that of a simulator, if it is the same one for all topics.
     """
     late = list[int]()
-    for own in stamps.values():
-        headers = [stamp["header"] for stamp in own]
+    for of_topic in stamps.values():
+        headers = [stamp["header"] for stamp in of_topic]
         if None in headers or any(b <= a for a, b in pairwise(headers)):  # type: ignore[operator]
             return False
-        late += [stamp["log"] - stamp["header"] for stamp in own]  # type: ignore[operator]
+        late += [stamp["log"] - stamp["header"] for stamp in of_topic]  # type: ignore[operator]
     return bool(late) and max(late) - min(late) <= 10**9
-
-
-def _path(text: str) -> tuple[str | int, ...]:
-    """Return the steps of a path such as ``pose.position[2].x``."""
-    steps: list[str | int] = []
-    for part in text.split("."):
-        name, *indices = part.replace("]", "").split("[")
-        steps += [name, *(int(index) if index.isdigit() else index for index in indices)]
-    return tuple(step for step in steps if step != "")
-
-
-def _joined(path: Sequence[str | int]) -> str:
-    return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path).removeprefix(".")
 
 
 def _resolved(content: Any, path: Sequence[str | int]) -> Any:
@@ -184,7 +169,7 @@ def _resolved(content: Any, path: Sequence[str | int]) -> Any:
 
 def _first(content: Any, *paths: Sequence[str | int]) -> Any:
     """Return the first part of a message that exists; None if there is none."""
-    return next((found for path in paths if (found := _resolved(content, path)) is not None), None)
+    return next((value for path in paths if (value := _resolved(content, path)) is not None), None)
 
 
 def _leaves(content: Any, before: str = "", depth: int = 6) -> Iterator[str]:

@@ -17,15 +17,6 @@ from ctxval.errors import InputError, ShapeError, UnknownNameError
 
 SignalKind = Literal["random", "multisine", "chirp"]
 
-_HELD = 4
-"""Number of steps for which a random value is held."""
-_SINES = 12
-"""Largest number of sines in a multisine."""
-_FASTEST = 0.1
-"""Highest frequency, in cycles per step."""
-_DRAWN = 20
-"""Number of sets of random phases, of which that with the smallest peak is used."""
-
 
 def excitation(kind: SignalKind, horizon: int, amplitude: ArrayLike, rng: np.random.Generator) -> Array:
     """Return a signal for each input, shape ``(H, m)``, with magnitudes up to the amplitude.
@@ -39,48 +30,35 @@ def excitation(kind: SignalKind, horizon: int, amplitude: ArrayLike, rng: np.ran
         horizon: number of steps H.
         amplitude: the largest magnitude for each input, shape ``(m,)``.
         rng: the source of the random numbers.
-
-    Raises:
-        UnknownNameError: if there is no such kind.
-        InputError: if an amplitude is negative or not finite.
     """
     if kind not in get_args(SignalKind):
         raise UnknownNameError.among("kind of excitation", str(kind), get_args(SignalKind))
     sizes = np.atleast_1d(as_finite("amplitude", amplitude))
     if sizes.ndim != 1 or (sizes < 0).any() or not sizes.any():
         raise InputError(f"amplitude must be numbers >= 0, not all of them 0, got {np.asarray(amplitude).tolist()}.")
-    makers = {"random": _random, "multisine": _multisine, "chirp": _chirp}
-    return np.stack([size * makers[kind](horizon, rng) for size in sizes], axis=-1)
+    return np.stack([size * _signal(kind, horizon, rng) for size in sizes], axis=-1)
 
 
-def _random(horizon: int, rng: np.random.Generator) -> Array:
-    return np.asarray(np.repeat(rng.uniform(-1, 1, -(-horizon // _HELD)), _HELD)[:horizon])
-
-
-def _multisine(horizon: int, rng: np.random.Generator) -> Array:
-    cycles = np.unique(np.linspace(1, max(1, _FASTEST * horizon), _SINES).round())
+def _signal(kind: SignalKind, horizon: int, rng: np.random.Generator) -> Array:
+    fastest = 0.1  # cycles per step
+    if kind == "random":
+        return np.asarray(np.repeat(rng.uniform(-1, 1, -(-horizon // 4)), 4)[:horizon])
+    if kind == "chirp":
+        steps = np.arange(horizon)
+        first = min(1 / horizon, fastest)
+        turns = first * steps + 0.5 * (fastest - first) * steps**2 / horizon
+        return np.asarray(np.sin(2 * np.pi * (turns + rng.uniform())))
+    cycles = np.unique(np.linspace(1, max(1, fastest * horizon), 12).round())
     t = np.arange(horizon)[:, None] / horizon
-    waves = [np.sin(2 * np.pi * (cycles * t + rng.uniform(size=len(cycles)))).sum(axis=1) for _ in range(_DRAWN)]
+    # Of several sets of random phases, that with the smallest peak is used.
+    waves = [np.sin(2 * np.pi * (cycles * t + rng.uniform(size=len(cycles)))).sum(axis=1) for _ in range(20)]
     best = min(waves, key=lambda wave: float(np.abs(wave).max()))
     return np.asarray(best / max(float(np.abs(best).max()), 1e-12))
 
 
-def _chirp(horizon: int, rng: np.random.Generator) -> Array:
-    t = np.arange(horizon)
-    first = min(1 / horizon, _FASTEST)
-    turns = first * t + 0.5 * (_FASTEST - first) * t**2 / horizon
-    return np.asarray(np.sin(2 * np.pi * (turns + rng.uniform())))
-
-
 @dataclass(frozen=True, eq=False)
 class Excited(ShortRepr):
-    """A controller with a signal added to its inputs, within limits.
-
-    Attributes:
-        controller: the controller.
-        signal: the signal, shape ``(H, m)``.
-        limits: the limits of the sum.
-    """
+    """A controller with a signal added to its inputs, within limits."""
 
     controller: Controller
     signal: Array
@@ -103,11 +81,6 @@ class Excitation(ShortRepr):
         amplitude: the largest magnitude of the signal for each input, shape ``(m,)``, or a number.
         limits: the limits of the inputs; by default those of the controllers.
         seed: the seed.
-
-    Raises:
-        UnknownNameError: if there is no such kind.
-        InputError: if the system is operated by people, or there are no limits.
-        ShapeError: if the number of amplitudes is not that of the inputs.
     """
 
     def __init__(
@@ -123,10 +96,10 @@ class Excitation(ShortRepr):
             raise ShapeError(f"amplitude must be one number for each of {m} inputs, got {sizes.tolist()}.")
         self.amplitude: Array = np.broadcast_to(sizes, (m,))
         excitation(kind, 2, self.amplitude, np.random.default_rng(0))
-        own = getattr(plan.controller, "limits", None) if limits is None else limits
-        if own is None:
+        limits = getattr(plan.controller, "limits", None) if limits is None else limits
+        if limits is None:
             raise InputError("the controllers have no limits: give the limits within which the inputs must stay.")
-        self.limits = Limits.of(own, m)
+        self.limits = Limits.of(limits, m)
 
     def plan(self, number: int) -> Plan:
         """Return the plan of a run: a random task."""

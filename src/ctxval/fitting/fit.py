@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -17,9 +17,8 @@ from ctxval.errors import InputError, ModelError, UnknownNameError
 from ctxval.fitting.least_squares import FittedParameter, as_bounds, fit_parameters
 from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear
 from ctxval.models.parametric import ParametricStep
-from ctxval.replay.accuracy import StepError, step_errors
+from ctxval.replay.accuracy import RecordedSteps, StepError, step_errors
 from ctxval.replay.report import plain_numbers
-from ctxval.replay.steps import RecordedSteps
 
 Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
 KINDS: tuple[Kind, ...] = get_args(Kind)[:4]
@@ -27,13 +26,6 @@ STEPS = (1, 20)
 """Numbers of steps after which the held-out errors are computed, unless others are given."""
 HOLD_OUT = 0.25
 """Share of the recordings that is held out, unless another one is given."""
-
-_UNITS = (32, 32)
-"""Numbers of units in the hidden layers of the network."""
-_POINTS = 400
-"""Number of transitions that the Gaussian process is conditioned on."""
-_MOST = 20_000
-"""Largest number of transitions that a network is trained on; of more, every second, third, ... one is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +49,7 @@ class FittedModel(ShortRepr):
     @property
     def relative(self) -> float:
         """The largest one-step error of a state on held-out recordings, as a share of its recorded change."""
-        return max((one.relative for one in self.errors if one.steps == 1), default=float("inf"))
+        return max((error.relative for error in self.errors if error.steps == 1), default=float("inf"))
 
     @property
     def useless(self) -> str | None:
@@ -65,8 +57,10 @@ class FittedModel(ShortRepr):
 
         After one step, or after the largest number of steps, its error in a state is at least the recorded change.
         """
-        last = max((one.steps for one in self.errors), default=0)
-        worst = max((one for one in self.errors if one.steps in (1, last)), key=lambda one: one.relative, default=None)
+        last = max((error.steps for error in self.errors), default=0)
+        worst = max(
+            (error for error in self.errors if error.steps in (1, last)), key=lambda one: one.relative, default=None
+        )
         if worst is None or worst.relative < 1:
             return None
         return (
@@ -77,12 +71,7 @@ class FittedModel(ShortRepr):
 
 @dataclass(frozen=True)
 class FailedFit(ShortRepr):
-    """A kind of model that could not be learned from recordings.
-
-    Attributes:
-        kind: the kind.
-        reason: why.
-    """
+    """A kind of model that could not be learned from recordings."""
 
     kind: Kind
     reason: str
@@ -105,21 +94,20 @@ class FitReport(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all results but the models as plain values; numbers that are not finite are None."""
-        found = [
+        fitted = [
             {
-                "kind": one.kind,
-                "errors": [{**asdict(error), "relative": error.relative} for error in one.errors],
-                "parameters": [asdict(parameter) for parameter in one.parameters],
-                "notes": list(one.notes),
-                "useless": one.useless,
+                "kind": model.kind,
+                "errors": [{**asdict(error), "relative": error.relative} for error in model.errors],
+                "parameters": [asdict(parameter) for parameter in model.parameters],
+                "notes": list(model.notes),
+                "useless": model.useless,
             }
-            for one in self.fitted
+            for model in self.fitted
         ]
-        sizes = {"recordings": len(self.learned_from.runs), "steps": self.learned_from.steps}
-        held = {"recordings": len(self.held_out.runs), "steps": self.held_out.steps}
-        failed = [asdict(one) for one in self.failed]
-        report = {"fitted": found, "failed": failed, "learned_from": sizes, "held_out": held}
-        return {**plain_numbers(report), "dt": self.held_out.dt, "notes": list(self.held_out.notes)}
+        parts = {"learned_from": self.learned_from, "held_out": self.held_out}
+        sizes = {name: {"recordings": len(part.runs), "steps": part.steps} for name, part in parts.items()}
+        report = plain_numbers({"fitted": fitted, "failed": [asdict(kind) for kind in self.failed], **sizes})
+        return {**report, "dt": self.held_out.dt, "notes": list(self.held_out.notes)}
 
 
 def fit(
@@ -154,44 +142,6 @@ def fit(
             given model has another time step.
         ModelError: if the given model cannot predict the recordings.
     """
-    _require_kinds(kinds, step, bounds)
-    learned_from, held_out = split(recordings, hold_out, seed)
-    data, _ = learned_from.transitions()
-
-    def parameters() -> tuple[Model, tuple[FittedParameter, ...], tuple[str, ...]]:
-        model, found = fit_parameters(step, bounds, data, vectorized=vectorized, seed=seed)  # type: ignore[arg-type]
-        return model, found, ()
-
-    makers: dict[Kind, Callable[[], tuple[Model, tuple[FittedParameter, ...], tuple[str, ...]]]] = {
-        "linear": lambda: _linear(data, learned_from),
-        "network": lambda: (FeedforwardReLU.fit(_some(data), _UNITS, seed=seed, restarts=2), (), ()),
-        "gaussian-process": lambda: (GaussianProcessModel.fit(data, _POINTS, seed=seed), (), ()),
-        "parameters": parameters,
-    }
-    fitted: list[FittedModel] = []
-    failed: list[FailedFit] = []
-    recorded = RecordedSteps(held_out, range(len(held_out.runs)))
-
-    def errors_of(model: Model) -> tuple[StepError, ...]:
-        return step_errors(model, recorded, sorted(set(steps)))
-
-    with single_threaded():
-        # Before anything is learned, because what is named must be usable.
-        if given is not None:
-            require_time_step(given, recordings.dt, "the recording")
-        known = [] if given is None else [FittedModel("given", given, errors_of(given))]
-        for kind in dict.fromkeys(kinds):
-            try:
-                model, found, notes = makers[kind]()
-                fitted.append(FittedModel(kind, model, errors_of(model), found, notes))
-            except (InputError, ModelError) as error:
-                failed.append(FailedFit(kind, str(error)))
-    return FitReport(tuple(sorted([*fitted, *known], key=_rank)), tuple(failed), learned_from, held_out)
-
-
-def _require_kinds(
-    kinds: Sequence[Kind], step: ParametricStep | None, bounds: Mapping[str, tuple[float, float]] | None
-) -> None:
     for kind in kinds:
         if kind not in KINDS:
             raise UnknownNameError.among("kind of model", str(kind), KINDS)
@@ -201,12 +151,50 @@ def _require_kinds(
         if step is None or not bounds:
             raise InputError("the kind 'parameters' needs a function (x, u, theta) -> x_next and the bounds of theta.")
         as_bounds(bounds)
+    learned_from, held_out = split(recordings, hold_out, seed)
+    data, _ = learned_from.transitions()
+    recorded = RecordedSteps(held_out, range(len(held_out.runs)))
+    fitted: list[FittedModel] = []
+    failed: list[FailedFit] = []
 
+    def errors_of(model: Model) -> tuple[StepError, ...]:
+        return step_errors(model, recorded, sorted(set(steps)))
 
-def _rank(one: FittedModel) -> float:
-    last = max((error.steps for error in one.errors), default=0)
-    found = max((error.relative for error in one.errors if error.steps == last), default=np.inf)
-    return found if np.isfinite(found) else np.inf
+    def fitted_model(kind: Kind) -> FittedModel:
+        parameters: tuple[FittedParameter, ...] = ()
+        notes: tuple[str, ...] = ()
+        model: Model
+        match kind:
+            case "linear":
+                model = Linear.fit(data)
+                notes = tuple(identifiability(data, [*recordings.states, *recordings.inputs]))
+            case "network":
+                every = max(1, -(-len(data) // 20_000))  # of too many transitions, every second, third, ... is used
+                model = FeedforwardReLU.fit(data[::every], (32, 32), seed=seed, restarts=2)
+            case "gaussian-process":
+                model = GaussianProcessModel.fit(data, 400, seed=seed)
+            case _:
+                assert step is not None
+                model, parameters = fit_parameters(step, bounds or {}, data, vectorized=vectorized, seed=seed)
+        return FittedModel(kind, model, errors_of(model), parameters, notes)
+
+    with single_threaded():
+        # Before anything is learned, because what is named must be usable.
+        if given is not None:
+            require_time_step(given, recordings.dt, "the recording")
+            fitted.append(FittedModel("given", given, errors_of(given)))
+        for kind in dict.fromkeys(kinds):
+            try:
+                fitted.append(fitted_model(kind))
+            except (InputError, ModelError) as error:
+                failed.append(FailedFit(kind, str(error)))
+
+    def rank(model: FittedModel) -> tuple[float, bool]:
+        last = max((error.steps for error in model.errors), default=0)
+        relative = max((error.relative for error in model.errors if error.steps == last), default=np.inf)
+        return relative if np.isfinite(relative) else np.inf, model.kind == "given"
+
+    return FitReport(tuple(sorted(fitted, key=rank)), tuple(failed), learned_from, held_out)
 
 
 def split(recordings: Recordings, share: float, seed: int) -> tuple[Recordings, Recordings]:
@@ -231,24 +219,10 @@ def split(recordings: Recordings, share: float, seed: int) -> tuple[Recordings, 
 
 
 def _part(run: Recording, first: int, last: int) -> Recording:
-    one = run.trajectory
-    times: Array = one.times[first : last + 1] - one.times[first]
-    part = Trajectory(times, one.states[first : last + 1], one.inputs[first:last])
-    return Recording(run.source, run.start + float(one.times[first]), part)
-
-
-def _some(data: Transitions) -> Transitions:
-    every = max(1, -(-len(data) // _MOST))
-    return Transitions(data.x[::every], data.u[::every], data.x_next[::every])
-
-
-def _linear(data: Transitions, recordings: Recordings) -> tuple[Model, tuple[FittedParameter, ...], tuple[str, ...]]:
-    model = Linear.fit(data)
-    return model, (), tuple(identifiability(data, [*recordings.states, *recordings.inputs]))
-
-
-_WEAK = 30.0
-"""Ratio of the standard deviations of coefficients with and without the others, from which a regressor is named."""
+    whole = run.trajectory
+    times: Array = whole.times[first : last + 1] - whole.times[first]
+    part = Trajectory(times, whole.states[first : last + 1], whole.inputs[first:last])
+    return Recording(run.source, run.start + float(whole.times[first]), part)
 
 
 def identifiability(data: Transitions, names: Sequence[str]) -> list[str]:
@@ -260,7 +234,7 @@ def identifiability(data: Transitions, names: Sequence[str]) -> list[str]:
         return [f"{', '.join(still)} never changes, so its coefficients are not determined"]
     correlation = np.corrcoef(Z, rowvar=False).reshape(len(names), -1)
     inflation = np.sqrt(np.diag(np.linalg.pinv(correlation)))
-    weak = [name for name, ratio in zip(names, inflation, strict=True) if ratio > _WEAK]
+    weak = [name for name, ratio in zip(names, inflation, strict=True) if ratio > 30.0]
     worst = float(inflation.max())
     if weak:
         return [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -16,15 +16,6 @@ from ctxval.core.trajectory import Transitions
 from ctxval.errors import CtxvalError, InputError, ModelError
 from ctxval.models import Parametric
 from ctxval.models.parametric import ParametricStep
-
-_STARTS = 8
-"""Number of starting points, of which the first is the middle of the bounds."""
-_MOST = 4000
-"""Largest number of transitions that are used; of more, every second, third, ... one is."""
-_AT_BOUND = 1e-4
-"""Share of the width of the bounds within which a value counts as at a bound."""
-_CONDITION = 1e8
-"""Largest condition number of the scaled Jacobian; beyond it the data do not determine all parameters."""
 
 
 @dataclass(frozen=True)
@@ -67,14 +58,10 @@ def fit_parameters(
         vectorized: whether ``step`` takes whole batches.
         confidence: the confidence of each interval.
         seed: seed of the starting points.
-
-    Raises:
-        InputError: if bounds or data cannot be used.
-        ModelError: if the function fails on the recorded states.
     """
     low, high = as_bounds(bounds)
-    every = max(1, -(-len(data) // _MOST))
-    some = Transitions(data.x[::every], data.u[::every], data.x_next[::every])
+    every = max(1, -(-len(data) // 4000))
+    some = data[::every]
     if some.x.size <= len(low):
         raise InputError(f"{len(low)} parameters need more than {some.x.size} recorded numbers.")
     problem = _Problem(step, list(bounds), some, vectorized)
@@ -83,11 +70,11 @@ def fit_parameters(
         theta = _best(problem, low, high, sizes, seed)
         left = problem.errors(theta)
         sizes = np.maximum(np.sqrt((left**2).mean(axis=0)), 1e-9 * sizes)
-        found = least_squares(
+        best = least_squares(
             lambda p: (problem.errors(p) / sizes).ravel(), theta, bounds=(low, high), x_scale=high - low
         )
-    intervals = _intervals(list(bounds), found.x, found.jac, found.fun, (low, high), confidence)
-    return Parametric(step, dict(zip(bounds, found.x, strict=True)), vectorized=vectorized, data=data), intervals
+    intervals = _intervals(list(bounds), best.x, best.jac, best.fun, (low, high), confidence)
+    return Parametric(step, dict(zip(bounds, best.x, strict=True)), vectorized=vectorized, data=data), intervals
 
 
 def as_bounds(bounds: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
@@ -130,18 +117,13 @@ class _Problem:
 def _best(problem: _Problem, low: Array, high: Array, sizes: Array, seed: int) -> Array:
     """Return the parameters of least squared errors from several starting points."""
     rng = np.random.default_rng(seed)
-    starts = np.concatenate([[0.5 * (low + high)], rng.uniform(low, high, (_STARTS - 1, len(low)))])
-    few = max(1, len(problem.data) // 400)
-    data = problem.data
-    small = _Problem(
-        *(problem.step, problem.names, Transitions(data.x[::few], data.u[::few], data.x_next[::few])),
-        problem.vectorized,
-    )
-    found = [
+    starts = np.concatenate([[0.5 * (low + high)], rng.uniform(low, high, (7, len(low)))])
+    small = replace(problem, data=problem.data[:: max(1, len(problem.data) // 400)])
+    results = [
         least_squares(lambda p: (small.errors(p) / sizes).ravel(), start, bounds=(low, high), x_scale=high - low)
         for start in starts
     ]
-    return np.asarray(min(found, key=lambda one: one.cost).x)
+    return np.asarray(min(results, key=lambda result: result.cost).x)
 
 
 def _intervals(
@@ -152,25 +134,20 @@ def _intervals(
     _, singular, V = np.linalg.svd(J * width, full_matrices=False)
     degrees = max(len(errors) - len(theta), 1)
     variance = float((errors**2).sum()) / degrees
-    weak = V[singular <= singular.max(initial=0.0) / _CONDITION] if singular.max(initial=0.0) > 0 else V
+    # Beyond this condition number the data do not determine all parameters.
+    weak = V[singular <= singular.max(initial=0.0) / 1e8] if singular.max(initial=0.0) > 0 else V
     undetermined = (np.abs(weak) > 0.1).any(axis=0) if len(weak) else np.zeros(len(theta), dtype=bool)
     with np.errstate(all="ignore"):
         deviations = width * np.sqrt(variance * ((V / singular[:, None]) ** 2).sum(axis=0))
     reach = np.where(undetermined, np.inf, deviations * stdtrit(degrees, 0.5 + confidence / 2))
-    found = []
+    parameters = []
     for i, name in enumerate(names):
-        at = [
-            end for end, value in (("lower", bounds[0][i]), ("upper", bounds[1][i])) if _near(theta[i], value, width[i])
-        ]
+        ends = zip(("lower", "upper"), bounds, strict=True)
+        near = [end for end, bound in ends if abs(theta[i] - bound[i]) <= 1e-4 * width[i]]
         others = [names[j] for j in np.flatnonzero(undetermined).tolist() if j != i]
-        note = f"at its {at[0]} bound" if at else ""
+        note = f"at its {near[0]} bound" if near else ""
         if undetermined[i]:
             note = f"not determined together with {', '.join(others)}" if others else "not determined"
-        found.append(
-            FittedParameter(name, float(theta[i]), float(theta[i] - reach[i]), float(theta[i] + reach[i]), note)
-        )
-    return tuple(found)
-
-
-def _near(value: float, bound: float, width: float) -> bool:
-    return bool(abs(value - bound) <= _AT_BOUND * width)
+        interval = float(theta[i] - reach[i]), float(theta[i] + reach[i])
+        parameters.append(FittedParameter(name, float(theta[i]), *interval, note))
+    return tuple(parameters)

@@ -46,17 +46,29 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
     """Write a model to a file, and the data of an ONNX file to another one; return their paths."""
     require_file_for(path, model)
     if isinstance(model, Parametric):
-        _write_parameters(path, model, step)
-    elif path.suffix == ".onnx":
-        write_onnx(path, model)
-        data = getattr(model, "data", None)
-        if data is not None:
-            beside = path.with_suffix(".data.npz")
-            write_transitions(beside, data)
-            return [str(path), str(beside)]
-    else:
+        values = ", ".join(f"{name} = {value!r}" for name, value in model.theta.items())
+        dt = model.dt or getattr(model.data, "dt", None)
+        lines = [
+            f"# {MADE_BY}",
+            "[model]",
+            'type = "Parametric"',
+            f'step = {{ ref = "{require_reference(step)}" }}',
+            f"theta = {{ {values} }}",
+            *([] if dt is None else [f"dt = {dt!r}"]),
+            *(["vectorized = true"] if model.vectorized else []),
+        ]
+        write_text(path, "\n".join([*lines, ""]))
+        return [str(path)]
+    if path.suffix == ".npz":
         write_model(path, model)
-    return [str(path)]
+        return [str(path)]
+    write_onnx(path, model)
+    data = getattr(model, "data", None)
+    if data is None:
+        return [str(path)]
+    beside = path.with_suffix(".data.npz")
+    write_transitions(beside, data)
+    return [str(path), str(beside)]
 
 
 def require_reference(step: str | None) -> str:
@@ -66,14 +78,3 @@ def require_reference(step: str | None) -> str:
             "the parameters of a function can only be written with the reference module:attr to it (--step)."
         )
     return step
-
-
-def _write_parameters(path: Path, model: Parametric, step: str | None) -> None:
-    values = ", ".join(f"{name} = {value!r}" for name, value in model.theta.items())
-    text = f'# {MADE_BY}\n[model]\ntype = "Parametric"\n'
-    text += f'step = {{ ref = "{require_reference(step)}" }}\ntheta = {{ {values} }}\n'
-    dt = model.dt or getattr(model.data, "dt", None)
-    text += "" if dt is None else f"dt = {dt!r}\n"
-    if model.vectorized:
-        text += "vectorized = true\n"
-    write_text(path, text)

@@ -14,8 +14,7 @@ from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear
 
-_OPSET, _IR = 17, 8
-"""Versions that onnxruntime has read since 2022."""
+_OPSET, _IR = 17, 8  # versions that onnxruntime has read since 2022
 
 
 def write_onnx(path: str | Path, model: Model) -> None:
@@ -52,45 +51,32 @@ def _model(graph: _Graph, model: Model, output: str) -> tuple[int, int]:
     if isinstance(model, Linear):
         n, m = model.B.shape
         graph.affine("z", np.concatenate([model.A, model.B], axis=1).T, model.c, output)
-    elif isinstance(model, FeedforwardReLU):
-        n = len(model.scaling.shift_out)
-        m = len(model.scaling.shift_in) - n
-        _network(graph, model, n, output)
-    elif isinstance(model, GaussianProcessModel):
-        n = len(model.scaling.shift_out)
-        m = len(model.scaling.shift_in) - n
-        _gaussian_process(graph, model, n, output)
-    else:
-        assert isinstance(model, Corrected)  # require_onnx has checked it
+        return n, m
+    if isinstance(model, Corrected):
         n, m = _model(graph, model.model, "before")
         _correction(graph, model.correction, "correction")
         graph.node("Add", ["before", "correction"], output)
-    return n, m
-
-
-def _network(graph: _Graph, model: FeedforwardReLU, n: int, output: str) -> None:
+        return n, m
+    assert isinstance(model, FeedforwardReLU | GaussianProcessModel)  # require_onnx has checked it
     scaling = model.scaling
+    n, width = len(scaling.shift_out), len(scaling.shift_in)
     graph.affine("z", np.diag(1 / scaling.scale_in), -scaling.shift_in / scaling.scale_in, "h0")
-    last = len(model.weights) - 1
-    for i, (weight, bias) in enumerate(zip(model.weights, model.biases, strict=True)):
-        graph.affine(f"h{i}", weight, bias, f"a{i}")
-        if i < last:
-            graph.node("Relu", [f"a{i}"], f"h{i + 1}")
-    graph.affine(f"a{last}", np.diag(scaling.scale_out), scaling.shift_out, "change")
-    graph.affine("z", np.eye(len(scaling.shift_in))[:, :n], np.zeros(n), "x")
+    if isinstance(model, FeedforwardReLU):
+        last = len(model.weights) - 1
+        for i, (weight, bias) in enumerate(zip(model.weights, model.biases, strict=True)):
+            graph.affine(f"h{i}", weight, bias, f"a{i}")
+            if i < last:
+                graph.node("Relu", [f"a{i}"], f"h{i + 1}")
+        graph.affine(f"a{last}", np.diag(scaling.scale_out), scaling.shift_out, "change")
+    else:
+        _squared_distance(graph, "h0", model.centres, model.covariance.length_scales, 0.5, "half")
+        graph.node("Neg", ["half"], "exponent")
+        graph.node("Exp", ["exponent"], "covariances")
+        weights = model.covariance.variance * model.weights * scaling.scale_out
+        graph.affine("covariances", weights, scaling.shift_out, "change")
+    graph.affine("z", np.eye(width)[:, :n], np.zeros(n), "x")
     graph.node("Add", ["x", "change"], output)
-
-
-def _gaussian_process(graph: _Graph, model: GaussianProcessModel, n: int, output: str) -> None:
-    scaling = model.scaling
-    graph.affine("z", np.diag(1 / scaling.scale_in), -scaling.shift_in / scaling.scale_in, "pair")
-    _squared_distance(graph, "pair", model.centres, model.covariance.length_scales, 0.5, "half")
-    graph.node("Neg", ["half"], "exponent")
-    graph.node("Exp", ["exponent"], "covariances")
-    weights = model.covariance.variance * model.weights * scaling.scale_out
-    graph.affine("covariances", weights, scaling.shift_out, "change")
-    graph.affine("z", np.eye(len(scaling.shift_in))[:, :n], np.zeros(n), "x")
-    graph.node("Add", ["x", "change"], output)
+    return n, width - n
 
 
 def _correction(graph: _Graph, one: Correction, output: str) -> None:
@@ -123,8 +109,8 @@ def _squared_distance(graph: _Graph, source: str, centres: Array, scales: Array,
     inverse = factor / scales**2
     graph.node("Mul", [source, source], f"{output}_squares")
     graph.affine(source, (-2 * inverse * centres).T, (inverse * centres**2).sum(axis=1), f"{output}_mixed")
-    own = np.repeat(inverse[:, None], len(centres), axis=1)
-    graph.affine(f"{output}_squares", own, np.zeros(len(centres)), f"{output}_own")
+    squares = np.repeat(inverse[:, None], len(centres), axis=1)
+    graph.affine(f"{output}_squares", squares, np.zeros(len(centres)), f"{output}_own")
     graph.node("Add", [f"{output}_mixed", f"{output}_own"], f"{output}_sum")
     graph.node("Relu", [f"{output}_sum"], output)
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from ctxval.refinement.disturbance import MeasuredResidual, ResidualRegion, measure_residual
-from ctxval.refinement.held_out import HeldOut, held_out
 from ctxval.refinement.methods import Learned, Method, ParameterFit, Refit, ResidualCorrection, UserFit
-from ctxval.refinement.records import Records
+from ctxval.refinement.records import HeldOut, Records, held_out
 from ctxval.refinement.refine import refine
 from ctxval.refinement.rounds import Refinement, Round
 

@@ -18,15 +18,6 @@ from ctxval.errors import CtxvalError
 from ctxval.learning.recorded import closed_loops_on_model
 from ctxval.models import Corrected, Linear, Refined
 
-_SAME = 1e-6
-"""Largest difference between the inputs of two controllers, as a share of the largest magnitude of each input."""
-_BETTER = 0.95
-"""The Jacobian of M' is used for one linearisation if this lowers the cost of the tasks on M' to so much of it."""
-_ONCE = 2
-"""Largest number of states and inputs at which a synthesizer that linearises once asks for the Jacobian."""
-_TASKS = 32
-"""Largest number of tasks whose controllers are compared."""
-
 
 @dataclass(frozen=True)
 class SameControllers:
@@ -52,9 +43,6 @@ def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refine
     A synthesizer that linearises once, such as LQR, needs a linear model that is good on the whole task. If M is
     linear, it is such a model, and the Jacobian of a nonlinear M' at one point may be none. It is used only if random
     tasks have a clearly smaller cost on M' with it. Nothing is executed.
-
-    Returns:
-        the model, and a sentence if the Jacobian of M is used.
     """
     own = refined.model
     if not isinstance(own, Corrected) or not _linearises_a_linear_model_once(validation, own.model):
@@ -63,7 +51,7 @@ def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refine
         Corrected(own.model, own.correction, linearised="model", data=own.data), refined.data, refined.before
     )
     costs = [_typical_cost(validation.with_model(model)) for model in (refined, kept)]
-    if costs[0] <= _BETTER * costs[1]:
+    if costs[0] <= 0.95 * costs[1]:  # clearly
         return refined, None
     return kept, (
         "controllers are designed with the Jacobian of the model before, and the prediction is corrected: the "
@@ -96,7 +84,7 @@ def _linearises_a_linear_model_once(validation: Validation, model: Model) -> boo
         validation.with_model(counted).plan(validation.space.from_unit(np.full(validation.space.dimension, 0.5)))
     except CtxvalError:
         return False
-    return 1 <= counted.points <= _ONCE
+    return 1 <= counted.points <= 2
 
 
 def _typical_cost(validation: Validation) -> float:
@@ -104,21 +92,15 @@ def _typical_cost(validation: Validation) -> float:
     try:
         with single_threaded():
             loops = closed_loops_on_model(validation)
-            if loops is None or loops.states.ndim == 2:
-                return _cost_one_by_one(validation)
-            space = validation.space
-            points = space.from_unit(np.random.default_rng(0).random((len(loops.states), space.dimension)))
+            space, rng = validation.space, np.random.default_rng(0)
+            if loops is None or loops.states.ndim == 2:  # designs cannot be made in a batch
+                plans = [validation.plan(point) for point in space.from_unit(rng.random((8, space.dimension)))]
+                return float(np.median([_cost(validation, plan.task, plan.model_trajectory) for plan in plans]))
+            points = space.from_unit(rng.random((len(loops.states), space.dimension)))
             costs = _cost(validation, validation.task(space.parameters(points)), loops)
             return float(np.median(costs)) if np.isfinite(costs).all() else np.inf
     except Exception:  # users' tasks, synthesizers and costs may raise anything, on tasks that may never be executed
         return np.inf
-
-
-def _cost_one_by_one(validation: Validation) -> float:
-    space = validation.space
-    points = space.from_unit(np.random.default_rng(0).random((8, space.dimension)))
-    plans = [validation.plan(point) for point in points]
-    return float(np.median([_cost(validation, plan.task, plan.model_trajectory) for plan in plans]))
 
 
 def _cost(validation: Validation, task: Task, loops: Trajectory) -> Array:
@@ -133,15 +115,15 @@ def _cost(validation: Validation, task: Task, loops: Trajectory) -> Array:
 
 def same_controllers(validation: Validation, executed: Sequence[tuple[Trial, Trajectory]]) -> SameControllers:
     """Return on how many executed tasks the controllers of a refined model are those that were executed."""
-    some = executed[-_TASKS:]
-    distances = [one for one in (_known_distance(validation, *pair) for pair in some) if one is not None]
-    return SameControllers(len(some), len(distances), max(distances, default=None))
-
-
-def _known_distance(validation: Validation, trial: Trial, recorded: Trajectory) -> float | None:
-    """Return the distance of a refined model on an executed task; None if its controller has changed."""
-    try:
-        plan = validation.plan(validation.space.from_unit(trial.unit_point))
-        return validation.accept(plan, recorded).distance if gives_inputs(plan, recorded, _SAME) else None
-    except Exception:  # users' tasks, synthesizers and distances may raise anything: what cannot be compared differs
-        return None
+    distances = []
+    for trial, recorded in executed[-32:]:
+        try:
+            plan = validation.plan(validation.space.from_unit(trial.unit_point))
+            if gives_inputs(plan, recorded, 1e-6):  # a share of the largest magnitude of each input
+                distances.append(validation.accept(plan, recorded).distance)
+        except (
+            Exception
+        ):  # users' tasks, synthesizers and distances may raise anything: what cannot be compared differs
+            continue
+    known = [distance for distance in distances if distance is not None]
+    return SameControllers(len(executed[-32:]), len(known), max(known, default=None))

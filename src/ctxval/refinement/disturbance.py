@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,20 +10,10 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import aligned
-from ctxval.refinement.held_out import HeldOut
+from ctxval.refinement.records import HeldOut
 
 QUANTILE = 0.95
 """The share of the held-out transitions whose residual is at most the stated quantile."""
-_REGIONS = 6
-"""Largest number of regions."""
-_LEAST = 40
-"""Least number of transitions in a region: the 0.95 quantile of fewer would be their largest value."""
-_PLACES = (0.25, 0.5, 0.75)
-"""Quantiles of a coordinate at which a region may be split."""
-_GAIN = 0.1
-"""Least share of the spread of the logarithms that a split must explain."""
-_ROUNDING = 1e-6
-"""Spread of the logarithms of one transition that may be rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +56,10 @@ class MeasuredResidual(ShortRepr):
         """The table as plain text."""
         units = [f"{name} [{unit}]" if unit else name for name, unit in self.states.items()]
         head = ["region", "steps", *(f"{unit}: 95 %" for unit in units), *(f"{unit}: largest" for unit in units)]
-        rows = [head, *(self._row(one, self._where(one)) for one in self.regions)]
-        rows.append(self._row(self.whole, "all records"))
+        rows = [head]
+        for region, where in [*((region, self._where(region)) for region in self.regions), (self.whole, "all records")]:
+            sizes = (*region.quantile.tolist(), *region.largest.tolist())
+            rows.append([where, str(region.steps), *(f"{value:.3g}" for value in sizes)])
         return aligned(rows, right=True)
 
     @property
@@ -81,12 +72,10 @@ class MeasuredResidual(ShortRepr):
         ]
         return ", ".join(parts)
 
-    def _row(self, one: ResidualRegion, where: str) -> list[str]:
-        return [where, str(one.steps), *(f"{value:.3g}" for value in (*one.quantile.tolist(), *one.largest.tolist()))]
-
-    def _where(self, one: ResidualRegion) -> str:
+    def _where(self, region: ResidualRegion) -> str:
         parts = []
-        for name, low, high in zip((*self.states, *self.inputs), one.low.tolist(), one.high.tolist(), strict=True):
+        ends = zip((*self.states, *self.inputs), region.low.tolist(), region.high.tolist(), strict=True)
+        for name, low, high in ends:
             if np.isfinite(low) and np.isfinite(high):
                 parts.append(f"{low:.3g} < {name} <= {high:.3g}")
             elif np.isfinite(low):
@@ -102,7 +91,7 @@ class MeasuredResidual(ShortRepr):
         def plain(one: ResidualRegion) -> dict[str, Any]:
             ends = zip(names, one.low.tolist(), one.high.tolist(), strict=True)
             return {
-                "range": {name: [_finite(low), _finite(high)] for name, low, high in ends},
+                "range": {name: [end if np.isfinite(end) else None for end in pair] for name, *pair in ends},
                 "steps": one.steps,
                 "quantile": dict(zip(self.states, one.quantile.tolist(), strict=True)),
                 "largest": dict(zip(self.states, one.largest.tolist(), strict=True)),
@@ -112,12 +101,12 @@ class MeasuredResidual(ShortRepr):
             "quantile_level": QUANTILE,
             "units": {**self.states, **self.inputs},
             "whole": plain(self.whole),
-            "regions": [plain(one) for one in self.regions],
+            "regions": [plain(region) for region in self.regions],
             "guaranteed": False,
         }
 
 
-def measure_residual(found: HeldOut, states: dict[str, str], inputs: dict[str, str]) -> MeasuredResidual:
+def measure_residual(held: HeldOut, states: dict[str, str], inputs: dict[str, str]) -> MeasuredResidual:
     """Return the residual by regions, from errors on transitions that were held out.
 
     The regions are those of a small regression tree: each split explains most of the spread of the logarithm of the
@@ -127,15 +116,15 @@ def measure_residual(found: HeldOut, states: dict[str, str], inputs: dict[str, s
         found: the errors.
         states, inputs: the names of states and inputs with their units.
     """
-    magnitude = np.abs(found.errors)
-    sizes = np.maximum(found.changes.std(axis=0), 1e-300)
-    error = np.sqrt(((found.errors / sizes) ** 2).mean(axis=1))
+    magnitude = np.abs(held.errors)
+    sizes = np.maximum(held.changes.std(axis=0), 1e-300)
+    error = np.sqrt(((held.errors / sizes) ** 2).mean(axis=1))
     logs = np.log(np.maximum(error, 1e-12 * max(float(error.max(initial=0.0)), 1e-300)))
-    boxes = _split(found.pairs, logs)
+    boxes = _split(held.pairs, logs)
     regions = [_region(magnitude, *box) for box in boxes]
     inside = np.ones(len(magnitude), dtype=bool)
-    whole = _region(magnitude, inside, found.pairs.min(axis=0), found.pairs.max(axis=0))
-    ordered = sorted(regions, key=lambda one: float((one.quantile / sizes).max()))
+    whole = _region(magnitude, inside, held.pairs.min(axis=0), held.pairs.max(axis=0))
+    ordered = sorted(regions, key=lambda region: float((region.quantile / sizes).max()))
     return MeasuredResidual(states, inputs, whole, tuple(ordered))
 
 
@@ -146,8 +135,9 @@ def _split(pairs: Array, logs: Array) -> list[_Box]:
     """Return boxes with the transitions in them: the box whose split explains most is split first."""
     k = pairs.shape[1]
     boxes: list[_Box] = [(np.ones(len(pairs), dtype=bool), np.full(k, -np.inf), np.full(k, np.inf))]
-    least = max(_GAIN * float(((logs - logs.mean()) ** 2).sum()), _ROUNDING * len(logs))
-    while len(boxes) < _REGIONS:
+    # A split must explain a share of the spread, and more than rounding.
+    least = max(0.1 * float(((logs - logs.mean()) ** 2).sum()), 1e-6 * len(logs))
+    while len(boxes) < 6:
         splits = [_best_split(pairs, logs, box[0]) for box in boxes]
         best = max(range(len(boxes)), key=lambda i: splits[i][0])
         gain, column, place = splits[best]
@@ -164,28 +154,21 @@ def _split(pairs: Array, logs: Array) -> list[_Box]:
 def _best_split(pairs: Array, logs: Array, inside: Mask) -> tuple[float, int, float]:
     """Return the spread that the best split of a box explains, with its column and its place."""
     best = (0.0, 0, 0.0)
-    own = logs[inside]
-    total = float(((own - own.mean()) ** 2).sum())
+    chosen = logs[inside]
+    total = float(((chosen - chosen.mean()) ** 2).sum())
     for column in range(pairs.shape[1]):
         values = pairs[inside, column]
-        for place in _cuts(values):
+        # Rounded, so that they can be written down.
+        for place in (float(f"{cut:.3g}") for cut in np.quantile(values, (0.25, 0.5, 0.75))):
             below = values <= place
-            if min(int(below.sum()), int((~below).sum())) < _LEAST:
+            # The 0.95 quantile of fewer would be their largest value.
+            if min(int(below.sum()), int((~below).sum())) < 40:
                 continue
-            left = sum(float(((part - part.mean()) ** 2).sum()) for part in (own[below], own[~below]))
+            left = sum(float(((part - part.mean()) ** 2).sum()) for part in (chosen[below], chosen[~below]))
             best = max(best, (total - left, column, place))
     return best
 
 
-def _cuts(values: Array) -> Sequence[float]:
-    """Return places at which a coordinate may be split, rounded to three digits so that they can be written down."""
-    return [float(f"{place:.3g}") for place in np.quantile(values, _PLACES).tolist()]
-
-
 def _region(magnitude: Array, inside: Mask, low: Array, high: Array) -> ResidualRegion:
-    own = magnitude[inside]
-    return ResidualRegion(low, high, len(own), np.quantile(own, QUANTILE, axis=0), own.max(axis=0))
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+    sizes = magnitude[inside]
+    return ResidualRegion(low, high, len(sizes), np.quantile(sizes, QUANTILE, axis=0), sizes.max(axis=0))

@@ -37,35 +37,34 @@ def require_file_of(path: Path, method: Method, model: Model, step: str | None =
         require_onnx(before_refinement(model) if issubclass(method.makes, Corrected) else None)
 
 
-def write_refined(path: str | Path, found: Refinement, step: str | None = None) -> list[str]:
+def write_refined(path: str | Path, refinement: Refinement, step: str | None = None) -> list[str]:
     """Write the last model of a refinement, and next to it its residual as JSON and as a table; return the paths."""
-    if not found.last.number:
+    if not refinement.last.number:
         raise InputError("no model was refined, so there is none to write.")
     target = Path(path)
-    written = write_model_file(target, found.model, step)
-    if found.residual is None:
+    written = write_model_file(target, refinement.model, step)
+    if refinement.residual is None:
         return written
     about = {
         "made_by": MADE_BY,
         "model": target.name,
-        "verdict": found.answer,
-        "threshold": found.threshold,
-        "units": found.units,
-        "statement": found.statement,
-        "residual": found.residual.to_dict(),
+        "verdict": refinement.answer,
+        "threshold": refinement.threshold,
+        "units": refinement.units,
+        "statement": refinement.statement,
+        "residual": refinement.residual.to_dict(),
     }
+    remark = (
+        f"{MADE_BY}. Residual S(x, u) - M(x, u) of one step, measured on executions that the model was not learned "
+        f"from, and not guaranteed.\nMeasured for {refinement.residual.range_text}.\nA robust controller must assume "
+        "at least these disturbances."
+    )
     texts = {
         ".residual.json": json.dumps(describe(about, 12), indent=1, allow_nan=False) + "\n",
-        ".residual.txt": f"{found.residual.text}\n\n{_REMARK.format(range=found.residual.range_text)}\n",
+        ".residual.txt": f"{refinement.residual.text}\n\n{remark}\n",
     }
     for suffix, text in texts.items():
         beside = target.with_suffix(suffix)
         write_text(beside, text)
         written.append(str(beside))
     return written
-
-
-_REMARK = (
-    f"{MADE_BY}. Residual S(x, u) - M(x, u) of one step, measured on executions that the model was not learned from, "
-    "and not guaranteed.\nMeasured for {range}.\nA robust controller must assume at least these disturbances."
-)

@@ -20,22 +20,12 @@ from ctxval.fitting.least_squares import as_bounds
 from ctxval.learning import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
-from ctxval.refinement.held_out import HeldOut, held_out
-from ctxval.refinement.records import Records
+from ctxval.refinement.records import HeldOut, Records, held_out
 
-_CENTRES = 300
-"""Largest number of transitions that a correction is conditioned on."""
+_CENTRES = 300  # largest number of transitions that a correction is conditioned on
+# Fewer of them are kept, at least so many, if they predict the others with this relative error: design on the model
+# is then faster.
 _FEWEST, _PRECISE = 24, 0.005
-"""Fewer of them are kept, at least so many, if they predict the others with this relative error: design on the model is
-then faster."""
-_FAMILY = (2.5, 0.0)
-"""Smoothness and growth of the covariance of a correction."""
-_UNITS = (32, 32)
-"""Numbers of units in the hidden layers of a network."""
-_NEGLIGIBLE = 1e-7
-"""A residual below this share of the state's typical change is rounding."""
-_CHECKED = 50
-"""Number of recorded pairs at which a learned model is tried."""
 
 RefitKind = Literal["linear", "network", "gaussian-process"]
 NAMES = ("residual", *get_args(RefitKind), "parameters", "fit")
@@ -103,8 +93,8 @@ class ResidualCorrection(ShortRepr, Method):
         """Return the corrected model."""
 
         def corrected(some: Records) -> Model:
-            found = self._correction(model, some)
-            return model if found is None else Corrected(model, found)
+            correction = self._correction(model, some)
+            return model if correction is None else Corrected(model, correction)
 
         errors = held_out(corrected, model, records)
         better = errors.better
@@ -115,22 +105,22 @@ class ResidualCorrection(ShortRepr, Method):
                 "predicted from state and input. A state may be missing, such as a temperature or a delay, or the "
                 "executions have too little in common."
             )
-        worth: Mask = np.asarray(errors.rms_before > _NEGLIGIBLE * errors.changes.std(axis=0))
-        notes = () if (better | ~worth).all() else (_uncorrected(better | ~worth),)
+        worth: Mask = np.asarray(errors.rms_before > 1e-7 * errors.changes.std(axis=0))
+        rows = ", ".join(str(i) for i in np.flatnonzero(worth & ~better).tolist())
+        notes = (
+            (f"not corrected, because the error on held-out executions would not fall: state {rows}",) if rows else ()
+        )
         return Learned(Corrected(model, whole.of_states(better), data=records.transitions), errors.kept(better), notes)
 
     def _correction(self, model: Model, records: Records) -> Correction | None:
-        settings = PosteriorSettings(hyperparameters=1, centres=self.centres, families=(_FAMILY,), of_steps=False)
-        found = learn_posterior(model, records.transitions, records.sources, settings=settings)
-        return None if found is None else correction_of(found)
+        # Matern 5/2 that does not grow with the inputs.
+        settings = PosteriorSettings(hyperparameters=1, centres=self.centres, families=((2.5, 0.0),), of_steps=False)
+        posterior = learn_posterior(model, records.transitions, records.sources, settings=settings)
+        return None if posterior is None else correction_of(posterior)
 
 
 def correction_of(posterior: DynamicsPosterior) -> Correction:
-    """Return a learned residual as a correction, with the box of the records that it was learned from.
-
-    Args:
-        posterior: a posterior whose covariance is a Matern 5/2 one that does not grow with the inputs.
-    """
+    """Return a learned residual as a correction, with the box of the records that it was learned from."""
     data, mean = posterior.data, posterior.with_few_centres(_FEWEST, _PRECISE)
     low, high = data.pairs.min(axis=0), data.pairs.max(axis=0)
     values = np.exp(mean.hyperparameters.theta)
@@ -139,24 +129,10 @@ def correction_of(posterior: DynamicsPosterior) -> Correction:
     weights[:, data.learned] = mean.weights[0]
     weights *= data.units
     linear = np.concatenate([slope * mean.centres.T @ weights, constant * weights.sum(axis=0, keepdims=True)])
-    return Correction(
-        data.shift,
-        data.scale,
-        mean.centres,
-        scales,
-        weights,
-        linear,
-        low,
-        high,
-        # A coordinate that the residual does not depend on fades the correction within one more range of the records.
-        np.minimum(scales, np.maximum(high - low, 1.0)),
-        posterior.limit * data.units,
-    )
-
-
-def _uncorrected(better: Mask) -> str:
-    rows = ", ".join(str(i) for i in np.flatnonzero(~better).tolist())
-    return f"not corrected, because the error on held-out executions would not fall: state {rows}"
+    # A coordinate that the residual does not depend on fades the correction within one more range of the records.
+    fade = np.minimum(scales, np.maximum(high - low, 1.0))
+    limit = posterior.limit * data.units
+    return Correction(data.shift, data.scale, mean.centres, scales, weights, linear, low, high, fade, limit)
 
 
 @dataclass(frozen=True)
@@ -166,9 +142,6 @@ class Refit(ShortRepr, Method):
     Attributes:
         kind: ``linear``, ``network`` or ``gaussian-process``.
         seed: seed of all random numbers.
-
-    Raises:
-        UnknownNameError: if there is no such kind.
     """
 
     kind: RefitKind
@@ -190,15 +163,14 @@ class Refit(ShortRepr, Method):
 
     def learn(self, model: Model, records: Records) -> Learned:
         """Return the new model."""
-        made: dict[str, Callable[[Transitions], Model]] = {
-            "linear": Linear.fit,
-            "network": lambda data: FeedforwardReLU.fit(data, _UNITS, seed=self.seed, restarts=2),
-            "gaussian-process": lambda data: GaussianProcessModel.fit(data, _CENTRES, seed=self.seed),
-        }
 
         def fitted(some: Records) -> Model:
             with single_threaded():
-                return made[self.kind](some.transitions)
+                if self.kind == "linear":
+                    return Linear.fit(some.transitions)
+                if self.kind == "network":
+                    return FeedforwardReLU.fit(some.transitions, (32, 32), seed=self.seed, restarts=2)
+                return GaussianProcessModel.fit(some.transitions, _CENTRES, seed=self.seed)
 
         return Learned(_usable(fitted(records), records), held_out(fitted, model, records))
 
@@ -212,9 +184,6 @@ class ParameterFit(ShortRepr, Method):
         step: the function; None for that of the first model, which must then be a ``Parametric``.
         vectorized: whether ``step`` takes whole batches.
         seed: seed of the starting points.
-
-    Raises:
-        InputError: if the bounds cannot be used.
     """
 
     bounds: Mapping[str, tuple[float, float]]
@@ -241,8 +210,8 @@ class ParameterFit(ShortRepr, Method):
         def fitted(some: Records) -> Model:
             return fit_parameters(step, self.bounds, some.transitions, **known)[0]
 
-        found, parameters = fit_parameters(step, self.bounds, records.transitions, **known)
-        return Learned(_usable(found, records), held_out(fitted, model, records), parameters=parameters)
+        learned, parameters = fit_parameters(step, self.bounds, records.transitions, **known)
+        return Learned(_usable(learned, records), held_out(fitted, model, records), parameters=parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,9 +220,6 @@ class UserFit(ShortRepr, Method):
 
     Attributes:
         fit: the function of the transitions; it must always return the same for the same data.
-
-    Raises:
-        InputError: if it is not a function.
     """
 
     fit: Callable[[Transitions], Model | Step]
@@ -265,8 +231,7 @@ class UserFit(ShortRepr, Method):
 
     def learn(self, model: Model, records: Records) -> Learned:
         """Return the model that the function returns."""
-        found = _usable(self._fitted(records), records)
-        return Learned(found, held_out(self._fitted, model, records))
+        return Learned(_usable(self._fitted(records), records), held_out(self._fitted, model, records))
 
     def _fitted(self, records: Records) -> Model:
         try:
@@ -280,19 +245,20 @@ class UserFit(ShortRepr, Method):
 def _usable(model: Model, records: Records) -> Model:
     """Return a model that gives finite states of the right shape at recorded pairs."""
     data = records.transitions
-    rows = np.linspace(0, len(data) - 1, min(_CHECKED, len(data))).astype(int)
+    rows = np.linspace(0, len(data) - 1, min(50, len(data))).astype(int)
     try:
         with np.errstate(all="ignore"):
-            found = np.asarray(model.step(data.x[rows], data.u[rows]), dtype=np.float64)
+            predicted = np.asarray(model.step(data.x[rows], data.u[rows]), dtype=np.float64)
     except CtxvalError as error:
         raise ModelError(f"the learned model cannot predict the recorded steps: {error}") from error
     except (Exception, SystemExit) as error:
         raise ModelError(f"the learned model failed on recorded states and inputs: {reason_of(error)}.") from error
-    if found.shape != data.x[rows].shape:
+    if predicted.shape != data.x[rows].shape:
         raise ModelError(
-            f"the learned model must return states of shape {data.x[rows].shape} for as many states, got {found.shape}."
+            f"the learned model must return states of shape {data.x[rows].shape} for as many states, got "
+            f"{predicted.shape}."
         )
-    if not np.isfinite(found).all():
+    if not np.isfinite(predicted).all():
         raise ModelError("the learned model returns NaN or infinity on recorded states and inputs.")
     return model
 

@@ -6,14 +6,14 @@ import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 from ctxval._util.checked import PositiveFloat, PositiveInt, checked
 from ctxval._util.progress import stage
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import executed_trials
-from ctxval.certificates import CertificateOptions, Verdict
+from ctxval.certificates import CertificateOptions
 from ctxval.certificates.verdict import counterexample
 from ctxval.core.model import Model, Step
 from ctxval.core.trajectory import Trajectory, Transitions
@@ -29,14 +29,8 @@ from ctxval.refinement.methods import Learned, Method, method_of
 from ctxval.refinement.records import Records
 from ctxval.refinement.rounds import Refinement, Round
 
-
-class OpensRound(Protocol):
-    """Makes the campaign of a round."""
-
-    def __call__(
-        self, validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
-    ) -> Campaign:
-        """Return the campaign of a refined model."""
+OpensRound = Callable[[Validation, Path | None, Path | None, CertificateOptions], Campaign]
+"""A function that makes the campaign of a round, from its validation, its store, the file of its model and options."""
 
 
 @checked
@@ -88,34 +82,21 @@ def refine(
         )
     chosen = method_of(method, seed=campaign.seed)
     options = CertificateOptions() if certificate is None else certificate
-    loop = _Loop(
-        campaign,
-        float(threshold),
-        int(budget),
-        chosen,
-        options,
-        open_round or _SameSettings(campaign),
-        {"on_trial": on_trial, "progress": progress, **execution},
-    )
+
+    def same_settings(
+        validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
+    ) -> Campaign:
+        search = copy.deepcopy(campaign.search)
+        return Campaign(validation, search=search, store=store, seed=campaign.seed, name=campaign.name)
+
+    open_round = same_settings if open_round is None else open_round
+    execution |= {"on_trial": on_trial, "progress": progress}
+    loop = _Loop(campaign, float(threshold), int(budget), chosen, options, open_round, execution)
     with progress_shown(progress):
         return loop.run()
 
 
-@dataclass(frozen=True, eq=False)
-class _SameSettings:
-    """Makes the campaigns of rounds like that of the first model."""
-
-    first: Campaign
-
-    def __call__(
-        self, validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
-    ) -> Campaign:
-        search = copy.deepcopy(self.first.search)
-        return Campaign(validation, search=search, store=store, seed=self.first.seed, name=self.first.name)
-
-
-@dataclass(frozen=True, eq=False)
-class _RefinedModel:
+class _RefinedModel(NamedTuple):
     """A refined model before its first execution."""
 
     model: Refined
@@ -139,45 +120,38 @@ class _Loop:
 
     def run(self) -> Refinement:
         """Run the rounds until one is validated, or nothing more can be done."""
-        self.rounds.append(self._first_round())
+        self._execute(self.first, self.options)
+        verdict = self.first.verdict(self.threshold, certificate=self.options)
+        self.rounds.append(Round(0, "given", self.first, verdict, self.options.confidence))
         ended = self._why_ended()
         while ended is None:
             ended = self._next_round() or self._why_ended()
         return self._result(ended)
 
-    # The first model
-
-    def _first_round(self) -> Round:
-        self._execute(self.first, self.options)
-        return Round(0, "given", self.first, self._verdict(self.first, self.options), self.options.confidence)
-
     def _execute(self, campaign: Campaign, options: CertificateOptions) -> None:
         """Execute tasks of a campaign until it is decided or the budget ends; people execute theirs themselves."""
         known = counterexample(campaign.trials, self.threshold) is not None
-        left = self.budget - sum(one.executions for one in self.rounds if one.campaign is not campaign)
+        left = self.budget - sum(item.executions for item in self.rounds if item.campaign is not campaign)
         if known or getattr(campaign.validation.system, "manual", False) or left < 1:
             return
         campaign.run(left, self.threshold, certificate=options, **self.execution)
 
-    def _verdict(self, campaign: Campaign, options: CertificateOptions) -> Verdict:
-        return campaign.verdict(self.threshold, certificate=options)
-
     def _why_ended(self) -> str | None:
         """Return why there is no further round; None if there is one."""
-        last, spent = self.rounds[-1], sum(one.executions for one in self.rounds)
+        last, spent = self.rounds[-1], sum(item.executions for item in self.rounds)
         if last.verdict.answer == "validated":
             which = "the given model" if not last.number else f"the model of round {last.number}"
             return f"{which} is validated"
         if last.verdict.answer == "undecided":
             if getattr(last.campaign.validation.system, "manual", False):
-                return f"people execute the tasks of this system: {self._by_hand(last)}"
+                return (
+                    f"people execute the tasks of this system: get them with `ctxval ask {last.store}`, tell their "
+                    "results, and refine again"
+                )
             return f"the verdict on the model of round {last.number} is undecided after {spent} executions"
         if spent >= self.budget:
             return f"the budget of {self.budget} executions is spent"
         return None
-
-    def _by_hand(self, last: Round) -> str:
-        return f"get them with `ctxval ask {last.store}`, tell their results, and refine again"
 
     # Refined models
 
@@ -195,7 +169,9 @@ class _Loop:
                     raise
                 return f"no better model can be learned: {str(error).removesuffix('.')}"
         validation = self.first.validation.with_model(made.model)
-        known = self._unchanged(validation)
+        known = SameControllers()
+        if not getattr(self.options.kind, "stochastic", False):
+            known = same_controllers(validation, list(self._executed(self.rounds)))
         if known.worst is not None and known.worst > self.threshold:
             return (
                 f"the model that round {number} would learn has the distance {known.worst:.4g} on a task that it has "
@@ -203,17 +179,12 @@ class _Loop:
             )
         campaign = self.open_round(validation, self._beside(number, ".sqlite"), made.file, options)
         self._execute(campaign, options)
+        verdict = campaign.verdict(self.threshold, certificate=options)
+        learned_from = len(made.model.data)
         self.rounds.append(
             Round(
-                number,
-                self.method.name,
-                campaign,
-                self._verdict(campaign, options),
-                confidence,
-                len(made.model.data),
-                made.file,
-                made.notes,
-                known,
+                *(number, self.method.name, campaign, verdict, confidence, learned_from, made.file, made.notes),
+                unchanged=known,
             )
         )
         return None
@@ -229,9 +200,9 @@ class _Loop:
                 f"{file} was learned by the method {note.get('method')!r}: give this method, or move the files of the "
                 "rounds away."
             )
-        found = read_refined(file, self._base)
-        notes = tuple(str(one) for one in note.get("notes", []))
-        return _RefinedModel(Refined(found, found.data or self._records(number).transitions, self._base), file, notes)
+        model = read_refined(file, self._base)
+        data = model.data or self._records(number).transitions
+        return _RefinedModel(Refined(model, data, self._base), file, tuple(map(str, note.get("notes", []))))
 
     def _learned_model(self, number: int) -> _RefinedModel:
         """Return the model of a round, learned from the executions before, and write its file."""
@@ -254,8 +225,8 @@ class _Loop:
         return before_refinement(self.first.validation.model)
 
     def _executed(self, rounds: list[Round]) -> Iterator[tuple[Trial, Trajectory]]:
-        for one in rounds:
-            yield from executed_trials(one.campaign.store, one.campaign.trials)
+        for item in rounds:
+            yield from executed_trials(item.campaign.store, item.campaign.trials)
 
     def _learned(self, number: int) -> Learned:
         """Return what the rounds before a number teach; the result needs it after the round, too."""
@@ -268,11 +239,6 @@ class _Loop:
         executed = [trajectory for _, trajectory in self._executed(self.rounds[:before])]
         return Records.of(self.first.validation.model, executed)
 
-    def _unchanged(self, validation: Validation) -> SameControllers:
-        if getattr(self.options.kind, "stochastic", False):
-            return SameControllers()
-        return same_controllers(validation, list(self._executed(self.rounds)))
-
     def _beside(self, number: int, suffix: str) -> Path | None:
         return None if self.first.store.path is None else round_file(self.first.store.path, number, suffix)
 
@@ -281,19 +247,14 @@ class _Loop:
     def _result(self, ended: str) -> Refinement:
         number = self.rounds[-1].number
         learned, residual = self._measured(number) if number else (None, None)
-        names = {} if residual is None else residual.states
-        rms = (
-            [] if learned is None else zip(learned.errors.rms_before.tolist(), learned.errors.rms.tolist(), strict=True)
-        )
+        accuracy = {}
+        if learned is not None and residual is not None:
+            rms = zip(learned.errors.rms_before.tolist(), learned.errors.rms.tolist(), strict=True)
+            accuracy = dict(zip(residual.states, rms, strict=False))
+        parameters = () if learned is None else learned.parameters
         return Refinement(
-            tuple(self.rounds),
-            self.threshold,
-            self.options.confidence,
-            self.budget,
-            ended,
-            residual,
-            dict(zip(names, rms, strict=False)),
-            () if learned is None else learned.parameters,
+            *(tuple(self.rounds), self.threshold, self.options.confidence, self.budget, ended, residual, accuracy),
+            parameters,
             self.first.validation.labels.units,
         )
 
@@ -304,8 +265,8 @@ class _Loop:
                 learned = self._learned(number)
             except CtxvalError:  # the file of the model is there, but its executions are not
                 return None, None
-            own = tuple(trajectory for _, trajectory in self._executed(self.rounds[number:]))
-            whole = learned.errors.with_executions(self.rounds[number].model, self._base, own)
+            last = tuple(trajectory for _, trajectory in self._executed(self.rounds[number:]))
+            whole = learned.errors.with_executions(self.rounds[number].model, self._base, last)
             names = self.first.validation.names(whole.errors.shape[1], whole.pairs.shape[1] - whole.errors.shape[1])
             return replace(learned, errors=whole), measure_residual(whole, *names)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,7 @@ class Round(ShortRepr):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values."""
-        found = self.verdict.certificate
+        certificate = self.verdict.certificate
         return {
             "round": self.number,
             "method": self.method,
@@ -93,13 +93,9 @@ class Round(ShortRepr):
             "reason": self.verdict.reason,
             "confidence": self.confidence,
             "bound": self.verdict.bound,
-            "certificate": None if found is None else found.to_json(),
+            "certificate": None if certificate is None else certificate.to_json(),
             "notes": list(self.notes),
-            "unchanged_controllers": {
-                "tasks": self.unchanged.tasks,
-                "same": self.unchanged.same,
-                "worst": self.unchanged.worst,
-            },
+            "unchanged_controllers": asdict(self.unchanged),
         }
 
 
@@ -149,26 +145,25 @@ class Refinement:
     @property
     def executions(self) -> int:
         """The number of executions of all rounds."""
-        return sum(one.executions for one in self.rounds)
+        return sum(item.executions for item in self.rounds)
 
     @property
     def statement(self) -> str:
         """What the last verdict means: the executions that it counts, and its confidence after several rounds."""
-        own = self.last.executions
-        others = self.executions - own
-        said = (
-            f"The verdict on the model of round {self.last.number} counts {counted(own, 'execution')} under its own "
-            "controllers"
+        others = self.executions - self.last.executions
+        counts = (
+            f"The verdict on the model of round {self.last.number} counts "
+            f"{counted(self.last.executions, 'execution')} under its own controllers"
         )
         if others:
-            said += (
+            counts += (
                 f"; {counted(others, 'execution')} under controllers of other models taught the model, and "
                 f"{'proves' if others == 1 else 'prove'} nothing of it"
             )
         if self.answer != "validated" or not self.last.number:
-            return f"{said}."
+            return f"{counts}."
         return (
-            f"{said}. Its confidence is {self.last.confidence:.6g}: the k-th refined model may be validated wrongly "
+            f"{counts}. Its confidence is {self.last.confidence:.6g}: the k-th refined model may be validated wrongly "
             f"with probability {1 - self.confidence:.3g} / (k (k + 1)), so the whole sequence is wrong with "
             f"probability at most {1 - self.confidence:.3g}, however many models were tried. This holds for one "
             "refinement: if several refinements begin with the same stores or executions, the probability that any of "
@@ -184,7 +179,7 @@ class Refinement:
     @property
     def text(self) -> str:
         """The rounds as a table of plain text."""
-        return aligned([self.head, *(one.cells for one in self.rounds)])
+        return aligned([self.head, *(item.cells for item in self.rounds)])
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the models as plain values."""
@@ -199,11 +194,11 @@ class Refinement:
             "statement": self.statement,
             "distance_before": self.rounds[0].worst,
             "distance_after": self.last.worst,
-            "rounds": [one.to_dict() for one in self.rounds],
+            "rounds": [item.to_dict() for item in self.rounds],
             "one_step_error": {
                 name: {"before": before, "after": after} for name, (before, after) in self.accuracy.items()
             },
-            "parameters": [vars(one) for one in self.parameters],
+            "parameters": [vars(parameter) for parameter in self.parameters],
             "residual": None if self.residual is None else self.residual.to_dict(),
         }
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from ctxval.replay.accuracy import Region, StepError
-from ctxval.replay.explained import ResidualShare
+from ctxval.replay.causes import ResidualShare, Suggestion
 from ctxval.replay.report import RecordedData, ReplayReport, replay
-from ctxval.replay.timing import Suggestion
 from ctxval.replay.untested import PredictedTask, PredictedTasks
 
 __all__ = [

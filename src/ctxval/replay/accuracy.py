@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.data.recordings import Recordings
-from ctxval.replay.steps import Predictions, RecordedSteps, predicted, root_mean_square
+from ctxval.errors import CtxvalError, ModelError
 
-_BINS = 5
-"""Number of regions of one state or input; each has about as many steps."""
+_PARTS = 5  # number of parts of a single recording, which then take the place of recordings
 
 
 @dataclass(frozen=True)
@@ -73,30 +72,139 @@ class Region(ShortRepr):
     ratio: float
 
 
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """Predictions of k steps from recorded states, under the recorded inputs.
+
+    Attributes:
+        errors: predicted minus recorded states, shape ``(N, n)``; not finite if the model diverged.
+        changes: recorded changes of the states over the steps, shape ``(N, n)``.
+        states, inputs: recorded states and inputs at the start, shapes ``(N, n)`` and ``(N, m)``.
+        groups: the part of the recordings in which each prediction lies, shape ``(N,)``.
+    """
+
+    errors: Array
+    changes: Array
+    states: Array
+    inputs: Array
+    groups: Rows
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """The places in recordings from which so many steps before and after are recorded.
+
+    Attributes:
+        runs, places: the recording, and the step in it, shape ``(N,)``.
+        groups: the part of the recordings in which each lies, shape ``(N,)``.
+    """
+
+    runs: Rows
+    places: Rows
+    groups: Rows
+
+    def __len__(self) -> int:
+        return len(self.runs)
+
+
+class RecordedSteps:
+    """The steps of some recordings.
+
+    If there is only one recording, it is divided into five parts of equal length, which take the place of recordings.
+    """
+
+    def __init__(self, recordings: Recordings, used: Sequence[int]) -> None:
+        self.recordings = recordings
+        self._used = [recordings.runs[number].trajectory for number in used]
+        self._states = np.concatenate([run.states for run in self._used])
+        self._inputs = np.concatenate([run.inputs for run in self._used])
+        self._horizons = np.array([run.horizon for run in self._used])
+        self._first_input = np.cumsum([0, *self._horizons[:-1]])
+        self._first_state = self._first_input + np.arange(len(self._used))
+
+    def windows(self, before: int, after: int, most: int = 40_000) -> Windows:
+        """Return places with so many recorded steps before and after them; of too many, every second, third, ..."""
+        runs, places, groups = [], [], []
+        for number, horizon in enumerate(self._horizons.tolist()):
+            at = np.arange(before, horizon - after + 1)
+            runs.append(np.full(len(at), number))
+            places.append(at)
+            groups.append(np.full(len(at), number) if len(self._used) > 1 else (_PARTS * at) // (horizon + 1))
+        joined = [np.concatenate(part).astype(np.intp) for part in (runs, places, groups)]
+        every = max(1, -(-len(joined[0]) // most))
+        return Windows(*(part[::every] for part in joined))
+
+    def states(self, where: Windows, shift: int = 0) -> Array:
+        """Return the recorded states so many steps after places, shape ``(N, n)``."""
+        return np.asarray(self._states[self._first_state[where.runs] + where.places + shift])
+
+    def inputs(self, where: Windows, shift: int = 0) -> Array:
+        """Return the recorded inputs so many steps after places, shape ``(N, m)``."""
+        return np.asarray(self._inputs[self._first_input[where.runs] + where.places + shift])
+
+
+def predicted(model: Model, recorded: RecordedSteps, steps: int) -> Predictions:
+    """Return predictions of a number of steps from recorded states; none if no recording is so long."""
+    where = recorded.windows(0, steps, min(40_000, max(200, 400_000 // steps)))
+    x = start = recorded.states(where)
+    for k in range(steps if len(where) else 0):
+        x = stepped(model, x, recorded.inputs(where, k))
+    reached = recorded.states(where, steps) if len(where) else start
+    return Predictions(x - reached, reached - start, start, recorded.inputs(where), where.groups)
+
+
+def stepped(model: Model, x: Array, u: Array) -> Array:
+    """Return the next states of a model, ``(N, n)``."""
+    try:
+        with np.errstate(all="ignore"):
+            x_next = np.asarray(model.step(x, u), dtype=np.float64)
+    except CtxvalError as error:
+        raise _unusable(x, u, str(error)) from error
+    except Exception as error:  # the user's model
+        raise _unusable(x, u, f"{type(error).__name__}: {str(error)[:200]}") from error
+    if x_next.shape != x.shape:
+        raise _unusable(x, u, f"it returned the shape {x_next.shape}")
+    return x_next
+
+
+def _unusable(x: Array, u: Array, why: str) -> ModelError:
+    return ModelError(
+        f"the model cannot predict a step of the recordings, which have {x.shape[1]} states and {u.shape[1]} inputs: "
+        f"{why.removesuffix('.')}."
+    )
+
+
+def root_mean_square(values: Array) -> Array:
+    """Return the root mean square over the first axis, without rows whose squares are not finite; NaN if none is."""
+    with np.errstate(over="ignore"):
+        squares = values**2
+    finite = np.isfinite(squares).all(axis=tuple(range(1, values.ndim)))
+    if not finite.any():
+        return np.full(values.shape[1:], np.nan)
+    return np.asarray(np.sqrt(squares[finite].mean(axis=0)))
+
+
 def step_errors(model: Model, recorded: RecordedSteps, steps: Sequence[int]) -> tuple[StepError, ...]:
     """Return the errors of all states after numbers of steps for which a recording is long enough."""
-    found: list[StepError] = []
+    results: list[StepError] = []
     for count in steps:
         made = predicted(model, recorded, count)
-        if len(made.errors):
-            found += _errors(made, recorded.recordings)
-    return tuple(found)
-
-
-def _errors(made: Predictions, recordings: Recordings) -> list[StepError]:
-    finite: Mask = np.asarray(np.isfinite(made.errors).all(axis=1))
-    rms, change = root_mean_square(made.errors), root_mean_square(made.changes)
-    own = np.array([root_mean_square(made.errors[made.groups == group]) for group in np.unique(made.groups)])
-    sizes = np.abs(made.errors[finite]) if finite.any() else np.full((1, made.errors.shape[1]), np.nan)
-    known = own[np.isfinite(own).all(axis=1)] if np.isfinite(own).any() else own
-    return [
-        StepError(
-            *(name, unit, made.steps, float(rms[i]), float(known[:, i].min()), float(known[:, i].max())),
-            *(float(np.median(sizes[:, i])), float(np.quantile(sizes[:, i], 0.95)), float(sizes[:, i].max())),
-            *(float(change[i]), len(finite), float(1 - finite.mean())),
-        )
-        for i, (name, unit) in enumerate(recordings.states.items())
-    ]
+        if not len(made.errors):
+            continue
+        finite: Mask = np.asarray(np.isfinite(made.errors).all(axis=1))
+        rms, change = root_mean_square(made.errors), root_mean_square(made.changes)
+        by_group = np.array([root_mean_square(made.errors[made.groups == k]) for k in np.unique(made.groups)])
+        sizes = np.abs(made.errors[finite]) if finite.any() else np.full((1, made.errors.shape[1]), np.nan)
+        known = by_group[np.isfinite(by_group).all(axis=1)] if np.isfinite(by_group).any() else by_group
+        results += [
+            StepError(
+                *(name, unit, count, float(rms[i]), float(known[:, i].min()), float(known[:, i].max())),
+                *(float(np.median(sizes[:, i])), float(np.quantile(sizes[:, i], 0.95)), float(sizes[:, i].max())),
+                *(float(change[i]), len(finite), float(1 - finite.mean())),
+            )
+            for i, (name, unit) in enumerate(recorded.recordings.states.items())
+        ]
+    return tuple(results)
 
 
 def normalised(errors: Array, changes: Array) -> Array:
@@ -121,13 +229,13 @@ def regions(model: Model, recorded: RecordedSteps) -> tuple[Region, ...]:
     overall = float(np.sqrt((error[known] ** 2).mean()))
     values = np.concatenate([made.states, made.inputs], axis=1)[known]
     labels = recorded.recordings.states | recorded.recordings.inputs
-    found: list[Region] = []
+    results: list[Region] = []
     for (name, unit), column in zip(labels.items(), values.T, strict=True):
-        edges = np.unique(np.quantile(column, np.linspace(0, 1, _BINS + 1)))
+        edges = np.unique(np.quantile(column, np.linspace(0, 1, 6)))
         bins = np.clip(np.searchsorted(edges, column, side="right") - 1, 0, max(len(edges) - 2, 0))
         for k in range(max(len(edges) - 1, 0)):
             inside = error[known][bins == k]
-            own = float(np.sqrt((inside**2).mean())) if len(inside) else 0.0
-            ratio = own / overall if overall > 0 else 1.0
-            found.append(Region(name, unit, float(edges[k]), float(edges[k + 1]), len(inside), own, ratio))
-    return tuple(found)
+            rms = float(np.sqrt((inside**2).mean())) if len(inside) else 0.0
+            ratio = rms / overall if overall > 0 else 1.0
+            results.append(Region(name, unit, float(edges[k]), float(edges[k + 1]), len(inside), rms, ratio))
+    return tuple(results)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -17,11 +17,8 @@ from ctxval.core.validation import Validation
 from ctxval.data.recordings import Recordings
 from ctxval.data.sampling import Break
 from ctxval.errors import InputError
-from ctxval.replay.accuracy import Region, StepError, regions, step_errors
-from ctxval.replay.explained import ResidualShare, residual_shares
-from ctxval.replay.insights import insights
-from ctxval.replay.steps import RecordedSteps
-from ctxval.replay.timing import Suggestion, suggestions
+from ctxval.replay.accuracy import RecordedSteps, Region, StepError, regions, step_errors
+from ctxval.replay.causes import ResidualShare, Suggestion, residual_shares, suggestions
 from ctxval.replay.untested import PredictedTasks, predicted_tasks
 
 STEPS = (1, 5, 20, 100)
@@ -79,10 +76,10 @@ class ReplayReport(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values; numbers that are not finite are None."""
-        found: dict[str, Any] = plain_numbers(asdict(self))
-        for row, error in zip(found["errors"], self.errors, strict=True):
+        report: dict[str, Any] = plain_numbers(asdict(self))
+        for row, error in zip(report["errors"], self.errors, strict=True):
             row["relative"] = plain_numbers(error.relative)
-        return found
+        return report
 
 
 def replay(
@@ -119,55 +116,38 @@ def replay(
     recorded = RecordedSteps(recordings, used)
     with single_threaded():
         errors = step_errors(model, recorded, sorted(set(steps)))
-        found = regions(model, recorded)
+        where = regions(model, recorded)
         residuals = residual_shares(model, recorded, seed)
         changes = suggestions(model, recorded)
     tasks = None
     if validation is not None:
         logged = [run.trajectory for run in recordings.runs]
         tasks = predicted_tasks(validation, logged, executions=executions, seed=seed)
-    data = _data(recordings, len(seen))
-    said = (
+    data = RecordedData(
+        sources=tuple(dict.fromkeys(run.source for run in recordings.runs)),
+        recordings=len(recordings.runs),
+        steps=recordings.steps,
+        dt=recordings.dt,
+        states=recordings.states,
+        inputs=recordings.inputs,
+        breaks=recordings.breaks,
+        notes=recordings.notes,
+        seen=len(seen),
+    )
+    sentences = [
         *_of_data(data),
-        *insights(data.states | data.inputs, len(used), errors, found, residuals, changes, tasks),
-        *([_NOTHING] if validation is not None and tasks is None else []),
-    )
-    return ReplayReport(data, errors, found, residuals, changes, tasks, said)
-
-
-_NOTHING = (
-    "nothing is predicted of the tasks: the model explains the recordings, or no controller can be designed for a task"
-)
-
-
-def _data(recordings: Recordings, seen: int) -> RecordedData:
-    sources = tuple(dict.fromkeys(run.source for run in recordings.runs))
-    return RecordedData(
-        sources,
-        len(recordings.runs),
-        recordings.steps,
-        recordings.dt,
-        recordings.states,
-        recordings.inputs,
-        recordings.breaks,
-        recordings.notes,
-        seen,
-    )
-
-
-def _of_data(data: RecordedData) -> list[str]:
-    found = []
-    if data.breaks:
-        places = {(one.source, one.time): one.seconds for one in data.breaks}  # several fields may lack one time
-        found.append(
-            f"the logs were split at {counted(len(places), 'place')}, and {sum(places.values()):.3g} s are left out; "
-            f"the first is {data.breaks[0]}"
+        *(change.sentence for change in changes),
+        *_of_errors(errors, len(used)),
+        *_of_residuals(errors, residuals),
+        *_of_regions(errors, where),
+        *_of_tasks([*data.states, *data.inputs], tasks),
+    ]
+    if validation is not None and tasks is None:
+        sentences.append(
+            "nothing is predicted of the tasks: the model explains the recordings, or no controller can be designed "
+            "for a task"
         )
-    if data.seen == data.recordings:
-        found.append("the model was learned from all of these recordings, so its errors on others are larger")
-    elif data.seen:
-        found.append(f"the model was learned from {data.seen} of these recordings; the errors are those of the others")
-    return found
+    return ReplayReport(data, errors, where, residuals, changes, tasks, tuple(sentences))
 
 
 def _seen(model: Model, recordings: Recordings) -> set[int]:
@@ -176,19 +156,15 @@ def _seen(model: Model, recordings: Recordings) -> set[int]:
     n, m = len(recordings.states), len(recordings.inputs)
     if not isinstance(data, Transitions) or data.x.shape[1] != n or data.u.shape[1] != m:
         return set()
-    known = set(_rows(data))
-    found = set()
-    for number, run in enumerate(recordings.runs):
-        rows = _rows(run.trajectory.transitions())
-        if sum(row in known for row in rows) > len(rows) / 2:
-            found.add(number)
-    return found
 
+    def rows(transitions: Transitions) -> list[bytes]:
+        """Return transitions as texts that agree if the numbers agree to single precision."""
+        whole = np.concatenate([transitions.x, transitions.u, transitions.x_next], axis=1)
+        return [row.tobytes() for row in (whole.astype(np.float32) + np.float32(0.0))]
 
-def _rows(transitions: Transitions) -> list[bytes]:
-    """Return transitions as texts that agree if the numbers agree to single precision."""
-    whole = np.concatenate([transitions.x, transitions.u, transitions.x_next], axis=1)
-    return [row.tobytes() for row in (whole.astype(np.float32) + np.float32(0.0))]
+    known = set(rows(data))
+    recorded = [rows(run.trajectory.transitions()) for run in recordings.runs]
+    return {k for k, steps in enumerate(recorded) if sum(step in known for step in steps) > len(steps) / 2}
 
 
 def _require_same_step(validation: Validation, recordings: Recordings) -> None:
@@ -217,3 +193,100 @@ def plain_numbers(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return value
+
+
+# What follows, in sentences
+
+_SHARE = 0.3  # share of a residual from which an explanation is named
+_SMALL = 1e-3  # a one-step error below this share of the change is called small, and its causes are not named
+
+
+def _of_data(data: RecordedData) -> Iterator[str]:
+    if data.breaks:
+        places = {(gap.source, gap.time): gap.seconds for gap in data.breaks}  # several fields may lack one time
+        yield (
+            f"the logs were split at {counted(len(places), 'place')}, and {sum(places.values()):.3g} s are left out; "
+            f"the first is {data.breaks[0]}"
+        )
+    if data.seen == data.recordings:
+        yield "the model was learned from all of these recordings, so its errors on others are larger"
+    elif data.seen:
+        yield f"the model was learned from {data.seen} of these recordings; the errors are those of the others"
+
+
+def _of_errors(errors: Sequence[StepError], held_out: int) -> Iterator[str]:
+    single = [error for error in errors if error.steps == 1]
+    if not single:
+        yield "no recording has a single step, so nothing can be compared"
+        return
+    worst = max(single, key=lambda one: one.relative)
+    if worst.relative >= 1:
+        yield (
+            f"the model predicts {worst.state} no better than no change at all: its one-step error is "
+            f"{100 * worst.relative:.0f} % of the recorded change"
+        )
+    last = max(errors, key=lambda one: one.steps)
+    late = [error for error in errors if error.steps == last.steps and error.relative >= 1]
+    if late and worst.relative < 1:
+        states = ", ".join(one.state for one in late)
+        yield f"after {last.steps} steps the model predicts {states} no better than no change at all"
+    diverged = max(errors, key=lambda one: one.diverged)
+    if diverged.diverged > 0:
+        yield f"{100 * diverged.diverged:.2g} % of the predictions of {diverged.steps} steps diverge"
+    if held_out == 1:
+        yield "there is only one recording, so the spread is that over five parts of it"
+
+
+def _of_residuals(errors: Sequence[StepError], residuals: Sequence[ResidualShare]) -> Iterator[str]:
+    relative = {error.state: error.relative for error in errors if error.steps == 1}
+    for one in residuals:
+        if relative.get(one.state, 0.0) < _SMALL:
+            continue
+        left = f"{one.rest:.3g} {one.unit}".rstrip()
+        if one.explained >= _SHARE:
+            how = "an affine function" if one.linear > 0.9 * one.explained else "a function"
+            yield (
+                f"{100 * one.explained:.0f} % of the residual of {one.state} is {how} of state and input: a better "
+                f"model can be learned from these recordings, with {left} of one-step error left"
+            )
+        elif one.history < _SHARE:
+            yield (
+                f"state and input explain {100 * one.explained:.0f} % of the residual of {one.state}: the rest of "
+                f"{left} is noise, or has a cause that is not recorded"
+            )
+        if one.history >= _SHARE and one.rest > 0.05 * one.rms:
+            yield (
+                f"the step before explains {100 * one.history:.0f} % of what state and input leave of the residual of "
+                f"{one.state}: the system has a state that is not recorded, a delay, or filtered measurements"
+            )
+
+
+def _of_regions(errors: Sequence[StepError], where: Sequence[Region]) -> Iterator[str]:
+    if max((error.relative for error in errors if error.steps == 1), default=0.0) < _SMALL:
+        return
+    large = sorted((one for one in where if one.ratio >= 1.5), key=lambda one: -one.ratio)
+    for one in large[:3]:
+        unit = f" {one.unit}" if one.unit else ""
+        yield (
+            f"the one-step error is {one.ratio:.2g} times as large as on average where {one.variable} is between "
+            f"{one.low:.3g} and {one.high:.3g}{unit}"
+        )
+
+
+def _of_tasks(names: Sequence[str], tasks: PredictedTasks | None) -> Iterator[str]:
+    if tasks is None or not tasks.worst:
+        return
+    worst = tasks.worst[0]
+    task = ", ".join(
+        f"{name} = {value:.4g}" if isinstance(value, float) else f"{name} = {value}"
+        for name, value in worst.parameters.items()
+    )
+    yield (
+        f"of all tasks, {task} has the largest predicted distance, {worst.median:.3g} (between {worst.low:.3g} and "
+        f"{worst.high:.3g}); no execution has tested it"
+    )
+    if tasks.beyond > 0.05:
+        yield (
+            f"predicted runs of the tasks leave the recorded range of {names[tasks.beyond_of]} by "
+            f"{100 * tasks.beyond:.0f} %: predictions are extrapolated there"
+        )

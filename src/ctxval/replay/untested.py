@@ -15,22 +15,6 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning import DynamicsStudy, LearnedDynamics
 from ctxval.learning.closed_loops import loop_pairs
-from ctxval.learning.worst_case import WorstCase
-
-_WORST = 5
-"""Number of tasks with large predicted distances that are listed."""
-_RANDOM = 96
-"""Number of random tasks among those from which executions are chosen."""
-_CANDIDATES = 192
-"""Largest number of these tasks."""
-_PAIRS = 700
-"""Number of state-input pairs from which the pivots of the draws are chosen."""
-_SAME = 0.02
-"""Least distance of two listed tasks, as a share of the cube's diagonal."""
-_ELSEWHERE = 0.01
-"""Weight of all tasks together, against that of the likely worst ones."""
-_DIVERGED = 10.0
-"""A draw that diverges counts as this many times the 0.95 quantile of the finite distances."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +23,7 @@ class PredictedTask(ShortRepr):
 
     Attributes:
         parameters: the task parameters.
-        median, low, high: median, 0.05 and 0.95 quantile of the distance over draws of the dynamics.
+        median, low, high: median, 0.05 and 0.95 quantile of the distance over posterior samples of the dynamics.
         resolved: for a proposed execution, the share of the variance of the distances of likely worst tasks that it and
             those before it resolve; None for others.
     """
@@ -57,9 +41,9 @@ class PredictedTasks(ShortRepr):
 
     Attributes:
         worst: tasks with large predicted distances, the largest first.
-        median, upper: median and 0.95 quantile of the largest distance over all tasks, over draws of the dynamics.
+        median, upper: median and 0.95 quantile of the largest distance over all tasks, over posterior samples.
         executions: the executions that would tell most of the largest distance, in this order.
-        draws: number of draws of the dynamics.
+        draws: number of posterior samples of the dynamics.
         unplanned: share of the tasks for which no controller can be designed, or on which the model diverges.
         beyond: how far the closed loops of the tasks lead beyond all records of one state or input, as a share of the
             range that they visit.
@@ -88,20 +72,27 @@ def predicted_tasks(
     if learned is None:
         return None
     with single_threaded():
-        worst = learned.worst_case
-        points = _candidates(worst, study, seed)
-        drawn = _distances(learned, points, seed)
-    planned = ~np.isnan(drawn).any(axis=0)
-    points, drawn = points[planned], _finite(drawn[:, planned])
+        worst, pool = learned.worst_case, study.search.pool
+        random = pool[np.random.default_rng([seed, 3]).permutation(len(pool))[:96]]
+        together = np.concatenate([worst.elites[:24], worst.points, random])
+        points = np.unique(together.round(6), axis=0)[:: max(1, -(-len(together) // 384))]
+        distances = _sampled_distances(learned, points, seed)
+    planned = ~np.isnan(distances).any(axis=0)
+    points, distances = points[planned], distances[:, planned]
     if not len(points):
         return None
+    known = distances[np.isfinite(distances)]
+    # A sample that diverges counts as a large distance.
+    largest = 10.0 * float(np.quantile(known, 0.95)) if len(known) else 1.0
+    drawn = np.minimum(distances, max(largest, float(known.max(initial=0.0))))
     order = np.argsort(-np.median(drawn, axis=0), kind="stable")
-    apart = order[separated_rows(points[order], _SAME * np.sqrt(points.shape[1]), len(points))]
+    # A share of the diagonal of the cube.
+    apart = order[separated_rows(points[order], 0.02 * np.sqrt(points.shape[1]), len(points))]
     points, drawn = points[apart], drawn[:, apart]
     chosen, resolved = _informative(drawn, executions)
     maxima = worst.maxima
     return PredictedTasks(
-        tuple(_task(validation, points[row], drawn[:, row]) for row in range(min(_WORST, len(points)))),
+        tuple(_task(validation, points[row], drawn[:, row]) for row in range(min(5, len(points)))),
         float(np.median(maxima)),
         float(np.quantile(maxima, 0.95, method="higher")),
         tuple(
@@ -114,26 +105,12 @@ def predicted_tasks(
     )
 
 
-def _candidates(worst: WorstCase, study: DynamicsStudy, seed: int) -> Array:
-    """Return tasks that may be worst, and random ones, points of the unit cube ``(T, d)``."""
-    pool = study.search.pool
-    random = pool[np.random.default_rng([seed, 3]).permutation(len(pool))[:_RANDOM]]
-    together = np.concatenate([worst.elites[:24], worst.points, random])
-    return np.unique(together.round(6), axis=0)[:: max(1, -(-len(together) // (2 * _CANDIDATES)))]
-
-
-def _distances(learned: LearnedDynamics, points: Array, seed: int) -> Array:
-    """Return the distances ``(S, T)`` of tasks on draws of the dynamics."""
+def _sampled_distances(learned: LearnedDynamics, points: Array, seed: int) -> Array:
+    """Return the distances ``(S, T)`` of tasks on posterior samples of the dynamics."""
     rng, planner = np.random.default_rng([seed, 4]), learned.study.planner
     pairs = loop_pairs(planner, learned.posterior, points)
-    draws = learned.posterior.draw(pairs[rng.permutation(len(pairs))[:_PAIRS]], rng)
-    return planner.distances(draws, planner.plan(points), len(points))
-
-
-def _finite(drawn: Array) -> Array:
-    known = drawn[np.isfinite(drawn)]
-    largest = _DIVERGED * float(np.quantile(known, 0.95)) if len(known) else 1.0
-    return np.minimum(drawn, max(largest, float(known.max(initial=0.0))))
+    pivots = pairs[rng.permutation(len(pairs))[:700]]
+    return planner.distances(learned.posterior.draw(pivots, rng), planner.plan(points), len(points))
 
 
 def _informative(drawn: Array, count: int) -> tuple[Rows, Array]:
@@ -145,7 +122,7 @@ def _informative(drawn: Array, count: int) -> tuple[Rows, Array]:
     """
     C = np.cov(drawn, rowvar=False).reshape(drawn.shape[1], -1)
     worst = np.bincount(drawn.argmax(axis=1), minlength=drawn.shape[1]) / len(drawn)
-    weights = (1 - _ELSEWHERE) * worst + _ELSEWHERE / drawn.shape[1]
+    weights = 0.99 * worst + 0.01 / drawn.shape[1]  # the other tasks count a little, too
     total = float(weights @ np.diag(C))
     noise = 1e-6 * float(np.trace(C)) / len(C)
     chosen, shares = list[int](), list[float]()

@@ -27,13 +27,10 @@ SMALL = {"width": 340, "height": 220}
 """Size of a chart of which several stand side by side."""
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 12, 46
-_TICKS = 5
-_MOST_MARKS = 600
-"""More marks than this are drawn as dots, which have no names."""
 
 Kind = Literal[
     "mean", "model", "system", "corrected", "reference", "best", "threshold", "bound", "sample", "initial", "covering",
-    "failed", "worst", "band", "weak", "identity",
+    "failed", "worst", "band", "weak", "rest", "identity", "axis",
 ]  # fmt: skip
 """What is drawn, which decides its colour, its line style and its mark."""
 
@@ -74,7 +71,7 @@ class Axis(ShortRepr):
             zero: whether it starts at 0; values are then expected to be at least 0.
             room: share of the range that is left free at each end.
         """
-        flat = np.concatenate([np.ravel(np.asarray(one, dtype=np.float64)) for one in values] or [np.zeros(1)])
+        flat = np.concatenate([np.ravel(np.asarray(array, dtype=np.float64)) for array in values] or [np.zeros(1)])
         finite = flat[np.isfinite(flat) & (np.abs(flat) < 1e300)]
         low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
         low = 0.0 if zero else low - room * (high - low)
@@ -88,7 +85,12 @@ class Axis(ShortRepr):
         width = 0.5 * abs(self.low) or 0.5
         return self.low - width, self.low + width
 
-    def ticks(self, count: int = _TICKS) -> list[float]:
+    def shares(self, values: ArrayLike) -> Array:
+        """Return how far along the axis values are, from 0 to 1; a little more for those beyond its ends."""
+        low, high = self.ends
+        return np.clip((np.asarray(values, dtype=np.float64) - low) / (high - low), -0.02, 1.02)
+
+    def ticks(self, count: int = 5) -> list[float]:
         """Return round numbers within the axis, about so many."""
         low, high = self.ends
         raw = (high - low) / count
@@ -121,15 +123,11 @@ class Chart:
 
     def across(self, values: ArrayLike) -> Array:
         """Return the horizontal positions of values of x; NaN stays NaN."""
-        low, high = self.x.ends
-        share = (np.asarray(values, dtype=np.float64) - low) / (high - low)
-        return np.asarray(_LEFT + np.clip(share, -0.02, 1.02) * (self.width - _LEFT - _RIGHT))
+        return np.asarray(_LEFT + self.x.shares(values) * (self.width - _LEFT - _RIGHT))
 
     def up(self, values: ArrayLike) -> Array:
         """Return the vertical positions of values of y; NaN stays NaN."""
-        low, high = self.y.ends
-        share = (np.asarray(values, dtype=np.float64) - low) / (high - low)
-        return np.asarray(self.height - _BOTTOM - np.clip(share, -0.02, 1.02) * (self.height - _TOP - _BOTTOM))
+        return np.asarray(self.height - _BOTTOM - self.y.shares(values) * (self.height - _TOP - _BOTTOM))
 
     # What is drawn
 
@@ -137,7 +135,10 @@ class Chart:
         """Add a line; it is interrupted at values that are not finite."""
         at = np.stack([self.across(x), self.up(y)], axis=-1)
         self._named(kind, label, "line")
-        self._parts += [_path(run, f"line {kind}") for run in _runs(at) if len(run) > 1]
+        finite = np.isfinite(at).all(axis=-1)
+        for run in np.split(at, np.flatnonzero(np.diff(finite)) + 1):
+            if len(run) > 1 and np.isfinite(run[0]).all():
+                self._parts.append(_path(run, f"line {kind}"))
         return self
 
     def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, label: str = "") -> Chart:
@@ -155,26 +156,24 @@ class Chart:
         """Add marks; their names appear if the pointer rests on them."""
         xs, ys = np.ravel(self.across(x)), np.ravel(self.up(y))
         self._named(kind, label, "mark")
-        if len(xs) > _MOST_MARKS:
-            dots = "".join(
-                f"M{left:.0f},{top:.0f}h0" for left, top in zip(xs, ys, strict=True) if np.isfinite(left + top)
-            )
+        places = [(k, xs[k], ys[k]) for k in np.flatnonzero(np.isfinite(xs + ys)).tolist()]
+        if len(xs) > 600:  # dots have no names, and are smaller in the file
+            dots = "".join(f"M{left:.0f},{top:.0f}h0" for _, left, top in places)
             self._parts.append(element("path", d=dots, class_=f"dots {kind}"))
             return self
-        for k, (left, top) in enumerate(zip(xs.tolist(), ys.tolist(), strict=True)):
-            if np.isfinite(left + top):
-                name = None if names is None else element("title", names[k])
-                where = f"translate({left:.1f} {top:.1f})"
-                self._parts.append(element("path", name, d=_MARKS[kind], transform=where, class_=f"mark {kind}"))
+        for k, left, top in places:
+            name = None if names is None else element("title", names[k])
+            where = f"translate({left:.1f} {top:.1f})"
+            self._parts.append(element("path", name, d=_MARKS[kind], transform=where, class_=f"mark {kind}"))
         return self
 
     def whiskers(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, kind: Kind) -> Chart:
         """Add vertical intervals."""
-        for left, bottom, top in zip(
-            np.ravel(self.across(x)), np.ravel(self.up(low)), np.ravel(self.up(high)), strict=True
-        ):
-            if np.isfinite(left + bottom + top):
-                self._parts.append(_path(np.array([[left, bottom], [left, top]]), f"whisker {kind}"))
+        across = np.ravel(self.across(x))
+        ends = np.stack([[across, np.ravel(self.up(end))] for end in (low, high)])
+        for interval in np.moveaxis(ends, -1, 0):
+            if np.isfinite(interval).all():
+                self._parts.append(_path(interval, f"whisker {kind}"))
         return self
 
     def limit(self, value: float | None, kind: Kind, label: str) -> Chart:
@@ -225,6 +224,7 @@ class Chart:
             viewBox=f"0 0 {self.width} {self.height}",
             role="img",
             class_="chart",
+            width=self.width,
         )
         names = legend(self._legend) if with_legend else None
         return element("figure", drawing, names, *below, element("figcaption", self.title))
@@ -238,23 +238,16 @@ class Chart:
             element("text", self.x.label, x=0.5 * (left + right), y=self.height - 8, class_="axis-label"),
             element("text", self.y.label, transform=f"translate(13 {middle}) rotate(-90)", class_="axis-label"),
         )
-        return element("g", *self._ticks_across(bottom), *self._ticks_up(left, right), box, *names)
-
-    def _ticks_across(self, bottom: float) -> list[Markup]:
-        found = []
+        ticks = []
         for value in self.x.ticks():
             at = round(float(self.across(value)), 1)
-            found.append(element("path", d=f"M{at},{bottom}v4", class_="axis"))
-            found.append(element("text", number(value), x=at, y=bottom + 18, class_="tick across"))
-        return found
-
-    def _ticks_up(self, left: float, right: float) -> list[Markup]:
-        found = []
+            ticks.append(element("path", d=f"M{at},{bottom}v4", class_="axis"))
+            ticks.append(element("text", number(value), x=at, y=bottom + 18, class_="tick across"))
         for value in self.y.ticks():
             at = round(float(self.up(value)), 1)
-            found.append(element("path", d=f"M{left},{at}H{right}", class_="grid"))
-            found.append(element("text", number(value), x=left - 6, y=at + 4, class_="tick up"))
-        return found
+            ticks.append(element("path", d=f"M{left},{at}H{right}", class_="grid"))
+            ticks.append(element("text", number(value), x=left - 6, y=at + 4, class_="tick up"))
+        return element("g", *ticks, box, *names)
 
     def __repr__(self) -> str:
         return f"Chart({self.title!r}, {self.x!r}, {self.y!r})"
@@ -273,20 +266,18 @@ def legend(named: dict[str, tuple[str, str]]) -> Markup | None:
     """Return a legend, from labels with the kind and the form (line, area or mark) of each; None if there is none."""
     if not named:
         return None
-    swatches = (element("li", _swatch(kind, form), element("span", label)) for label, (kind, form) in named.items())
-    return element("ul", *swatches, class_="legend")
-
-
-def _swatch(kind: str, form: str) -> Markup:
-    if form == "mark":
-        inside = element("path", d=_MARKS[kind], transform="translate(13 8)", class_=f"mark {kind}")
-    elif form == "area":
-        inside = element("path", d="M1,3H25V13H1z", class_="band")
-    elif form == "edge":
-        inside = element("g", *(element("path", d="M1,8H25", class_=f"line {one}") for one in ("edge-under", "edge")))
-    else:
-        inside = element("path", d="M1,8H25", class_=f"line {kind}")
-    return element("svg", inside, viewBox="0 0 26 16", aria_hidden="true", class_="swatch")
+    items = []
+    for label, (kind, form) in named.items():
+        if form == "mark":
+            shapes = [element("path", d=_MARKS[kind], transform="translate(13 8)", class_=f"mark {kind}")]
+        elif form == "area":
+            shapes = [element("path", d="M1,3H25V13H1z", class_="band")]
+        else:
+            kinds = ("edge-under", "edge") if form == "edge" else (kind,)
+            shapes = [element("path", d="M1,8H25", class_=f"line {name}") for name in kinds]
+        swatch = element("svg", *shapes, viewBox="0 0 26 16", aria_hidden="true", class_="swatch")
+        items.append(element("li", swatch, element("span", label)))
+    return element("ul", *items, class_="legend")
 
 
 def data_uri(values: Array, low: float, high: float) -> str:
@@ -313,23 +304,9 @@ def colour_scale(low: float, high: float, label: str) -> Markup:
     return element("svg", shades, *ends, name, viewBox="0 0 480 34", class_="chart scale", aria_hidden="true")
 
 
-def _runs(at: Array) -> list[Array]:
-    """Return the stretches of points ``(k, 2)`` that are finite."""
-    finite = np.isfinite(at).all(axis=-1)
-    edges = np.flatnonzero(np.diff(finite.astype(int))) + 1
-    return [
-        run for run, keep in zip(np.split(at, edges), np.split(finite, edges), strict=True) if len(keep) and keep[0]
-    ]
-
-
 def _path(at: Array, class_: str, *, closed: bool = False) -> Markup:
     """Return a path through points ``(k, 2)``, in relative coordinates, which are shorter."""
-    rounded = np.rint(10 * at).astype(int)
-    steps = np.diff(rounded, axis=0)
-    start = f"M{_tenth(rounded[0, 0])},{_tenth(rounded[0, 1])}"
-    rest = "".join(f"l{_tenth(dx)},{_tenth(dy)}" for dx, dy in steps.tolist())
-    return element("path", d=start + rest + ("z" if closed else ""), class_=class_)
-
-
-def _tenth(value: int) -> str:
-    return f"{value / 10:g}"
+    tenths = np.rint(10 * at).astype(int)
+    start = f"M{tenths[0, 0] / 10:g},{tenths[0, 1] / 10:g}"
+    steps = "".join(f"l{dx / 10:g},{dy / 10:g}" for dx, dy in np.diff(tenths, axis=0).tolist())
+    return element("path", d=start + steps + ("z" if closed else ""), class_=class_)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,24 +25,9 @@ from ctxval.learning.replays import Replay, replay_executed
 from ctxval.report.distance_model import DistanceModel
 from ctxval.storage.store import Store
 
-MOST_REPLAYS = 120
-"""Largest number of trials that are replayed on the corrected model: those with the largest distances."""
 
-MOST_RECORDINGS = 400
-"""Largest number of trials whose trajectories are read: those with the largest distances."""
-
-_SLOW_REPLAYS = 40
-"""The same, if the synthesizer designs one controller at a time."""
-
-
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """The trajectories of one trial.
-
-    Attributes:
-        model: the closed loop on M.
-        system: the execution of S.
-    """
+class TrajectoryPair(NamedTuple):
+    """The trajectories of one trial: the closed loop on M, and the execution of S."""
 
     model: Trajectory
     system: Trajectory
@@ -108,20 +93,15 @@ class ReportContext(ShortRepr):
         """Return the trials with the largest distances at different tasks, the largest first.
 
         A search executes its worst task several times, almost unchanged; of such trials only the first is returned.
-
-        Args:
-            count: largest number of trials.
-            recorded: whether only trials with recordings are returned.
         """
-        found: list[Trial] = []
+        chosen: list[Trial] = []
         for trial in self.worst_first:
-            if recorded and trial.number not in self.recordings:
-                continue
-            if all(np.abs(trial.unit_point - one.unit_point).max() > NEAR for one in found):
-                found.append(trial)
-            if len(found) == count:
+            known = not recorded or trial.number in self.recordings
+            if known and all(np.abs(trial.unit_point - other.unit_point).max() > NEAR for other in chosen):
+                chosen.append(trial)
+            if len(chosen) == count:
                 break
-        return found
+        return chosen
 
     @functools.cached_property
     def points(self) -> Array:
@@ -161,27 +141,22 @@ class ReportContext(ShortRepr):
     # Trajectories
 
     @functools.cached_property
-    def recordings(self) -> dict[int, Recording]:
+    def recordings(self) -> dict[int, TrajectoryPair]:
         """The trajectories of the worst trials that have both, by number; those of another size are left out."""
-        found: dict[int, Recording] = {}
-        sizes: tuple[int, int] | None = None
-        for trial in self.worst_first[:MOST_RECORDINGS]:
-            one = self._recording(trial)
-            if one is None:
+        pairs: dict[int, TrajectoryPair] = {}
+        widths: tuple[int, int] | None = None
+        for trial in self.worst_first[:400]:
+            model, system = (self.store.trajectory(trial.number, side) for side in ("model", "system"))
+            if model is None or system is None or model.batch_shape or system.batch_shape:
                 continue
-            own = (one.system.states.shape[-1], one.system.inputs.shape[-1])
-            sizes = own if sizes is None else sizes
-            if own == sizes:
-                found[trial.number] = one
-        return found
-
-    def _recording(self, trial: Trial) -> Recording | None:
-        model = self.store.trajectory(trial.number, "model")
-        system = self.store.trajectory(trial.number, "system")
-        if model is None or system is None or model.batch_shape or system.batch_shape:
-            return None
-        same = model.states.shape == system.states.shape and model.inputs.shape == system.inputs.shape
-        return Recording(model, system) if same and model.horizon and model.finite and system.finite else None
+            same = model.states.shape == system.states.shape and model.inputs.shape == system.inputs.shape
+            if not (same and model.horizon and model.finite and system.finite):
+                continue
+            width = system.states.shape[-1], system.inputs.shape[-1]
+            widths = widths or width
+            if width == widths:
+                pairs[trial.number] = TrajectoryPair(model, system)
+        return pairs
 
     @functools.cached_property
     def signals(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -221,27 +196,28 @@ class ReportContext(ShortRepr):
         if learned is None:
             return None
         executed = {trial.number: distance_of(trial) for trial in self.completed}
-        errors = np.array([one.distance - executed[number] for number, one in self.replays.items()])
+        errors = np.array([replay.distance - executed[number] for number, replay in self.replays.items()])
         if model is not None and not (errors**2).mean() <= ((model.left_out.median - model.values) ** 2).mean():
             return None
         try:
             with stage("predicting distances", len(points), "tasks"):
-                found = learned.expected(points, len(self.trials))
+                expected = learned.expected(points, len(self.trials))
         except Exception:  # the user's parts, at states that no execution has reached, must not end a report
             return None
-        return found if np.isfinite(found).any() else None
+        return expected if np.isfinite(expected).any() else None
 
     @functools.cached_property
     def replays(self) -> dict[int, Replay]:
         """The replays of the trials with recordings on the corrected model, by number; empty without the experiment."""
         if self.validation is None or not self.recordings:
             return {}
-        by_number = {trial.number: trial for trial in self.completed}
-        numbers = list(self.recordings)[: MOST_REPLAYS if self.batched else _SLOW_REPLAYS]
-        executed = [(by_number[number].unit_point, one.system) for number, one in self.recordings.items()]
+        points = {trial.number: trial.unit_point for trial in self.completed}
+        # Designs that cannot be made in a batch take long.
+        numbers = list(self.recordings)[: 120 if self.batched else 40]
+        executed = [(points[number], pair.system) for number, pair in self.recordings.items()]
         with stage("replaying executed tasks", len(numbers), "tasks"):
-            found = replay_executed(self.validation, executed, [by_number[number].unit_point for number in numbers])
-        return {number: one for number, one in zip(numbers, found, strict=True) if one is not None}
+            replays = replay_executed(self.validation, executed, [points[number] for number in numbers])
+        return {number: replay for number, replay in zip(numbers, replays, strict=True) if replay is not None}
 
 
 def distance_of(trial: Trial) -> float:
@@ -267,15 +243,14 @@ def context_of_campaign(
         certificate: the kind and the options of the certificate of that verdict.
         budget: the budget of the campaign.
     """
-    found = verdict
-    if found is None and threshold is not None:
-        found = campaign.verdict(threshold, certificate=certificate)
+    if verdict is None and threshold is not None:
+        verdict = campaign.verdict(threshold, certificate=certificate)
     return ReportContext(
         campaign.name,
         campaign.validation.space,
         campaign.trials,
         campaign.store,
-        found,
+        verdict,
         campaign.validation,
         labels=campaign.validation.labels,
         budget=budget,
@@ -302,10 +277,6 @@ def context_of_store(
         certificate: the kind and the options of the certificate.
         missing: why the experiment is not loaded, as a sentence.
         labels: names and units.
-
-    Raises:
-        InputError: if the store does not describe its task space, or its trials do not lie in it.
-        StoreError: if the store cannot be read.
     """
     with store.snapshot():
         description, changes, trials = store.description(), store.history(), store.trials()

@@ -18,17 +18,12 @@ from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.findings import Finding, Light, Question, findings_of
 from ctxval.report.markup import number, percent, quantity
 
-_IMPROVED = 0.01
-"""Least increase of the largest distance that counts as an improvement, as a share of it."""
+_IMPROVED = 0.01  # least increase of the largest distance that counts as an improvement, as a share of it
 
-_QUIET = 1 / 3
-"""Share of the executions without an improvement after which a search is taken to have converged."""
+_LISTED = 10  # largest number of failed trials that are listed one by one
 
-_LISTED = 10
-"""Largest number of failed trials that are listed one by one."""
-
+# Range of the root mean square of standardised errors that is as expected, and the value above which it is not.
 _CALIBRATED, _ROUGH = (0.5, 1.5), 2.5
-"""Range of the root mean square of standardised errors that is as expected, and the value above which it is not."""
 
 
 def diagnostics(context: ReportContext) -> list[Finding]:
@@ -53,23 +48,28 @@ def _executions(context: ReportContext) -> Finding | None:
 
 
 def _certificate(context: ReportContext) -> Finding | None:
-    verdict, found = context.verdict, context.certificate
+    verdict, certificate = context.verdict, context.certificate
     if verdict is None or verdict.answer == "falsified":
         return None
-    if found is None:
+    if certificate is None:
         return Finding("Certificate", "bad", f"Refused: {verdict.reason}")
-    if found.doubt is None:
+    if certificate.doubt is None:
         return None
-    numbers = {"kind": found.kind, "upper_bound": _finite(found.upper_bound), "confidence": found.confidence}
-    return Finding("Certificate", "bad", f"Withdrawn: {found.doubt}.", numbers)
+    bound = certificate.upper_bound if np.isfinite(certificate.upper_bound) else None
+    numbers = {"kind": certificate.kind, "upper_bound": bound, "confidence": certificate.confidence}
+    return Finding("Certificate", "bad", f"Withdrawn: {certificate.doubt}.", numbers)
 
 
 def _rests_on_distances(context: ReportContext) -> bool:
     """Return whether the answer depends on where the tasks lie: not a counterexample, not a bound from dynamics."""
-    verdict, found = context.verdict, context.certificate
+    verdict, certificate = context.verdict, context.certificate
     if verdict is None:
         return True
-    return verdict.answer != "falsified" and found is not None and (found.kind != "dynamics" or found.doubt is not None)
+    return (
+        verdict.answer != "falsified"
+        and certificate is not None
+        and (certificate.kind != "dynamics" or certificate.doubt is not None)
+    )
 
 
 def _covering(context: ReportContext) -> Finding | None:
@@ -88,12 +88,7 @@ def _covering(context: ReportContext) -> Finding | None:
 
 
 def share_far_from_trials(points: Array, resolution: float = RESOLUTION) -> float:
-    """Return the share of the tasks that are farther than a resolution from every trial.
-
-    Args:
-        points: points of the unit cube of the trials ``(n, d)``.
-        resolution: the distance in diagonals of the task space.
-    """
+    """Return the share of the tasks that are farther than a resolution from every trial."""
     d = points.shape[1]
     gaps, _ = KDTree(points).query(np.random.default_rng(0).random((4096, d)))
     return float(np.mean(gaps / np.sqrt(d) > resolution))
@@ -106,7 +101,7 @@ def _converged(context: ReportContext) -> Finding | None:
     so_far = np.maximum.accumulate(distances)
     last = int(np.argmax(so_far >= (1 - _IMPROVED) * so_far[-1]))
     quiet = len(distances) - 1 - last
-    good = quiet >= max(3.0, _QUIET * len(distances))
+    good = quiet >= max(3.0, len(distances) / 3)
     text = (
         f"The largest distance was within {percent(_IMPROVED)} of its final value after {last + 1} of "
         f"{len(distances)} measured executions; {quiet} followed without an improvement."
@@ -124,8 +119,8 @@ def _smooth(context: ReportContext) -> Finding | None:
         "A Gaussian process of the distance predicts each trial from the others with errors of "
         f"{number(size, 2)} of its own standard deviations (root mean square; about 1 is expected)."
     )
-    found = Finding("Distance is smooth over the tasks", light, text, {"standardised_error": size})
-    return found.unless(context.designs)
+    finding = Finding("Distance is smooth over the tasks", light, text, {"standardised_error": size})
+    return finding.unless(context.designs)
 
 
 def stored_predictions(context: ReportContext) -> list[tuple[Trial, ExecutionPrediction]]:
@@ -136,30 +131,30 @@ def stored_predictions(context: ReportContext) -> list[tuple[Trial, ExecutionPre
 
 
 def _predictions(context: ReportContext) -> Finding | None:
-    found = stored_predictions(context)
-    if not found:
+    predicted = stored_predictions(context)
+    if not predicted:
         return None
     size = max(float(context.distances.max()), context.bound or 0.0)
-    held = sum(agrees(distance_of(trial), one.median, size) for trial, one in found)
+    held = sum(agrees(distance_of(trial), one.median, size) for trial, one in predicted)
     text = (
-        f"{held} of {counted(len(found), 'execution')} that were predicted beforehand came out within "
+        f"{held} of {counted(len(predicted), 'execution')} that were predicted beforehand came out within "
         f"{quantity(ACCURATE * size, context.labels.units)} of the prediction, which is {percent(ACCURATE)} of the "
         "largest distance or of the bound."
     )
-    light: Light = "good" if held == len(found) else "attention"
-    return Finding("Predictions made beforehand", light, text, {"made": len(found), "held": held})
+    light: Light = "good" if held == len(predicted) else "attention"
+    return Finding("Predictions made beforehand", light, text, {"made": len(predicted), "held": held})
 
 
 def _states_covered(context: ReportContext) -> Finding | None:
-    found = context.certificate
-    if found is None or "beyond_the_records" not in found.details:
+    certificate = context.certificate
+    if certificate is None or "beyond_the_records" not in certificate.details:
         return None
-    gap, beyond = found.details["coverage_gap"], found.details["beyond_the_records"]
+    gap, beyond = certificate.details["coverage_gap"], certificate.details["beyond_the_records"]
     text = (
         f"The closed loops of the tasks leave the recorded range of a state or an input by {percent(beyond)} of it or "
         f"less, and are never farther than {percent(gap)} of it from every record."
     )
-    light: Light = "good" if found.doubt is None else "attention"
+    light: Light = "good" if certificate.doubt is None else "attention"
     return Finding("States and inputs covered", light, text, {"beyond": beyond, "gap": gap})
 
 
@@ -176,47 +171,32 @@ _QUESTIONS: tuple[tuple[str, Question], ...] = (
 
 def not_tested(context: ReportContext) -> list[str]:
     """Return what was not tested, one sentence each."""
-    said = []
+    sentences = []
     certificate = context.certificate
     if certificate is not None and certificate.volume:
         left_out = at_most(100 * certificate.volume, 3)
-        said.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
+        sentences.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
     if len(context.points):
-        said += _regions(context)
+        share, d = share_far_from_trials(context.points), context.space.dimension
+        if share:
+            sentences.append(
+                f"{percent(share)} of the task space is farther than {RESOLUTION:g} diagonals from every trial; there "
+                "the distance is inferred and not executed."
+            )
+        bare = len(bare_corners(context.points, RESOLUTION))
+        where = "ends of the range" if d == 1 else "corners of the task space"
+        if bare:
+            sentences.append(f"{bare} of the {2**d} {where} have no trial next to them.")
     for trial in context.failed[:_LISTED]:
-        where = ", ".join(
-            f"{label} = {number(value)}"
-            for label, value in zip(context.space.labels, context.coordinates([trial])[0], strict=True)
-        )
-        said.append(f"The distance at the task of trial {trial.number} ({where}), because it {_ended(trial)}.")
+        values = zip(context.space.labels, context.coordinates([trial])[0], strict=True)
+        where = ", ".join(f"{label} = {number(value)}" for label, value in values)
+        ended = "failed" if trial.state == "failed" else "could not be measured"
+        sentences.append(f"The distance at the task of trial {trial.number} ({where}), because it {ended}.")
     if len(context.failed) > _LISTED:
-        said.append(f"The distances of {len(context.failed) - _LISTED} more trials that failed or were not measured.")
-    said.append(
+        more = len(context.failed) - _LISTED
+        sentences.append(f"The distances of {more} more trials that failed or were not measured.")
+    sentences.append(
         "Tasks outside the task space, other controllers, and conditions that the recorded state does not hold, such "
         "as wear, temperature or payload."
     )
-    return said
-
-
-def _regions(context: ReportContext) -> list[str]:
-    said = []
-    share = share_far_from_trials(context.points)
-    if share:
-        said.append(
-            f"{percent(share)} of the task space is farther than {RESOLUTION:g} diagonals from every trial; there the "
-            "distance is inferred and not executed."
-        )
-    bare = len(bare_corners(context.points, RESOLUTION))
-    if bare:
-        d = context.space.dimension
-        where = "ends of the range" if d == 1 else "corners of the task space"
-        said.append(f"{bare} of the {2**d} {where} have no trial next to them.")
-    return said
-
-
-def _ended(trial: Trial) -> str:
-    return "failed" if trial.state == "failed" else "could not be measured"
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    return sentences

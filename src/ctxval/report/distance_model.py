@@ -13,19 +13,6 @@ from ctxval.core.trial import Trial
 from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.surrogate import Learned, learn
 
-NORMAL_95 = 1.96
-"""Number of standard deviations of a band of 95 %."""
-
-_TASKS = 4096
-"""Number of random tasks from which shares of the task space are estimated."""
-
-_SOBOL = 256
-"""Number of base points of the sensitivity indices, a power of two; d + 2 times as many tasks are predicted."""
-
-
-_MOST = 500
-"""Largest number of distances that the Gaussian process is conditioned on: half of them are the largest ones."""
-
 
 @dataclass(frozen=True, eq=False)
 class Band:
@@ -60,7 +47,12 @@ class DistanceModel:
     @classmethod
     def of(cls, trials: Sequence[Trial]) -> DistanceModel | None:
         """Return the model of completed trials; None if fewer than two distances are known, or none can be fitted."""
-        known = _some([trial for trial in trials if trial.distance is not None])
+        known = [trial for trial in trials if trial.distance is not None]
+        if len(known) > 500:  # those with the largest distances, and others evenly spread over their order
+            order = sorted(range(len(known)), key=lambda k: -(known[k].distance or 0.0))
+            rest = sorted(order[250:])
+            evenly = np.linspace(0, len(rest) - 1, 250).astype(int)
+            known = [known[k] for k in sorted({*order[:250], *(rest[j] for j in evenly.tolist())})]
         points = np.array([trial.unit_point for trial in known])
         values = np.array([trial.distance for trial in known], dtype=np.float64)
         if len(known) < 2:
@@ -89,7 +81,7 @@ class DistanceModel:
     @functools.cached_property
     def tasks(self) -> Array:
         """Random tasks, points of the unit cube ``(m, d)``."""
-        return np.random.default_rng(0).random((_TASKS, self.points.shape[1]))
+        return np.random.default_rng(0).random((4096, self.points.shape[1]))
 
     @functools.cached_property
     def over_tasks(self) -> Band:
@@ -108,8 +100,9 @@ class DistanceModel:
         from scipy.stats import sobol_indices, uniform  # imported here, because it is slow to load
 
         with np.errstate(all="ignore"):
-            found = sobol_indices(func=lambda x: self.predict(x.T).median[None], n=_SOBOL, dists=[uniform()] * d, rng=0)
-        return np.asarray(np.clip(np.nan_to_num(np.ravel(found.total_order)), 0.0, 1.0))
+            # A power of two; d + 2 times as many tasks are predicted.
+            indices = sobol_indices(func=lambda x: self.predict(x.T).median[None], n=256, dists=[uniform()] * d, rng=0)
+        return np.asarray(np.clip(np.nan_to_num(np.ravel(indices.total_order)), 0.0, 1.0))
 
     def _band(self, mean: Array, variance: Array) -> Band:
         def on_own_scale(standardised: Array) -> Array:
@@ -117,15 +110,5 @@ class DistanceModel:
                 values = self.learned.warp.backward(self.learned.shift + self.learned.scale * standardised)
             return np.maximum(values, 0.0)
 
-        half = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
+        half = 1.96 * np.sqrt(np.maximum(variance, 0.0))  # a band of 95 %
         return Band(on_own_scale(mean), on_own_scale(mean - half), on_own_scale(mean + half))
-
-
-def _some(trials: Sequence[Trial]) -> Sequence[Trial]:
-    """Return at most ``_MOST`` trials: those with the largest distances, and others evenly spread over their order."""
-    if len(trials) <= _MOST:
-        return trials
-    order = sorted(range(len(trials)), key=lambda k: -(trials[k].distance or 0.0))
-    rest = sorted(order[_MOST // 2 :])
-    evenly = np.linspace(0, len(rest) - 1, _MOST - _MOST // 2).astype(int)
-    return [trials[k] for k in sorted({*order[: _MOST // 2], *(rest[j] for j in evenly.tolist())})]

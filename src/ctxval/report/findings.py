@@ -58,12 +58,10 @@ Question = Callable[[ReportContext], Finding | None]
 
 def findings_of(questions: Iterable[tuple[str, Question]], context: ReportContext) -> list[Finding]:
     """Return what questions find; a question that fails is a finding that is not known."""
-    found = (_asked(name, question, context) for name, question in questions)
-    return [one for one in found if one is not None]
-
-
-def _asked(name: str, question: Question, context: ReportContext) -> Finding | None:
-    try:
-        return question(context)
-    except Exception as error:  # one question about odd data must not hide the answers to the others
-        return Finding(name, "unknown", f"This could not be computed: {reason_of(error)}.")
+    findings: list[Finding | None] = []
+    for name, question in questions:
+        try:
+            findings.append(question(context))
+        except Exception as error:  # one question about odd data must not hide the answers to the others
+            findings.append(Finding(name, "unknown", f"This could not be computed: {reason_of(error)}."))
+    return [finding for finding in findings if finding is not None]

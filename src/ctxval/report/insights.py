@@ -2,12 +2,283 @@
 
 from __future__ import annotations
 
-from ctxval.report.context import ReportContext
-from ctxval.report.findings import Finding, Question, findings_of
-from ctxval.report.insights_loops import components, converged, flips, goals, saturation, unusual_motion
-from ctxval.report.insights_tasks import bias, explained, weak_region, weak_states
+import numpy as np
 
-QUESTIONS: tuple[tuple[str, Question], ...] = (
+from ctxval._util.arrays import Array
+from ctxval._util.representation import counted
+from ctxval.core import soundness
+from ctxval.core.distance import ComposedDistance
+from ctxval.report.context import ReportContext, TrajectoryPair, distance_of
+from ctxval.report.findings import Finding, Question, findings_of
+from ctxval.report.markup import number, percent, quantity
+
+_WORST = 5  # number of trials with the largest distances that the insights on closed loops look at
+
+
+def insights(context: ReportContext) -> list[Finding]:
+    """Return what the trials show, one finding for each question that has an answer."""
+    return findings_of(_QUESTIONS, context)
+
+
+# The distance over the tasks
+
+
+def weak_region(context: ReportContext) -> Finding | None:
+    """Where the distance exceeds the threshold, executed and predicted."""
+    tau, units = context.threshold, context.labels.units
+    if tau is None or not len(context.distances):
+        return None
+    above = context.distances > tau
+    largest = quantity(float(context.distances.max()), units)
+    model = context.distance_model
+    share = 0.0 if model is None else float((model.over_tasks.median > tau).mean())
+    numbers = {"executed_above": int(above.sum()), "executed": len(above), "predicted_share_above": share}
+    if not above.any():
+        text = f"No executed task exceeds {quantity(tau, units)}, but the trials predict that {percent(share)} do."
+        return Finding("Where M is weak", "attention", text, numbers) if share else None
+    # Below this share, too few of the random tasks are weak.
+    weak = context.points[above] if model is None or share < 0.002 else model.tasks[model.over_tasks.median > tau]
+    text = (
+        f"{int(above.sum())} of {len(above)} executed tasks exceed {quantity(tau, units)}, the largest with {largest}: "
+        f"{region_text(context, weak)}. The trials predict that {percent(share)} of all tasks exceed it."
+    )
+    return Finding("Where M is weak", "bad", text, numbers)
+
+
+def region_text(context: ReportContext, points: Array) -> str:
+    """Return where points of the unit cube ``(m, d)`` lie, by the parameters in which they differ from all tasks."""
+    low, high = np.quantile(points, [0.05, 0.95], axis=0)
+    width = high - low
+    narrow = [int(j) for j in np.argsort(width) if width[j] < 0.7][:3]  # narrower than this share of the range
+    if not narrow:
+        return "they are spread over the task space"
+    ends = context.space.from_unit(np.stack([low, high]))
+    parts = []
+    for j in narrow:
+        first, last = number(ends[0, j], 3), number(ends[1, j], 3)
+        label = context.space.labels[j]
+        parts.append(f"{label} at {first}" if first == last else f"{label} from {first} to {last}")
+    return f"most of them have {' and '.join(parts)}"
+
+
+def weak_states(context: ReportContext) -> Finding | None:
+    """Which states and inputs the system visits where M is weak, and not elsewhere."""
+    if len(context.recordings) < 4:
+        return None
+    by_number = {trial.number: distance_of(trial) for trial in context.completed}
+    above = np.array([by_number[number] for number in context.recordings]) > (context.threshold or np.inf)
+    weak, which = above, "above the threshold"
+    if above.all() or not above.any():
+        weak, which = np.arange(len(above)) < max(1, len(above) // 4), "with the largest distances"
+    runs = [run.system for run in context.recordings.values()]
+    low = np.array([[*run.states.min(axis=0), *run.inputs.min(axis=0)] for run in runs])
+    high = np.array([[*run.states.max(axis=0), *run.inputs.max(axis=0)] for run in runs])
+    inside_low, inside_high = low[~weak].min(axis=0), high[~weak].max(axis=0)
+    span = np.maximum(high.max(axis=0) - low.min(axis=0), 1e-300)
+    beyond = np.maximum(high[weak].max(axis=0) - inside_high, inside_low - low[weak].min(axis=0)) / span
+    j = int(beyond.argmax())
+    if beyond[j] < 0.05:
+        return None
+    label = [label for labels in context.signals for label in labels][j]
+    numbers = {"signal": label, "beyond": float(beyond[j])}
+    text = (
+        f"{counted(int(weak.sum()), 'trial')} {which}: {label} goes from {number(low[weak, j].min())} to "
+        f"{number(high[weak, j].max())}; all others stay within {number(inside_low[j])} and {number(inside_high[j])}."
+    )
+    return Finding("States visited there", "note", text, numbers)
+
+
+def bias(context: ReportContext) -> Finding | None:
+    """How the distance of a typical task compares with the largest one, and whether S errs to one side of M."""
+    model = context.distance_model
+    if model is None or not context.distances.max() > 0:
+        return None
+    typical = float(np.mean(model.over_tasks.median))
+    share = typical / float(context.distances.max())
+    where = "nearly everywhere" if share > 0.6 else "in a part of the tasks" if share > 0.2 else "in few tasks"
+    text = (
+        f"The mean distance over all tasks is predicted to be {quantity(typical, context.labels.units)}, "
+        f"{percent(share)} of the largest executed one: M errs {where}."
+    )
+    numbers = {"mean_distance": typical, "share_of_largest": share}
+    if len(context.recordings) >= 4:
+        runs = context.recordings.values()
+        errors = np.array([run.system.final_state - run.model.final_state for run in runs])
+        spans = np.maximum(np.ptp([run.system.final_state for run in runs], axis=0), 1e-300)
+        j = int((np.abs(errors) / spans).mean(axis=0).argmax())
+        label, same = context.signals[0][j], float(max((errors[:, j] > 0).mean(), (errors[:, j] < 0).mean()))
+        text += (
+            f" At the end of the executed tasks S lies on the same side of M in {label} in {percent(same, 3)} of the "
+            "trials" + (", so the error is systematic." if same > 0.9 else ".")
+        )
+        numbers |= {"one_sided_share": same}
+    return Finding("Bias across the tasks", "note", text, numbers)
+
+
+def explained(context: ReportContext) -> Finding | None:
+    """Whether the corrected model, learned from the other trials, predicts the distance."""
+    if context.validation is None:
+        return Finding("Corrected model", "unknown", "Not known: it needs the experiment, which is not loaded.")
+    by_number = {trial.number: distance_of(trial) for trial in context.completed}
+    pairs = [(by_number[k], replay.distance) for k, replay in context.replays.items() if np.isfinite(replay.distance)]
+    if len(pairs) < 2:
+        return Finding("Corrected model", "unknown", "Not known: the trials do not teach a correction of M.")
+    executed, predicted = np.array(pairs).T
+    size = float(np.sqrt((executed**2).mean()))
+    error = float(np.sqrt(((executed - predicted) ** 2).mean()))
+    share = 1 - error / max(size, 1e-300)
+    numbers = {"share_explained": share, "error": error, "trials": len(pairs)}
+    text = (
+        f"M with a residual that is learned from the other trials predicts the distances of {len(pairs)} trials with "
+        f"an error of {quantity(error, context.labels.units)} (root mean square), "
+        f"{percent(error / max(size, 1e-300))} of the distances."
+    )
+    if share >= 0.8:
+        text += (
+            " It explains the distance: the difference is a function of the recorded state and input, and a model "
+            "that is fitted to these data can remove it."
+        )
+        return Finding("Corrected model", "good", text, numbers)
+    text += (
+        " It does not explain the distance: a state that is not recorded, a contact, dry friction or noise is the "
+        "likely cause, or too few trials."
+    )
+    return Finding("Corrected model", "attention", text, numbers)
+
+
+# The closed loops
+
+
+def components(context: ReportContext) -> Finding | None:
+    """Which states err in the worst trials, and when their errors peak."""
+    if not context.recordings:
+        return None
+    worst = list(context.recordings.values())[:_WORST]
+    spans = soundness.ranges([run.system.states for run in context.recordings.values()])
+    errors = [np.abs(run.system.states - run.model.states) / spans for run in worst]
+    peaks = np.mean([error.max(axis=0) for error in errors], axis=0)
+    j = int(peaks.argmax())
+    times = [float(run.system.times[error[:, j].argmax()]) for run, error in zip(worst, errors, strict=True)]
+    end = float(np.mean([run.system.times[-1] for run in worst]))
+    label, when = context.signals[0][j], float(np.median(times))
+    text = (
+        f"In the {counted(len(worst), 'worst trial')}, S differs from M most in {label}: by {percent(float(peaks[j]))} "
+        f"of its range at the peak, which is at {number(when, 3)} s of {number(end, 3)} s."
+    )
+    shares = _shares(context, worst)
+    numbers = {"state": label, "peak": float(peaks[j]), "time": when, "shares": shares}
+    if shares:
+        largest = sorted(shares.items(), key=lambda item: -item[1])[:3]
+        listed = " and ".join(f"{percent(share)} is in {name}" for name, share in largest)
+        text += f" Of the error that the distance measures, {listed}."
+    return Finding("What errs, and when", "note", text, numbers)
+
+
+def _shares(context: ReportContext, worst: list[TrajectoryPair]) -> dict[str, float]:
+    """Return the shares of the states in the error that the distance is composed of; empty if they are not known."""
+    validation = context.validation
+    distance = None if validation is None else validation.distance
+    if validation is None or not isinstance(distance, ComposedDistance) or not hasattr(distance, "components"):
+        return {}
+    compared = distance.components
+    labels = context.signals[0]
+    names = labels if compared is None else [labels[i] for i in compared]
+    tasks = [context.replays[k].task for k in list(context.recordings)[:_WORST] if k in context.replays]
+    errors = np.array([distance.error(one.model, one.system, task) for one, task in zip(worst, tasks, strict=False)])
+    if errors.ndim != 2 or errors.shape[1] != len(names) or not np.abs(errors).sum() > 0:
+        return {}
+    sizes = np.abs(errors).mean(axis=0)
+    return {name: float(size) for name, size in zip(names, sizes / sizes.sum(), strict=True)}
+
+
+def flips(context: ReportContext) -> Finding | None:
+    """Whether the controllers of neighbouring tasks differ abruptly."""
+    if len(context.recordings) < 2:
+        return None
+    by_number = {trial.number: trial for trial in context.completed}
+    numbers = list(context.recordings)
+    points = np.array([by_number[k].unit_point for k in numbers])
+    pairs = soundness.flips(points, [run.model.inputs for run in context.recordings.values()])
+    if pairs is None or not pairs.flipped:
+        return None
+    i, j = pairs.example
+    values = {"neighbours": pairs.pairs, "flipped": pairs.flipped, "largest_change": pairs.largest}
+    text = (
+        f"{pairs.flipped} of {pairs.pairs} pairs of neighbouring tasks have controllers that differ abruptly, for "
+        f"example trials {numbers[i]} and {numbers[j]}: their inputs on M differ by {percent(pairs.largest)} of the "
+        "range of the inputs. A planner that jumps between solutions makes the distance jump, too."
+    )
+    return Finding("Controllers of neighbouring tasks", "attention", text, values)
+
+
+def unusual_motion(context: ReportContext) -> Finding | None:
+    """Whether M itself makes an unusual motion in the worst trials, such as turning over."""
+    if len(context.recordings) < 4:
+        return None
+    sizes = np.array(
+        [np.abs(run.model.states - run.model.states[0]).max(axis=0) for run in context.recordings.values()]
+    )
+    usual = np.maximum(np.median(sizes, axis=0), 1e-3 * sizes.max(axis=0) + 1e-300)
+    ratios = sizes[:_WORST] / usual
+    row, j = (int(k) for k in np.unravel_index(int(ratios.argmax()), ratios.shape))
+    trial, label, ratio = list(context.recordings)[row], context.signals[0][j], float(ratios[row, j])
+    values = {"trial": trial, "state": label, "times_the_median": ratio}
+    if ratio < 3.0:
+        return None
+    text = (
+        f"In trial {trial} M itself moves {number(float(sizes[row, j]))} in {label}, {number(ratio, 2)} times as far "
+        "as in the median trial: the controller asks for an unusual motion, which may explain the distance better "
+        "than an error of M."
+    )
+    return Finding("Motion of M", "attention", text, values)
+
+
+def saturation(context: ReportContext) -> Finding | None:
+    """Whether inputs stay at their limits."""
+    synthesizer = None if context.validation is None else context.validation.synthesizer
+    limits = soundness.saturation([run.system.inputs for run in context.recordings.values()], synthesizer)
+    if limits is None or limits.shares.max() < soundness.SATURATED:
+        return None
+    j = int(limits.shares.argmax())
+    label, share = context.signals[1][j], float(limits.shares[j])
+    values = {"input": label, "share_of_steps": share, "limits_known": limits.known}
+    text = f"{label} is at its limit in {percent(share)} of all steps" + (
+        "." if limits.known else " (the limits are taken from the records, in which the extreme value repeats)."
+    )
+    return Finding("Inputs and their limits", "attention", text, values)
+
+
+def converged(context: ReportContext) -> Finding | None:
+    """Whether the designs of the controllers converged, and whether controllers jump."""
+    if context.designs is None:
+        return None
+    return Finding("Design of the controllers", "attention", f"{context.designs[0].upper()}{context.designs[1:]}.")
+
+
+def goals(context: ReportContext) -> Finding | None:
+    """Whether M itself reaches its goals under the controllers that are designed on it."""
+    if context.validation is None:
+        return Finding("Goals of M", "unknown", "Not known: it needs the experiment, which is not loaded.")
+    if not any(replay.task.has_goal for replay in context.replays.values()):
+        return None
+    numbers = list(context.replays)
+    on_model = [context.recordings[k].model for k in numbers]
+    misses = soundness.goal_misses(context.validation, on_model, [context.replays[k].task.goal for k in numbers])
+    if misses is None or not misses.missed.any():
+        return None
+    missed, (row, j) = misses.missed, misses.worst
+    label, size = context.signals[0][int(misses.states[j])], float(misses.misses[row, j])
+    values = {"missed": int(missed.sum()), "trials": len(numbers), "largest_miss": size, "state": label}
+    text = (
+        f"In {int(missed.sum())} of {len(numbers)} trials M ends farther than {percent(soundness.MISSED)} of the range "
+        f"of a weighted state from its goal; it misses most in {label}, by {number(size)}, in trial {numbers[row]}. A "
+        "controller that fails on M cannot be expected to work on S."
+    )
+    return Finding("Goals of M", "attention", text, values)
+
+
+# What is asked about every campaign, with the name of each question.
+_QUESTIONS: tuple[tuple[str, Question], ...] = (
     ("Where M is weak", weak_region),
     ("States visited there", weak_states),
     ("What errs, and when", components),
@@ -19,9 +290,3 @@ QUESTIONS: tuple[tuple[str, Question], ...] = (
     ("Bias across the tasks", bias),
     ("Corrected model", explained),
 )
-"""What is asked about every campaign, with the name of each question."""
-
-
-def insights(context: ReportContext) -> list[Finding]:
-    """Return what the trials show, one finding for each question that has an answer."""
-    return findings_of(QUESTIONS, context)

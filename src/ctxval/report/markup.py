@@ -14,19 +14,11 @@ from markupsafe import Markup, escape
 from ctxval._util.representation import shown
 from ctxval._util.texts import plain, shortened, visible
 
-LONGEST = 2_000
-"""Characters of one text."""
-
 UNCUT = 100_000
 """Characters of one text that must never be shortened, such as an assumption."""
 
-_CELL = 300
-"""Characters of a cell of a table."""
 
-_VOID = ("br", "meta", "link", "input")
-
-
-def text(value: object, longest: int = LONGEST) -> Markup:
+def text(value: object, longest: int = 2_000) -> Markup:
     """Return a text that cannot be markup; :class:`Markup` and charts stay as they are."""
     if hasattr(value, "__html__"):
         return Markup(value.__html__())
@@ -43,17 +35,14 @@ def element(name: str, *children: object, **attributes: object) -> Markup:
             that is None is left out, and one that is True has no value.
     """
     inside = Markup("").join(text(child) for child in children if child is not None)
-    given = Markup("").join(_attribute(key, value) for key, value in attributes.items() if value is not None)
-    if name in _VOID:
+    given = Markup("")
+    for key, value in attributes.items():
+        if value is not None:
+            content = Markup("") if value is True else Markup('="{}"').format(text(value, 4_000_000))
+            given += Markup(" {}{}").format(Markup(key.rstrip("_").replace("_", "-")), content)
+    if name in ("br", "meta", "link", "input"):
         return Markup("<{}{}>").format(Markup(name), given)
     return Markup("<{0}{1}>{2}</{0}>").format(Markup(name), given, inside)
-
-
-def _attribute(key: str, value: object) -> Markup:
-    name = Markup(key.rstrip("_").replace("_", "-"))
-    if value is True:
-        return Markup(" {}").format(name)
-    return Markup(' {}="{}"').format(name, text(value, 4_000_000))
 
 
 def joined(parts: Iterable[object]) -> Markup:
@@ -87,8 +76,11 @@ def table(caption: str, headers: Sequence[str], rows: Iterable[Sequence[object]]
         class_: further classes of the element.
     """
     head = element("tr", *(element("th", header, scope="col") for header in headers))
-    body = joined(_row(cells) for cells in rows)
-    inside = element("caption", caption), element("thead", head), element("tbody", body)
+    body = [
+        element("tr", element("th", cell(first), scope="row"), *(element("td", cell(value)) for value in others))
+        for first, *others in rows
+    ]
+    inside = element("caption", caption), element("thead", head), element("tbody", *body)
     # A wide table scrolls by itself, so it can be reached by the keyboard.
     return element(
         "div",
@@ -100,18 +92,13 @@ def table(caption: str, headers: Sequence[str], rows: Iterable[Sequence[object]]
     )
 
 
-def _row(cells: Sequence[object]) -> Markup:
-    first, *others = cells
-    return element("tr", element("th", cell(first), scope="row"), *(element("td", cell(one)) for one in others))
-
-
 def cell(value: object) -> Markup:
     """Return the content of a cell: numbers with four digits, a dash for None."""
     if value is None:
         return Markup("&ndash;")
     if hasattr(value, "__html__"):
         return Markup(value.__html__())
-    return text(value if isinstance(value, str) else number(value), _CELL)
+    return text(value if isinstance(value, str) else number(value), 300)
 
 
 def bar(share: float) -> Markup:

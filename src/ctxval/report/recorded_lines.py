@@ -10,16 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.texts import shortened, visible
-from ctxval.report.context import Recording, ReportContext
-
-MOST_CHARACTERS = 850_000
-"""Largest number of characters of all lines together; a report stays below 1.5 MB."""
-
-_POINTS = (200, 120, 70)
-"""Numbers of points of a line that are tried, until the lines of all trials fit."""
-
-_LEVELS = 65_535
-"""Number of steps of a value between the smallest and the largest one of its line."""
+from ctxval.report.context import ReportContext
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,38 +32,26 @@ class RecordedLines:
     thinned: bool
 
 
-def recorded_lines(context: ReportContext, most: int = MOST_CHARACTERS) -> RecordedLines:
-    """Return the lines of the trials, with fewer points or fewer trials if they would be too many."""
-    numbers, points = list(context.recordings), _POINTS[0]
-    found: dict[int, dict[str, Any]] = {}
-    for points in _POINTS:
-        found = _fitting(context, points, most)
-        if len(found) == len(numbers):
+def recorded_lines(context: ReportContext, most: int = 850_000) -> RecordedLines:
+    """Return the lines of the trials, with fewer points or fewer trials if they have too many characters together."""
+    numbers, points = list(context.recordings), 0
+    lines: dict[int, dict[str, Any]] = {}
+    for points in (200, 120, 70):
+        lines, used = {}, 0
+        for number in numbers:
+            of_trial = lines_of(context, number, points)
+            parts = [of_trial["t"], *of_trial["m"], *of_trial["e"], *of_trial.get("c", ()), *of_trial.get("r", ())]
+            used += sum(len(part.get("data", "")) + 60 for part in parts if part)
+            if used > most:
+                break
+            lines[number] = of_trial
+        if len(lines) == len(numbers):
             break
-    longest = max((one.system.horizon + 1 for one in context.recordings.values()), default=0)
-    states, inputs = context.signals
-    signals = [{"label": _safe(label), "kind": "state"} for label in states]
-    signals += [{"label": _safe(label), "kind": "input"} for label in inputs]
-    return RecordedLines(
-        {"signals": signals, "trials": {str(number): one for number, one in found.items()}},
-        tuple(found),
-        tuple(numbers[len(found) :]),
-        points,
-        longest > points,
-    )
-
-
-def _fitting(context: ReportContext, points: int, most: int) -> dict[int, dict[str, Any]]:
-    """Return the lines of the worst trials, as many as fit into a number of characters."""
-    found: dict[int, dict[str, Any]] = {}
-    used = 0
-    for number in context.recordings:
-        lines = lines_of(context, number, points)
-        used += _size(lines)
-        if used > most:
-            break
-        found[number] = lines
-    return found
+    kinds = zip(("state", "input"), context.signals, strict=True)
+    signals = [{"label": shortened(visible(name), 120), "kind": kind} for kind, names in kinds for name in names]
+    longest = max((run.system.horizon + 1 for run in context.recordings.values()), default=0)
+    data = {"signals": signals, "trials": {str(number): of_trial for number, of_trial in lines.items()}}
+    return RecordedLines(data, tuple(lines), tuple(numbers[len(lines) :]), points, longest > points)
 
 
 def lines_of(context: ReportContext, number: int, points: int) -> dict[str, Any]:
@@ -80,62 +59,37 @@ def lines_of(context: ReportContext, number: int, points: int) -> dict[str, Any]
 
     Differences are stored, because a small error of M would vanish in the steps of the values.
     """
-    recording = context.recordings[number]
-    replay = context.replays.get(number)
-    rows = _rows(recording, points)
-    inner = rows[rows < recording.system.horizon]
+    model, system = context.recordings[number].model, context.recordings[number].system
+    rows: Rows = np.arange(system.horizon + 1)
+    if len(rows) > points:  # evenly spread, and those of the largest error of each state
+        peaks = np.abs(system.states - model.states).argmax(axis=0)
+        rows = np.unique(np.concatenate([np.linspace(0, system.horizon, points).astype(np.intp), peaks]))
+    inner = rows[rows < system.horizon]
+
+    def columns(states: Array, inputs: Array) -> list[dict[str, Any]]:
+        return [packed(column) for column in (*states[rows].T, *inputs[inner].T)]
+
     lines: dict[str, Any] = {
-        "t": packed(recording.system.times[rows]),
-        "m": [*_columns(recording.model.states[rows]), *_columns(recording.model.inputs[inner])],
-        "e": [
-            *_columns((recording.system.states - recording.model.states)[rows]),
-            *_columns((recording.system.inputs - recording.model.inputs)[inner]),
-        ],
+        "t": packed(system.times[rows]),
+        "m": columns(model.states, model.inputs),
+        "e": columns(system.states - model.states, system.inputs - model.inputs),
     }
-    corrected = None if replay is None else replay.corrected
-    if corrected is not None and corrected.states.shape == recording.model.states.shape:
-        lines["c"] = [
-            *_columns((corrected.states - recording.model.states)[rows]),
-            *_columns((corrected.inputs - recording.model.inputs)[inner]),
-        ]
-    if replay is not None and replay.task.reference.shape == recording.model.states.shape:
-        reference = replay.task.reference
+    replay = context.replays.get(number)
+    if replay is None:
+        return lines
+    corrected, reference = replay.corrected, replay.task.reference
+    if corrected is not None and corrected.states.shape == model.states.shape:
+        lines["c"] = columns(corrected.states - model.states, corrected.inputs - model.inputs)
+    if reference.shape == model.states.shape:
         lines["r"] = [packed(column) if column.any() else None for column in reference[rows].T]
     return lines
-
-
-def _rows(recording: Recording, points: int) -> Rows:
-    """Return the rows of a trajectory that are drawn: evenly spread, and those of the largest error of each state."""
-    length = recording.system.horizon + 1
-    if length <= points:
-        return np.arange(length)
-    errors = np.abs(recording.system.states - recording.model.states)
-    peaks = errors.argmax(axis=0)
-    return np.unique(np.concatenate([np.linspace(0, length - 1, points).astype(np.intp), peaks]))
-
-
-def _columns(values: Array) -> list[dict[str, Any]]:
-    return [packed(column) for column in values.T]
 
 
 def packed(values: Array) -> dict[str, Any]:
     """Return numbers ``(k,)`` as their smallest value, a step, and multiples of the step in 16 bits each as base64."""
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
-    step = (high - low) / _LEVELS
+    step = (high - low) / 65_535
     if not (np.isfinite(step) and step > 0):
-        return {"low": _finite(low), "step": 0.0, "n": len(values)}
+        return {"low": low if np.isfinite(low) else 0.0, "step": 0.0, "n": len(values)}
     levels = np.rint((values - low) / step).astype("<u2")
     return {"low": low, "step": step, "data": base64.b64encode(levels.tobytes()).decode()}
-
-
-def _finite(value: float) -> float:
-    return value if np.isfinite(value) else 0.0
-
-
-def _size(lines: dict[str, Any]) -> int:
-    every = [lines["t"], *lines["m"], *lines["e"], *lines.get("c", ()), *filter(None, lines.get("r", ()))]
-    return sum(len(one.get("data", "")) + 60 for one in every)
-
-
-def _safe(label: str) -> str:
-    return shortened(visible(label), 120)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,232 +12,182 @@ from markupsafe import Markup
 from ctxval._util.files import write_text
 from ctxval._util.representation import counted
 from ctxval._util.texts import visible
-from ctxval.replay import PredictedTask, ReplayReport, StepError
+from ctxval.replay import PredictedTask, PredictedTasks, ReplayReport, StepError
 from ctxval.report.charts import SMALL, Axis, Chart, small_charts
 from ctxval.report.markup import bar, bullets, details, joined, number, paragraph, percent, quantity, table
-from ctxval.report.page import Rendered, SectionOf, framed, now, rendered_section
+from ctxval.report.page import framed, now, rendered
 
 __all__ = ["replay_page", "write_replay_page"]
 
-_LISTED = 20
-"""Largest number of sources and of splits that are listed."""
-
-_CHARTED = 12
-"""Largest number of states and inputs with charts of their own."""
-
-
-class _Section:
-    """What all sections share."""
-
-
-class InsightsOfReplay(_Section):
-    """What follows from the recordings, in sentences."""
-
-    title = "What follows"
-
-    def render(self, context: ReplayReport) -> Markup:
-        """Return the sentences; a replay always has some, except of a model without any error."""
-        if not context.insights:
-            return paragraph("The model predicts these recordings, and nothing is unusual.")
-        return bullets(_sentence(one) for one in context.insights)
-
-
-class ErrorsOfReplay(_Section):
-    """The errors of the prediction after one and several steps."""
-
-    title = "Error of the prediction"
-
-    def render(self, context: ReplayReport) -> Markup:
-        """Return the table of errors, and a chart of the relative error over the number of steps for each state."""
-        if not context.errors:
-            return paragraph("No recording has a single step.")
-        by_state = {state: [one for one in context.errors if one.state == state] for state in context.data.states}
-        headers = (
-            "State",
-            "Steps",
-            "RMS error",
-            "Over the recordings",
-            "95 % below",
-            "Share of the change",
-            "Diverged",
-        )
-        rows = [_error_row(one) for errors in by_state.values() for one in errors]
-        meaning = (
-            "A share of 100 % of the change is the error of a model that predicts no change. The errors are those of "
-            "recordings that the model has not seen, unless it has seen all of them."
-        )
-        charts = [_error_chart(errors) for errors in by_state.values() if len(errors) > 1][:_CHARTED]
-        return joined(
-            [
-                paragraph(meaning),
-                *([small_charts(charts)] if charts else []),
-                table("Errors after one and several steps", headers, rows),
-            ]
-        )
-
-
-class RegionsOfReplay(_Section):
-    """Where in state and input the one-step error is large."""
-
-    title = "Where the error is large"
-
-    def render(self, context: ReplayReport) -> Markup:
-        """Return a chart for each state and input, and the table behind them."""
-        if not context.regions:
-            return paragraph("There are too few recorded steps to divide them into regions.")
-        names = list(dict.fromkeys(one.variable for one in context.regions))
-        charts = [_region_chart(context, name) for name in names[:_CHARTED]]
-        rows = [
-            (_named(one.variable, one.unit), f"{number(one.low)} to {number(one.high)}", one.count, one.ratio)
-            for one in context.regions
-        ]
-        headers = ("State or input", "Between", "Steps", "Error, as a multiple of the average")
-        meaning = (
-            "Each state and input is divided into ranges with equally many steps. The error is that of one step over "
-            "all states, divided by its average over all recorded steps."
-        )
-        numbers = details("All regions", table("One-step error in each region", headers, rows))
-        return joined([paragraph(meaning), small_charts(charts), numbers])
-
-
-class ResidualsOfReplay(_Section):
-    """How much of the error a better model could explain."""
-
-    title = "What a better model could explain"
-
-    def render(self, context: ReplayReport) -> Markup:
-        """Return the table of shares."""
-        if not context.residuals:
-            return paragraph("There are too few recorded steps to tell.")
-        headers = (
-            *("State", "RMS residual", "Explained by state and input", "By an affine function"),
-            *("RMS of the rest", "Rest explained by the step before"),
-        )
-        rows = [
-            (
-                one.state,
-                quantity(one.rms, one.unit),
-                _bar(one.explained),
-                _bar(one.linear),
-                quantity(one.rest, one.unit),
-                _bar(one.history),
-            )
-            for one in context.residuals
-        ]
-        meaning = (
-            "All shares are of the mean square of the one-step residual, measured on held-out recordings. A large "
-            "share of the step before shows a state that is not recorded, a delay, or filtered measurements."
-        )
-        return joined([paragraph(meaning), table("One-step residual", headers, rows)])
-
-
-class TasksOfReplay(_Section):
-    """What the recordings predict of the tasks of an experiment.
-
-    Args:
-        units: the units of the distance.
-    """
-
-    title = "Tasks"
-
-    def __init__(self, units: str = "") -> None:
-        self.units = units
-
-    def render(self, context: ReplayReport) -> Markup:
-        """Return the worst tasks and the executions that would tell most; no execution has tested them."""
-        tasks = context.tasks
-        if tasks is None:
-            return paragraph("Nothing is predicted of tasks: give an experiment with --experiment.")
-        bound = (
-            f"The largest distance over all tasks is {quantity(tasks.median, self.units)} in the median of "
-            f"{tasks.draws} draws of the dynamics, and at most {quantity(tasks.upper, self.units)} in 95 % of them. "
-            "No execution has tested this, and it is no verdict."
-        )
-        left = paragraph(f"No controller can be designed for {percent(tasks.unplanned)} of the tasks.")
-        return joined(
-            [
-                paragraph(bound),
-                *([left] if tasks.unplanned else []),
-                self._chart(tasks.worst),
-                self._table("Tasks with the largest predicted distances", tasks.worst),
-                self._table("Executions that would tell most of the largest distance", tasks.executions),
-            ]
-        )
-
-    def _chart(self, tasks: Sequence[PredictedTask]) -> Chart:
-        numbers = np.arange(1.0, len(tasks) + 1)
-        low, median, high = (np.array([getattr(one, name) for one in tasks]) for name in ("low", "median", "high"))
-        label = f"distance [{self.units}]" if self.units else "distance"
-        axes = Axis("task in the table below", 0.5, len(tasks) + 0.5), Axis.over(label, high, zero=True)
-        chart = Chart("Predicted distances of the worst tasks, with 90 % of the draws", *axes)
-        return chart.whiskers(numbers, low, high, "corrected").marks(numbers, median, "corrected", "predicted")
-
-    def _table(self, caption: str, tasks: Sequence[PredictedTask]) -> Markup:
-        resolved = any(one.resolved is not None for one in tasks)
-        headers = ("Number", "Task", "Distance", "90 % between", *(("Resolved",) if resolved else ()))
-        rows = [
-            (
-                str(row),
-                _task(one),
-                quantity(one.median, self.units),
-                f"{number(one.low)} and {number(one.high)}",
-                *((percent(one.resolved or 0.0),) if resolved else ()),
-            )
-            for row, one in enumerate(tasks, 1)
-        ]
-        return table(caption, headers, rows)
-
-
-class RecordingsOfReplay(_Section):
-    """The recordings, how they were read and where they were split."""
-
-    title = "Recordings"
-
-    def render(self, context: ReplayReport) -> Markup:
-        """Return the sizes, the sources and the splits."""
-        data = context.data
-        named = [_named(name, unit) for name, unit in data.states.items()]
-        inputs = [_named(name, unit) for name, unit in data.inputs.items()]
-        rows: list[tuple[str, object]] = [
-            ("Recordings", data.recordings),
-            ("Steps", data.steps),
-            ("Time step", quantity(data.dt, "s")),
-            ("Duration", quantity(data.steps * data.dt, "s")),
-            ("States", ", ".join(named)),
-            ("Inputs", ", ".join(inputs) or "none"),
-            ("Recordings that the model was learned from", data.seen),
-        ]
-        splits = [str(one) for one in data.breaks]
-        return joined(
-            [
-                table("The recordings", ("Quantity", "Value"), rows, class_="facts"),
-                *([paragraph("How they were read:"), bullets(map(_sentence, data.notes))] if data.notes else []),
-                details(f"{counted(len(data.sources), 'source')}", bullets(_cut(data.sources))),
-                *([details(f"{counted(len(splits), 'split')}", bullets(_cut(splits)))] if splits else []),
-            ]
-        )
+_LISTED = 20  # largest number of sources and of splits that are listed
+_CHARTED = 12  # largest number of states and inputs with charts of their own
 
 
 def replay_page(report: ReplayReport, *, name: str = "", units: str = "") -> str:
     """Return what recordings show of a model as one HTML page, which opens no connection."""
-    sections: tuple[SectionOf[ReplayReport], ...] = (
-        InsightsOfReplay(),
-        ErrorsOfReplay(),
-        RegionsOfReplay(),
-        ResidualsOfReplay(),
-        *((TasksOfReplay(units),) if report.tasks is not None else ()),
-        RecordingsOfReplay(),
-    )
+    sections: dict[str, Callable[[ReplayReport], Markup]] = {
+        "What follows": _insights,
+        "Error of the prediction": _errors,
+        "Where the error is large": _regions,
+        "What a better model could explain": _residuals,
+    }
     with np.errstate(all="ignore"):  # recordings may have any numbers
-        rendered: list[Rendered] = [rendered_section(section, report) for section in sections]
+        parts = [rendered(title, partial(render, report)) for title, render in sections.items()]
+        if report.tasks is not None:
+            parts.append(rendered("Tasks", partial(_tasks, report.tasks, units)))
+        parts.append(rendered("Recordings", partial(_recordings, report)))
     count = counted(report.data.recordings, "recording")
     title = f"Recordings replayed on {visible(name) or 'a model'}"
-    return framed(title, f"{count} compared with the model; nothing was executed; report made {now()}.", rendered)
+    return framed(title, f"{count} compared with the model; nothing was executed; report made {now()}.", parts)
 
 
 def write_replay_page(report: ReplayReport, path: str | Path, *, name: str = "", units: str = "") -> Path:
     """Write :func:`replay_page` as one file, and return its path."""
     return write_text(path, replay_page(report, name=name, units=units))
+
+
+def _insights(report: ReplayReport) -> Markup:
+    if not report.insights:
+        return paragraph("The model predicts these recordings, and nothing is unusual.")
+    return bullets(map(_sentence, report.insights))
+
+
+def _errors(report: ReplayReport) -> Markup:
+    """Return a chart of the error over the number of steps for each state, and the table of errors."""
+    if not report.errors:
+        return paragraph("No recording has a single step.")
+    by_state = {state: [error for error in report.errors if error.state == state] for state in report.data.states}
+    rows = [
+        (
+            error.state,
+            error.steps,
+            quantity(error.rms, error.unit),
+            f"{number(error.lowest, 3)} to {number(error.highest, 3)}",
+            number(error.upper, 3),
+            percent(error.relative, 3) if np.isfinite(error.relative) else "more than any change",
+            percent(error.diverged),
+        )
+        for errors in by_state.values()
+        for error in errors
+    ]
+    headers = (
+        *("State", "Steps", "RMS error", "Over the recordings", "95 % below"),
+        *("Share of the change", "Diverged"),
+    )
+    meaning = (
+        "A share of 100 % of the change is the error of a model that predicts no change. The errors are those of "
+        "recordings that the model has not seen, unless it has seen all of them."
+    )
+    charts = [_error_chart(errors) for errors in by_state.values() if len(errors) > 1][:_CHARTED]
+    drawn = [small_charts(charts)] if charts else []
+    return joined([paragraph(meaning), *drawn, table("Errors after one and several steps", headers, rows)])
+
+
+def _regions(report: ReplayReport) -> Markup:
+    """Return a chart of the one-step error for each state and input, and the table behind them."""
+    if not report.regions:
+        return paragraph("There are too few recorded steps to divide them into regions.")
+    names = list(dict.fromkeys(region.variable for region in report.regions))
+    rows = [
+        (_named(region.variable, region.unit), f"{number(region.low)} to {number(region.high)}", region.count,
+         region.ratio)
+        for region in report.regions
+    ]  # fmt: skip
+    headers = ("State or input", "Between", "Steps", "Error, as a multiple of the average")
+    meaning = (
+        "Each state and input is divided into ranges with equally many steps. The error is that of one step over all "
+        "states, divided by its average over all recorded steps."
+    )
+    numbers = details("All regions", table("One-step error in each region", headers, rows))
+    charts = small_charts([_region_chart(report, name) for name in names[:_CHARTED]])
+    return joined([paragraph(meaning), charts, numbers])
+
+
+def _residuals(report: ReplayReport) -> Markup:
+    """Return how much of the error a better model could explain."""
+    if not report.residuals:
+        return paragraph("There are too few recorded steps to tell.")
+
+    def share(value: float) -> Markup:
+        return joined([percent(value, 3), bar(min(max(value, 0.0), 1.0))])
+
+    headers = (
+        *("State", "RMS residual", "Explained by state and input", "By an affine function"),
+        *("RMS of the rest", "Rest explained by the step before"),
+    )
+    rows = [
+        (
+            *(state.state, quantity(state.rms, state.unit), share(state.explained), share(state.linear)),
+            *(quantity(state.rest, state.unit), share(state.history)),
+        )
+        for state in report.residuals
+    ]
+    meaning = (
+        "All shares are of the mean square of the one-step residual, measured on held-out recordings. A large share of "
+        "the step before shows a state that is not recorded, a delay, or filtered measurements."
+    )
+    return joined([paragraph(meaning), table("One-step residual", headers, rows)])
+
+
+def _tasks(tasks: PredictedTasks, units: str) -> Markup:
+    """Return the worst tasks and the executions that would tell most; no execution has tested them."""
+    bound = (
+        f"The largest distance over all tasks is {quantity(tasks.median, units)} in the median of {tasks.draws} "
+        f"posterior samples of the dynamics, and at most {quantity(tasks.upper, units)} in 95 % of them. No execution "
+        "has tested this, and it is no verdict."
+    )
+    left = f"No controller can be designed for {percent(tasks.unplanned)} of the tasks."
+    numbers = np.arange(1.0, len(tasks.worst) + 1)
+    low, median, high = (np.array([getattr(task, name) for task in tasks.worst]) for name in ("low", "median", "high"))
+    label = f"distance [{units}]" if units else "distance"
+    axes = Axis("task in the table below", 0.5, len(tasks.worst) + 0.5), Axis.over(label, high, zero=True)
+    chart = Chart("Predicted distances of the worst tasks, with 90 % of the samples", *axes)
+    chart.whiskers(numbers, low, high, "corrected").marks(numbers, median, "corrected", "predicted")
+    return joined(
+        [
+            paragraph(bound),
+            *([paragraph(left)] if tasks.unplanned else []),
+            chart,
+            _task_table("Tasks with the largest predicted distances", tasks.worst, units),
+            _task_table("Executions that would tell most of the largest distance", tasks.executions, units),
+        ]
+    )
+
+
+def _task_table(caption: str, tasks: Sequence[PredictedTask], units: str) -> Markup:
+    headers = ["Number", "Task", "Distance", "90 % between"]
+    if any(task.resolved is not None for task in tasks):
+        headers.append("Resolved")
+    rows = []
+    for row, task in enumerate(tasks, 1):
+        parameters = ", ".join(f"{name} = {number(value)}" for name, value in task.parameters.items())
+        interval = f"{number(task.low)} and {number(task.high)}"
+        cells = [str(row), parameters, quantity(task.median, units), interval, percent(task.resolved or 0.0)]
+        rows.append(cells[: len(headers)])
+    return table(caption, headers, rows)
+
+
+def _recordings(report: ReplayReport) -> Markup:
+    """Return the sizes of the recordings, how they were read, the sources and the splits."""
+    data = report.data
+    rows: list[tuple[str, object]] = [
+        ("Recordings", data.recordings),
+        ("Steps", data.steps),
+        ("Time step", quantity(data.dt, "s")),
+        ("Duration", quantity(data.steps * data.dt, "s")),
+        ("States", ", ".join(_named(*state) for state in data.states.items())),
+        ("Inputs", ", ".join(_named(*input_) for input_ in data.inputs.items()) or "none"),
+        ("Recordings that the model was learned from", data.seen),
+    ]
+    folded = [("source", list(data.sources)), ("split", [str(gap) for gap in data.breaks])]
+    parts = [table("The recordings", ("Quantity", "Value"), rows, class_="facts")]
+    if data.notes:
+        parts += [paragraph("How they were read:"), bullets(map(_sentence, data.notes))]
+    for name, lines in folded:
+        more = [f"and {len(lines) - _LISTED} others; --json lists them"] if len(lines) > _LISTED else []
+        if lines:
+            parts.append(details(counted(len(lines), name), bullets([*lines[:_LISTED], *more])))
+    return joined(parts)
 
 
 def _sentence(words: str) -> str:
@@ -247,31 +198,11 @@ def _named(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-def _cut(lines: Sequence[str]) -> list[str]:
-    more = [f"and {len(lines) - _LISTED} others; --json lists them"] if len(lines) > _LISTED else []
-    return [*lines[:_LISTED], *more]
-
-
-def _bar(share: float) -> Markup:
-    return joined([percent(share, 3), bar(min(max(share, 0.0), 1.0))])
-
-
-def _task(one: PredictedTask) -> str:
-    return ", ".join(f"{name} = {number(value)}" for name, value in one.parameters.items())
-
-
-def _error_row(one: StepError) -> tuple[object, ...]:
-    share = percent(one.relative, 3) if np.isfinite(one.relative) else "more than any change"
-    spread = f"{number(one.lowest, 3)} to {number(one.highest, 3)}"
-    diverged = percent(one.diverged)
-    return (one.state, one.steps, quantity(one.rms, one.unit), spread, number(one.upper, 3), share, diverged)
-
-
 def _error_chart(errors: Sequence[StepError]) -> Chart:
     """Return the root mean square error of one state over the number of steps, with the spread over recordings."""
-    steps = np.array([float(one.steps) for one in errors])
+    steps = np.array([float(error.steps) for error in errors])
     rms, low, high, change = (
-        np.array([getattr(one, k) for one in errors]) for k in ("rms", "lowest", "highest", "change")
+        np.array([getattr(error, k) for error in errors]) for k in ("rms", "lowest", "highest", "change")
     )
     first = errors[0]
     x, y = Axis.over("steps", steps, room=0.03), Axis.over(_named(first.state, first.unit), high, rms, zero=True)
@@ -283,13 +214,13 @@ def _error_chart(errors: Sequence[StepError]) -> Chart:
     return chart.marks(steps, rms, "mean", "", [f"{one.steps} steps: {number(one.rms)}" for one in errors])
 
 
-def _region_chart(context: ReplayReport, name: str) -> Chart:
+def _region_chart(report: ReplayReport, name: str) -> Chart:
     """Return the error in the ranges of one state or input, as steps."""
-    own = [one for one in context.regions if one.variable == name]
-    across = np.repeat([own[0].low, *(one.high for one in own)], 2)[1:-1]
-    up = np.repeat([one.ratio for one in own], 2)
-    everywhere = [one.ratio for one in context.regions]
-    x = Axis.over(_named(name, own[0].unit), across, room=0.02)
+    parts = [region for region in report.regions if region.variable == name]
+    across = np.repeat([parts[0].low, *(region.high for region in parts)], 2)[1:-1]
+    up = np.repeat([region.ratio for region in parts], 2)
+    everywhere = [region.ratio for region in report.regions]
+    x = Axis.over(_named(name, parts[0].unit), across, room=0.02)
     y = Axis.over("error / average", everywhere, [1.2], zero=True)
     chart = Chart(f"One-step error over {name}", x, y, **SMALL)
     chart.line(x.ends, [1.0, 1.0], "reference", "average")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import Any
 from xml.etree import ElementTree
 
@@ -16,7 +17,7 @@ from ctxval.report.diagnostics import diagnostics, not_tested
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.insights import insights
 from ctxval.report.markup import UNCUT, number, quantity
-from ctxval.report.sections.appendix import appendix, appendix_json
+from ctxval.report.sections.appendix import appendix
 from ctxval.report.sections.repeat import command_snippet, identity, python_snippet, repeating_command
 
 _WORST = 5
@@ -34,8 +35,8 @@ def to_json(context: ReportContext) -> dict[str, Any]:
             "failed": [trial.number for trial in context.failed],
             "certificate": None if certificate is None else certificate.to_json(),
             "missing": context.missing or None,
-            "diagnostics": [one.to_json() for one in diagnostics(context)],
-            "insights": [one.to_json() for one in insights(context)],
+            "diagnostics": [finding.to_json() for finding in diagnostics(context)],
+            "insights": [finding.to_json() for finding in insights(context)],
             "not_tested": not_tested(context),
             "worst": [
                 {
@@ -49,7 +50,7 @@ def to_json(context: ReportContext) -> dict[str, Any]:
             ],
             "command": repeating_command(context) or None,
             "identity": identity(context),
-            "appendix": appendix_json(context),
+            "appendix": [asdict(entry) for entry in appendix(context)],
         }
         plain: dict[str, Any] = json.loads(json.dumps(describe(report, depth=12), allow_nan=False))
     return plain
@@ -61,46 +62,29 @@ def junit(context: ReportContext) -> str:
     The verdict fails if M is falsified, and is skipped if it is undecided. A diagnostic fails if it speaks against the
     verdict, and is skipped if it is not known.
     """
-    checks = diagnostics(context)
-    cases = [_verdict_case(context), *(_case(finding) for finding in checks)]
-    counts = {kind: sum(case.find(kind) is not None for case in cases) for kind in ("failure", "skipped")}
-    suite = ElementTree.Element(
-        "testsuite",
-        name=_xml_text(f"ctxval {context.name}"),
-        tests=str(len(cases)),
-        failures=str(counts["failure"]),
-        skipped=str(counts["skipped"]),
-        errors="0",
-        time=f"{sum(trial.seconds or 0.0 for trial in context.trials):.3f}",
-    )
-    suite.extend(cases)
-    ElementTree.indent(suite)
-    return (
-        f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {MADE_BY} -->\n'
-        + ElementTree.tostring(suite, encoding="unicode")
-        + "\n"
-    )
+    suite = ElementTree.Element("testsuite", name=_xml_text(f"ctxval {context.name}"))
+    kinds = {"falsified": "failure", "bad": "failure", "undecided": "skipped", "unknown": "skipped"}
 
+    def add(classname: str, name: str, result: str, text: str) -> None:
+        case = ElementTree.SubElement(suite, "testcase", classname=classname, name=_xml_text(name))
+        if result in kinds:
+            ElementTree.SubElement(case, kinds[result], message=_xml_text(text))
+        elif text:
+            ElementTree.SubElement(case, "system-out").text = _xml_text(text)
 
-def _verdict_case(context: ReportContext) -> ElementTree.Element:
-    case = ElementTree.Element("testcase", classname="ctxval", name="verdict")
     verdict = context.verdict
-    if verdict is None:
-        ElementTree.SubElement(case, "skipped", message="no threshold was given")
-    elif verdict.answer != "validated":
-        tag = "failure" if verdict.answer == "falsified" else "skipped"
-        ElementTree.SubElement(case, tag, message=_xml_text(str(verdict)))
-    return case
-
-
-def _case(finding: Finding) -> ElementTree.Element:
-    case = ElementTree.Element("testcase", classname="ctxval.diagnostics", name=_xml_text(finding.name))
-    if finding.light in ("bad", "unknown"):
-        tag = "failure" if finding.light == "bad" else "skipped"
-        ElementTree.SubElement(case, tag, message=_xml_text(finding.text))
-    else:
-        ElementTree.SubElement(case, "system-out").text = _xml_text(finding.text)
-    return case
+    answer, reason = ("undecided", "no threshold was given") if verdict is None else (verdict.answer, str(verdict))
+    add("ctxval", "verdict", answer, "" if answer == "validated" else reason)
+    for finding in diagnostics(context):
+        add("ctxval.diagnostics", finding.name, finding.light, finding.text)
+    suite.set("tests", str(len(suite)))
+    suite.set("failures", str(len(suite.findall("testcase/failure"))))
+    suite.set("skipped", str(len(suite.findall("testcase/skipped"))))
+    suite.set("errors", "0")
+    suite.set("time", f"{sum(trial.seconds or 0.0 for trial in context.trials):.3f}")
+    ElementTree.indent(suite)
+    content = ElementTree.tostring(suite, encoding="unicode")
+    return f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {MADE_BY} -->\n{content}\n'
 
 
 def _xml_text(words: str) -> str:
@@ -112,6 +96,7 @@ def markdown(context: ReportContext) -> str:
     """Return the report without its charts as Markdown; texts of the store cannot become markup."""
     units, verdict = context.labels.units, context.verdict
     answer = "No verdict: no threshold was given." if verdict is None else f"{verdict}"
+    trials = context.worst_tasks(_WORST)
     lines = [
         f"# Validation of {markdown_text(context.name) or 'campaign'}",
         "",
@@ -129,19 +114,23 @@ def markdown(context: ReportContext) -> str:
         "",
         "## What was not tested",
         "",
-        *(f"- {markdown_text(one)}" for one in not_tested(context)),
+        *(f"- {markdown_text(sentence)}" for sentence in not_tested(context)),
         "",
         "## Worst tasks",
         "",
         f"| trial | distance | {' | '.join(map(markdown_text, context.space.labels))} |",
         f"|{'---|' * (2 + context.space.dimension)}",
-        *_worst_rows(context, units),
+        *(
+            f"| {trial.number} | {markdown_text(quantity(distance_of(trial), units))} | "
+            f"{' | '.join(map(number, point))} |"
+            for trial, point in zip(trials, context.coordinates(trials).tolist(), strict=True)
+        ),
         "",
         "## For the file",
         "",
         *(
-            f"- **{markdown_text(one.term)}** ({one.standard}): {markdown_text(one.content, UNCUT)}"
-            for one in appendix(context)
+            f"- **{markdown_text(entry.term)}** ({entry.standard}): {markdown_text(entry.content, UNCUT)}"
+            for entry in appendix(context)
         ),
         "",
         f"<!-- {MADE_BY} -->",
@@ -151,14 +140,8 @@ def markdown(context: ReportContext) -> str:
 
 
 def _items(findings: list[Finding]) -> list[str]:
-    return [f"- {WORDS[one.light]}: **{markdown_text(one.name)}.** {markdown_text(one.text)}" for one in findings] or [
-        "Nothing is unusual."
+    items = [
+        f"- {WORDS[finding.light]}: **{markdown_text(finding.name)}.** {markdown_text(finding.text)}"
+        for finding in findings
     ]
-
-
-def _worst_rows(context: ReportContext, units: str) -> list[str]:
-    trials = context.worst_tasks(_WORST)
-    return [
-        f"| {trial.number} | {markdown_text(quantity(distance_of(trial), units))} | {' | '.join(map(number, point))} |"
-        for trial, point in zip(trials, context.coordinates(trials).tolist(), strict=True)
-    ]
+    return items or ["Nothing is unusual."]

@@ -10,14 +10,14 @@ from ctxval.reproduce.arm import ArmModels, ArmSamples
 from ctxval.reproduce.dubins import DubinsMedians
 from ctxval.reproduce.jobs import Job, Results
 from ctxval.reproduce.linear import LinearComplexity
-from ctxval.reproduce.pendulum import ConvergedGP, Frameworks, Techniques, Trajectories
+from ctxval.reproduce.pendulum import ConvergedGP, FourFrameworks, Techniques, Trajectories
 from ctxval.reproduce.study import FULL, QUICK, Scale, Study
-from ctxval.reproduce.table import write_table
+from ctxval.reproduce.table import table_text
 
 __all__ = ["FULL", "QUICK", "STUDIES", "Scale", "Study", "reproduce", "studies_named"]
 
 STUDIES: tuple[Study, ...] = (
-    Frameworks(),
+    FourFrameworks(),
     Trajectories(),
     Techniques(),
     ConvergedGP(),
@@ -30,17 +30,13 @@ STUDIES: tuple[Study, ...] = (
 
 
 def studies_named(name: str) -> list[Study]:
-    """Return the study with this name, or all studies for ``all``.
-
-    Raises:
-        UnknownNameError: if there is no such study.
-    """
+    """Return the study with this name, or all studies for ``all``."""
     if name == "all":
         return list(STUDIES)
-    found = [study for study in STUDIES if study.name == name]
-    if not found:
+    studies = [study for study in STUDIES if study.name == name]
+    if not studies:
         raise UnknownNameError.among("study", name, ["all", *(study.name for study in STUDIES)])
-    return found
+    return studies
 
 
 def reproduce(
@@ -65,9 +61,6 @@ def reproduce(
         workers: number of processes.
         on_start: function that is called with the number of missing runs.
         on_done: function that is called after each run, with its job.
-
-    Raises:
-        InputError: if there is no such study, or the number of workers is not positive.
     """
     if workers < 1:
         raise InputError(f"workers must be at least 1, got {workers}.")
@@ -81,4 +74,6 @@ def reproduce(
         study.draw(results, scale).savefig(out / f"{study.name}.png", dpi=150)
         study.data(results, scale).write(out / f"{study.name}.csv")
     complete = [study for study in STUDIES if all(job in results for job in study.jobs(scale))]
-    return write_table(out, complete, results, scale)
+    table = out.with_name(f"{out.name}.md")
+    table.write_text(table_text(out, complete, results, scale))
+    return table

@@ -16,41 +16,36 @@ from ctxval.reproduce.study import (
     Claim,
     Columns,
     Scale,
+    Study,
     agreement,
-    new_figure,
+    draw_quartiles,
     ranged,
     running_estimate,
     spread,
 )
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
 
-_RANDOM = 500
-"""Executions of the passive searches."""
-_ACTIVE = 100
-"""Executions of the active searches."""
-_TASKS = 200
-"""Random tasks that are simulated for Aspect 1."""
+_RANDOM = 500  # executions of the passive searches
+_ACTIVE = 100  # executions of the active searches
+_TASKS = 200  # random tasks that are simulated for Aspect 1
+# Ratio of the root mean square to the formula as printed, which divides by H instead of its root.
 _SQUARE = np.sqrt(dubins.Settings().horizon)
-"""Ratio of the root mean square to the formula as printed, which divides by H instead of its root."""
 
 
-class DubinsMedians:
+class DubinsMedians(Study):
     """The paper's Fig. 5: the largest distance found, 1/H ||xi_S - xi_M||_2 as printed, against executions."""
 
     name = "dubins"
     title = "Dubins car: largest distance found"
     case = "dubins"
-
-    def _budget(self, search: str) -> int:
-        return _ACTIVE if search == "gp-ucb" else _RANDOM
+    axes = "executions of S", r"largest distance $\frac{1}{H}\|\xi_S - \xi_M\|_2$ [m, rad]"
 
     def _job(self, search: str, seed: int) -> Job:
-        return Job("search", "dubins", seed, search=search, budget=self._budget(search))
+        return Job("search", "dubins", seed, search=search, budget=_ACTIVE if search == "gp-ucb" else _RANDOM)
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one campaign for each technique and trial, the best-known values, and how the tasks are completed."""
         seeds = range(scale.trials)
         searches = [self._job(search, seed) for search in TECHNIQUES for seed in seeds]
         return searches + [job for seed in seeds for job in (Job("truth", "dubins", seed), self._aspects(seed))]
@@ -63,36 +58,21 @@ class DubinsMedians:
         jobs = [self._job(search, seed) for seed in range(scale.trials)]
         return np.array([running_estimate(distances_of(results[job]), search) for job in jobs])
 
-    def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return a figure of the medians with their quartiles, and the median of the best-known values."""
-        figure = new_figure()
-        axes = figure.add_subplot()
-        for search, (label, colour, line, marker) in TECHNIQUES.items():
-            low, median, high = np.percentile(self.estimates(results, scale, search), [25, 50, 75], axis=0)
-            counts = np.arange(1, len(median) + 1)
-            every = max(1, len(median) // 10)
-            axes.fill_between(counts, low, high, color=colour, alpha=0.2, linewidth=0)
-            axes.plot(counts, median, color=colour, linestyle=line, marker=marker, markevery=every, label=label)
+    def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
+        draw_quartiles(axes, {search: self.estimates(results, scale, search) for search in TECHNIQUES})
         best = np.median([results[Job("truth", "dubins", seed)]["distance"] for seed in range(scale.trials)])
         axes.axhline(float(best), color=BLACK, linewidth=1, linestyle="-.", label="best-known value (median)")
-        axes.set_xlabel("executions of S")
-        axes.set_ylabel(r"largest distance $\frac{1}{H}\|\xi_S - \xi_M\|_2$ [m, rad]")
-        axes.grid(alpha=0.25)
-        figure.legend(loc="outside upper center", ncols=2, fontsize=8)
-        return figure
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return the medians; the cells after the end of a budget are empty."""
         names: list[str] = ["executions"]
         values: list[list[float | str]] = [list(range(1, _RANDOM + 1))]
         for search in TECHNIQUES:
             median = np.median(self.estimates(results, scale, search), axis=0)
             names.append(f"{search}_median")
-            values.append([*median.tolist(), *[""] * (_RANDOM - len(median))])
+            values.append([*median.tolist(), *[""] * (_RANDOM - len(median))])  # empty after the budget
         return Columns(names, values)
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return the paper's claims about the Dubins car, with the measured numbers."""
         seeds = range(scale.trials)
         final = {search: self.estimates(results, scale, search)[:, -1] for search in TECHNIQUES}
         truths = np.array([results[Job("truth", "dubins", seed)]["distance"] for seed in seeds])

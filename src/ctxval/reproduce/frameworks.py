@@ -61,17 +61,10 @@ def frameworks(seed: int = 0, *, per_axis: int = 2001, restarts: int = 64, bound
     goals = validation.space.grid(per_axis)
     task = validation.task(validation.space.parameters(goals))
     on_model, on_system = closed_loops(validation, task)
-    torques = [float(np.abs(loop.inputs).max()) for loop in (on_model, on_system)]
+    torque = max(float(np.abs(loop.inputs).max()) for loop in (on_model, on_system))
+    ccdt, custom = (distance(on_model, on_system, task) for distance in (WHOLE, FINAL))
     oldt, olcd = (open_loop(validation, distance, bound, restarts, seed) for distance in (WHOLE, FINAL))
-    return Frameworks(
-        goals=goals[:, 0],
-        ccdt=WHOLE(on_model, on_system, task),
-        custom=FINAL(on_model, on_system, task),
-        oldt=oldt,
-        olcd=olcd,
-        bound=bound,
-        closed_loop_torque=max(torques),
-    )
+    return Frameworks(goals[:, 0], ccdt, custom, oldt, olcd, bound, torque)
 
 
 def closed_loops(validation: Validation, task: Task) -> tuple[Trajectory, Trajectory]:

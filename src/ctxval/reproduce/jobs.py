@@ -32,15 +32,6 @@ Result = dict[str, Any]
 DISCARDED = 5
 """The paper's k in sampling and discarding."""
 
-_KNOWN = 101
-"""Number of tasks whose distance to another trial's model a prior is made from."""
-
-_FACTOR = 1.5
-"""Largest ratio of a length-scale to that of another trial, in both directions."""
-
-_DIGITS = 10
-"""Number of significant digits in stored results: more than any figure shows, at half the size."""
-
 
 @dataclass(frozen=True)
 class Job:
@@ -66,28 +57,19 @@ class Job:
     def key(self) -> str:
         """A readable name, by which the result is stored."""
         options = [f"{name}-{value}" for name, value in self.options]
-        parts = [
-            self.kind,
-            self.case,
-            *options,
-            self.search,
-            f"{self.budget}" if self.budget else "",
-            f"seed{self.seed}",
-        ]
-        return re.sub(r"[^a-zA-Z0-9._-]+", "-", "_".join(part for part in parts if part))
+        budget = f"{self.budget}" if self.budget else ""
+        parts = [self.kind, self.case, *options, self.search, budget, f"seed{self.seed}"]
+        return re.sub(r"[^a-zA-Z0-9._-]+", "-", "_".join(filter(None, parts)))
 
     def experiment(self) -> Experiment:
         """Return the case that the job runs on."""
         return cases.by_name(self.case, self.seed, **dict(self.options))
 
 
-# The kinds of jobs
-
-
 def _search(job: Job) -> Result:
     """Return the points and distances of one campaign in order, or only the records for independent draws."""
     experiment = job.experiment()
-    search = INFORMED[job.search](job) if job.search in INFORMED else searches.by_name(job.search)
+    search = _informed(job) if job.search in INFORMED else searches.by_name(job.search)
     if searches.BaseSearch.of(search).iid:
         # The points do not depend on the distances, so all of them are executed in one batch.
         search.reset(experiment.validation.space.dimension, job.seed)
@@ -101,28 +83,21 @@ def _search(job: Job) -> Result:
     return {"points": points.tolist(), "distances": distances}
 
 
-def _with_prior_mean(job: Job) -> searches.Search:
-    """Return GP-UCB whose prior mean is the distance of the model of the next seed."""
+INFORMED = ("gp-ucb-prior-mean", "gp-ucb-hyperprior")
+"""Searches that know the distance of another trial's model, for a one-dimensional task space."""
+
+
+def _informed(job: Job) -> searches.Search:
+    """Return GP-UCB whose prior mean is the distance of the next seed's model, or with about its length-scale."""
     before = replace(job, seed=job.seed + 1).experiment().validation
-    goals = before.space.grid(_KNOWN)
+    goals = before.space.grid(101)
     distances = before.distances(goals)
-    return searches.GPUCB(prior_mean=before.space.unit_function(lambda p: np.interp(p.goal, goals[:, 0], distances)))
-
-
-def _with_hyperprior(job: Job) -> searches.Search:
-    """Return GP-UCB whose length-scale is uniform around that of the distance of the model of the next seed."""
-    before = replace(job, seed=job.seed + 1).experiment().validation
-    goals = before.space.grid(_KNOWN)
-    known = fit_surrogate(before.space.to_unit(goals), before.distances(goals))
-    length = float(np.exp(known.process.theta[1]))
-    return searches.GPUCB(kernel=Matern(1.5, length_scale=(length / _FACTOR, length * _FACTOR)))
-
-
-INFORMED: dict[str, Callable[[Job], searches.Search]] = {
-    "gp-ucb-prior-mean": _with_prior_mean,
-    "gp-ucb-hyperprior": _with_hyperprior,
-}
-"""Searches that know what another trial found, for a one-dimensional task space."""
+    if job.search == "gp-ucb-prior-mean":
+        known = before.space.unit_function(lambda p: np.interp(p.goal, goals[:, 0], distances))
+        return searches.GPUCB(prior_mean=known)
+    surrogate = fit_surrogate(before.space.to_unit(goals), distances)
+    length = float(np.exp(surrogate.process.theta[1]))
+    return searches.GPUCB(kernel=Matern(1.5, length_scale=(length / 1.5, length * 1.5)))
 
 
 def records(distances: Array) -> list[list[float]]:
@@ -131,12 +106,12 @@ def records(distances: Array) -> list[list[float]]:
     The estimates of SC and of SD with k = 5 depend on no other distances.
     """
     largest: list[float] = []
-    found = []
+    pairs = []
     for index, distance in enumerate(distances.tolist()):
         if distance > (largest[-1] if len(largest) > DISCARDED else -np.inf):
             largest = sorted([*largest, distance], reverse=True)[: DISCARDED + 1]
-            found.append([index, distance])
-    return found
+            pairs.append([index, distance])
+    return pairs
 
 
 def distances_of(result: Result) -> Array:
@@ -169,16 +144,10 @@ def _frameworks(job: Job) -> Result:
     """Return the four frameworks of the paper's Example 1."""
     from ctxval.reproduce.frameworks import frameworks
 
-    found = frameworks(job.seed, per_axis=job.budget)
-    return {
-        "goals": found.goals.tolist(),
-        "ccdt": found.ccdt.tolist(),
-        "custom": found.custom.tolist(),
-        "oldt": found.oldt.restarts.tolist(),
-        "olcd": found.olcd.restarts.tolist(),
-        "bound": found.bound,
-        "closed_loop_torque": found.closed_loop_torque,
-    }
+    profile = frameworks(job.seed, per_axis=job.budget)
+    profiles = {name: getattr(profile, name).tolist() for name in ("goals", "ccdt", "custom")}
+    restarts = {"oldt": profile.oldt.restarts.tolist(), "olcd": profile.olcd.restarts.tolist()}
+    return {**profiles, **restarts, "bound": profile.bound, "closed_loop_torque": profile.closed_loop_torque}
 
 
 def _aspects(job: Job) -> Result:
@@ -190,8 +159,8 @@ def _aspects(job: Job) -> Result:
     if job.case == "arm":
         from ctxval.cases.arm import aspects
 
-        found = aspects(job.seed, **dict(job.options), per_axis=job.budget)
-        return {"model_error": found.model_error.tolist(), "system_error": found.system_error.tolist()}
+        errors = aspects(job.seed, **dict(job.options), per_axis=job.budget)
+        return {"model_error": errors.model_error.tolist(), "system_error": errors.system_error.tolist()}
     validation = job.experiment().validation
     points = validation.space.iid(job.budget, np.random.default_rng(job.seed))
     missed = TrackingError(components=(0, 1), over="mean")
@@ -241,9 +210,6 @@ class Results:
     """Stored results, a file of JSON lines for each kind of job; those of a case that has changed since do not count.
 
     A change of the searches makes no result invalid: the table says which results were measured before it.
-
-    Args:
-        folder: of the files; it is made with the first result.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -251,8 +217,8 @@ class Results:
         self._files: dict[str, JsonLines] = {}
 
     def __contains__(self, job: Job) -> bool:
-        found = self._of_kind(job.kind).get((job.key,))
-        return found is not None and found["case_digest"] == case_digest(job.case)
+        result = self._of_kind(job.kind).get((job.key,))
+        return result is not None and result["case_digest"] == case_digest(job.case)
 
     def __getitem__(self, job: Job) -> Result:
         return self._of_kind(job.kind)[job.key,]
@@ -267,8 +233,10 @@ class Results:
             waiting = {pool.submit(run_job, job): job for job in missing}
             try:
                 for future in as_completed(waiting):
-                    self._store(waiting[future], future.result())
-                    on_done(waiting[future])
+                    job, result = waiting[future], _rounded(future.result())
+                    stored = {"key": job.key, **result, "case_digest": case_digest(job.case), **provenance()}
+                    self._of_kind(job.kind).append(stored)
+                    on_done(job)
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
@@ -277,10 +245,6 @@ class Results:
         if kind not in self._files:
             self._files[kind] = JsonLines(self.folder / f"{kind}.jsonl", ("key",))
         return self._files[kind]
-
-    def _store(self, job: Job, result: Result) -> None:
-        stored = {"key": job.key, **_rounded(result), "case_digest": case_digest(job.case), **provenance()}
-        self._of_kind(job.kind).append(stored)
 
 
 @functools.cache
@@ -291,7 +255,7 @@ def case_digest(case: str) -> str:
 
 def _rounded(value: Any) -> Any:
     if isinstance(value, float):
-        return float(f"{value:.{_DIGITS}g}")
+        return float(f"{value:.10g}")  # more digits than any figure shows, at half the size
     if isinstance(value, list):
         return [_rounded(item) for item in value]
     if isinstance(value, dict):

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -23,15 +22,6 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.distances import FinalState, WholeTrajectory
 from ctxval.distances.base import require_indices
 from ctxval.errors import InputError, ModelError
-
-_ROLLOUTS = 4096
-"""Number of rollouts in one batch, large enough to be fast and small enough for memory."""
-
-_PARTIAL = 0.5 ** np.arange(1, 7)
-"""Fractions of the way by which the whole sequence is moved, in case whole moves of single entries are too far."""
-
-_NEGLIGIBLE = 1e-10
-"""Smallest relative increase that counts as an improvement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +103,7 @@ class _Pair:
         return self.run(self.system, U).states - self.run(self.model, U).states
 
     def gradient(self, U: Array, weights: Array) -> Array:
-        """Return the gradient of ``sum(weights * gap)`` with respect to the inputs, shape ``(..., H, m)``."""
+        """Gradient of ``sum(weights * gap)`` with respect to the inputs, shape ``(..., H, m)``."""
         return self._pulled_back(self.system, U, weights) - self._pulled_back(self.model, U, weights)
 
     def _pulled_back(self, model: Model, U: Array, weights: Array) -> Array:
@@ -129,16 +119,7 @@ class _Pair:
         return gradient
 
 
-# Objectives
-
-
-class _Objective(Protocol):
-    """A convex function of the gap ``(..., N, H + 1, n)`` of the restarts ``rows``, shape ``(N,)``."""
-
-    def value(self, gap: Array, rows: Rows) -> Array: ...
-
-    def weights(self, gap: Array, rows: Rows) -> Array:
-        """Return a subgradient in the shape of the gap."""
+# Objectives: convex functions of the gap (..., N, H + 1, n) of the restarts ``rows``, and a subgradient of each
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,16 +181,13 @@ class _Norm:
             if self.order == np.inf:
                 index, sign = divmod(r, 2)
                 level, component = divmod(index, len(components))
-                time = times[-1 - int(_van_der_corput(level) * len(times))]
+                # 0, 1/2, 1/4, 3/4, 1/8, ... (van der Corput): each entry falls into the largest gap.
+                share = sum((level >> j & 1) * 0.5 ** (j + 1) for j in range(level.bit_length()))
+                time = times[-1 - int(share * len(times))]
                 directions[r, time, components[component]] = 1 - 2 * sign
             else:
                 directions[r, :, components] = np.array([[1 - 2 * (r >> j & 1)] for j in range(len(components))])
         return directions * self.factors
-
-
-def _van_der_corput(index: int) -> float:
-    """Return an entry of the sequence 0, 1/2, 1/4, 3/4, 1/8, ..., in which each entry falls into the largest gap."""
-    return sum((index >> j & 1) * 0.5 ** (j + 1) for j in range(index.bit_length()))
 
 
 def _dual(vectors: Array, order: float) -> Array:
@@ -227,8 +205,9 @@ def _dual(vectors: Array, order: float) -> Array:
 
 # Maximisation
 
+_Objective = _Fixed | _Norm
+# A proposal returns a target for each entry of the inputs, and the gain of the objective by that entry alone.
 _Proposal = Callable[[_Pair, Array, _Objective, Rows], tuple[Array, Array]]
-"""A proposal returns a target for each entry of the inputs, and the gain of the objective by that entry alone."""
 
 
 def _first_inputs(pair: _Pair, restarts: int, seed: int) -> Array:
@@ -253,7 +232,7 @@ def _ascend(pair: _Pair, U: Array, objective: _Objective, proposal: _Proposal, i
         candidates = _moves(U[rows], *proposal(pair, U[rows], objective, rows))
         reached = objective.value(pair.gap(candidates), rows)
         best, columns = reached.argmax(axis=0), np.arange(len(rows))
-        improved = reached[best, columns] > values[rows] + _NEGLIGIBLE * np.abs(values[rows])
+        improved = reached[best, columns] > values[rows] + 1e-10 * np.abs(values[rows])
         best, columns, rows = best[improved], columns[improved], rows[improved]
         U[rows], values[rows] = candidates[best, columns], reached[best, columns]
     return U
@@ -269,7 +248,7 @@ def _moves(U: Array, targets: Array, gains: Array) -> Array:
     rank = np.argsort(order, axis=1).reshape(U.shape)
     counts = [*(2**j for j in range(size.bit_length()) if 2**j < size), size]
     whole = [np.where(rank < count, targets, U) for count in counts]
-    return np.stack([*whole, *(U + share * (targets - U) for share in _PARTIAL)])
+    return np.stack([*whole, *(U + share * (targets - U) for share in 0.5 ** np.arange(1, 7))])
 
 
 def _by_gradient(pair: _Pair, U: Array, objective: _Objective, rows: Rows) -> tuple[Array, Array]:
@@ -282,18 +261,14 @@ def _by_gradient(pair: _Pair, U: Array, objective: _Objective, rows: Rows) -> tu
 def _by_trial(pair: _Pair, U: Array, objective: _Objective, rows: Rows) -> tuple[Array, Array]:
     """Propose the opposite bound, with the true gain of each single switch."""
     targets = -np.copysign(pair.bound, U)
-    step = max(1, _ROLLOUTS // U[0].size)
-    gains = [
-        _trial_gains(pair, U[i : i + step], targets[i : i + step], objective, rows[i : i + step])
-        for i in range(0, len(U), step)
-    ]
+    step = max(1, 4096 // U[0].size)  # rollouts in one batch
+    gains = []
+    for i in range(0, len(U), step):
+        batch, some = U[i : i + step], rows[i : i + step]
+        flat = batch.reshape(len(batch), -1)
+        entries = np.arange(flat.shape[1])
+        trials = np.repeat(flat[None], len(entries), axis=0)
+        trials[entries, :, entries] = targets[i : i + step].reshape(flat.shape).T
+        switched = objective.value(pair.gap(trials.reshape(-1, *batch.shape)), some)
+        gains.append((switched - objective.value(pair.gap(batch), some)).T.reshape(batch.shape))
     return targets, np.concatenate(gains)
-
-
-def _trial_gains(pair: _Pair, U: Array, targets: Array, objective: _Objective, rows: Rows) -> Array:
-    flat = U.reshape(len(U), -1)
-    entries = np.arange(flat.shape[1])
-    trials = np.repeat(flat[None], len(entries), axis=0)
-    trials[entries, :, entries] = targets.reshape(flat.shape).T
-    values = objective.value(pair.gap(trials.reshape(-1, *U.shape)), rows) - objective.value(pair.gap(U), rows)
-    return np.asarray(values.T.reshape(U.shape))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,72 +23,62 @@ from ctxval.reproduce.study import (
     Claim,
     Columns,
     Scale,
+    Study,
     agreement,
-    new_figure,
+    draw_quartiles,
     ranged,
     running_estimate,
     spread,
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 SHOWN = 0
 """The seed of figures that show a single trial."""
 
 _BUDGET = 100
-_COMMON = 5
-"""Number of common first samples."""
-_NEAR = 2.5
-"""Per cent of d*: the paper says of SC that it is so near after 60 samples."""
+_COMMON = 5  # number of common first samples
+_NEAR = 2.5  # per cent of d*: the paper says of SC that it is so near after 60 samples
 
 
-class Frameworks:
+class FourFrameworks(Study):
     """The paper's Fig. 1: the distance in each framework over the goal angle."""
 
     name = "frameworks"
     title = "Pendulum: four frameworks"
     case = "pendulum"
+    axes = "goal angle [rad]", "distance between M and S [rad, rad/s]\n(below 0.001 drawn at 0.001)"
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one run for each trial, and the profile of each trial with biased data."""
         seeds = range(scale.trials)
         return [Job("frameworks", "pendulum", seed, budget=scale.of(1001)) for seed in seeds] + [
             Job("profile", "pendulum", seed, (("variant", "biased"),), budget=scale.of(1001)) for seed in seeds
         ]
 
-    def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return a figure of the four profiles of the first trial."""
-        found = results[self.jobs(scale)[SHOWN]]
-        goals = np.array(found["goals"])
-        figure = new_figure()
-        axes = figure.add_subplot()
+    def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
+        """Draw the four profiles of the first trial."""
+        profile = results[self.jobs(scale)[SHOWN]]
+        goals = np.array(profile["goals"])
         for label, values, colour, line in (
-            ("OLDT: open loop, trajectories", np.full(len(goals), found["oldt"][0]), GREEN, "-."),
-            ("OLCD: open loop, final states", np.full(len(goals), found["olcd"][0]), PINK, ":"),
-            ("CCDT: closed loop, trajectories", found["ccdt"], ORANGE, "--"),
-            ("CuSTOM: closed loop, final states", found["custom"], BLUE, "-"),
+            ("OLDT: open loop, trajectories", np.full(len(goals), profile["oldt"][0]), GREEN, "-."),
+            ("OLCD: open loop, final states", np.full(len(goals), profile["olcd"][0]), PINK, ":"),
+            ("CCDT: closed loop, trajectories", profile["ccdt"], ORANGE, "--"),
+            ("CuSTOM: closed loop, final states", profile["custom"], BLUE, "-"),
         ):
             axes.semilogy(goals, np.maximum(values, 1e-3), color=colour, linestyle=line, linewidth=1.8, label=label)
-        axes.set_xlabel("goal angle [rad]")
-        axes.set_ylabel("distance between M and S [rad, rad/s]\n(below 0.001 drawn at 0.001)")
-        axes.grid(alpha=0.25)
-        figure.legend(loc="outside upper center", ncols=2, fontsize=8)
-        return figure
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return the profiles of the first trial."""
         found = results[self.jobs(scale)[SHOWN]]
         count = len(found["goals"])
         flat = [[found["oldt"][0]] * count, [found["olcd"][0]] * count]
-        return Columns(
-            ["goal_rad", "oldt", "olcd", "ccdt", "custom"], [found["goals"], *flat, found["ccdt"], found["custom"]]
-        )
+        names = ["goal_rad", "oldt", "olcd", "ccdt", "custom"]
+        return Columns(names, [found["goals"], *flat, found["ccdt"], found["custom"]])
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return the paper's claims about the profiles, with the measured numbers."""
-        found = [results[job] for job in self.jobs(scale)]
-        trials, biased = found[: scale.trials], found[scale.trials :]
+        stored = [results[job] for job in self.jobs(scale)]
+        trials, biased = stored[: scale.trials], stored[scale.trials :]
         profiles = [(np.array(trial["goals"]), np.array(trial["custom"])) for trial in trials]
         of_half = [(np.array(trial["points"]), np.array(trial["distances"])) for trial in biased]
         return [
@@ -101,11 +91,7 @@ class Frameworks:
         ]
 
 
-_Profiles = list[tuple[Array, Array]]
-"""Goals and distances of each trial."""
-
-
-def _worst_goal(paper: str, profiles: _Profiles) -> Claim:
+def _worst_goal(paper: str, profiles: list[tuple[Array, Array]]) -> Claim:
     size = [float(distances.max()) for _, distances in profiles]
     place = [abs(float(goals[distances.argmax()])) for goals, distances in profiles]
     right = [abs(spread(size)[0] - 0.3) < 0.1, abs(spread(place)[0] - 2) < 0.1]
@@ -118,7 +104,7 @@ def _worst_goal(paper: str, profiles: _Profiles) -> Claim:
     )
 
 
-def _two_regions(paper: str, profiles: _Profiles) -> Claim:
+def _two_regions(paper: str, profiles: list[tuple[Array, Array]]) -> Claim:
     lower, places = [], []
     for goals, distances in profiles:
         left, right = goals < 0, goals > 0
@@ -137,18 +123,18 @@ def _two_regions(paper: str, profiles: _Profiles) -> Claim:
 
 
 def _ccdt_maximum(trials: list[Result]) -> Claim:
-    goals = [found["goals"][int(np.argmax(found["ccdt"]))] for found in trials]
+    goals = [trial["goals"][int(np.argmax(trial["ccdt"]))] for trial in trials]
     return Claim(
         f"CCDT is largest near a goal of {PAPERS_GOAL} rad",
-        f"largest at {ranged(goals, 2)} rad, where it is {ranged([max(found['ccdt']) for found in trials], 2)}",
+        f"largest at {ranged(goals, 2)} rad, where it is {ranged([max(trial['ccdt']) for trial in trials], 2)}",
         agreement(max(abs(goal - PAPERS_GOAL) for goal in goals) < 0.1),
     )
 
 
 def _open_loop_is_higher(trials: list[Result]) -> Claim:
-    oldt, olcd = ([found[name][0] for found in trials] for name in ("oldt", "olcd"))
+    oldt, olcd = ([trial[name][0] for trial in trials] for name in ("oldt", "olcd"))
     over = [min(o / max(f["ccdt"]), c / max(f["custom"])) for o, c, f in zip(oldt, olcd, trials, strict=True)]
-    gaps = [100 * (1 - np.median(found[name]) / found[name][0]) for found in trials for name in ("oldt", "olcd")]
+    gaps = [100 * (1 - np.median(trial[name]) / trial[name][0]) for trial in trials for name in ("oldt", "olcd")]
     return Claim(
         "OLDT and OLCD are flat, and much higher than CCDT and CuSTOM",
         f"OLDT {spread(oldt)[0]:.1f}, OLCD {spread(olcd)[0]:.1f} with |u| <= {trials[0]['bound']:g} N m, a bound of "
@@ -158,7 +144,7 @@ def _open_loop_is_higher(trials: list[Result]) -> Claim:
     )
 
 
-class Trajectories:
+class Trajectories(Study):
     """The paper's Fig. 2: the closed loops of M and S at the paper's goal with the largest CCDT distance."""
 
     name = "trajectories"
@@ -166,7 +152,6 @@ class Trajectories:
     case = "pendulum"
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one run for each trial."""
         return [Job("loops", "pendulum", seed) for seed in range(scale.trials)]
 
     def _loops(self) -> tuple[Trajectory, Trajectory]:
@@ -174,20 +159,17 @@ class Trajectories:
         return closed_loops(validation, validation.task(validation.space.parameters([PAPERS_GOAL])))
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return a figure of the trajectories of M and S."""
         model, system = self._loops()
         figure = plot.trajectories(model, system, states=("angle [rad]", "rate [rad/s]"), inputs=("torque [N m]",))
         figure.suptitle(f"goal {PAPERS_GOAL} rad", fontsize=10)
         return figure
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return both trajectories."""
         model, system = self._loops()
         names = ["t_s", "model_angle_rad", "model_rate_rad_per_s", "system_angle_rad", "system_rate_rad_per_s"]
         return Columns(names, [model.times.tolist(), *model.states.T.tolist(), *system.states.T.tolist()])
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return the paper's claims about the trajectories, with the measured numbers."""
         trials = [results[job] for job in self.jobs(scale)]
         names = ("apart", "end", "model_undershoot", "system_undershoot")
         apart, end, model, system = ([trial[name] for trial in trials] for name in names)
@@ -209,56 +191,42 @@ class Trajectories:
         ]
 
 
-class Techniques:
+class Techniques(Study):
     """The paper's Fig. 3: the error of the estimated d* against samples, for the three techniques."""
 
     name = "techniques"
     title = "Pendulum: three techniques"
     case = "pendulum"
+    axes = (
+        "executions of S",
+        "error of the estimated d* [%], median and quartiles\n(below 0.001 % drawn at 0.001 %)",
+    )
+    legend = 3
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one campaign for each technique and trial, those of informed searches, and the truths."""
         seeds, names = range(scale.trials), (*TECHNIQUES, *INFORMED)
         searches = [Job("search", "pendulum", seed, search=name, budget=_BUDGET) for name in names for seed in seeds]
-        return [
-            *searches,
-            *(Job("truth", "pendulum", seed) for seed in seeds),
-            *Frameworks().jobs(scale)[: scale.trials],
-        ]
+        truths = [Job("truth", "pendulum", seed) for seed in seeds]
+        return [*searches, *truths, *FourFrameworks().jobs(scale)[: scale.trials]]
 
     def errors(self, results: Results, scale: Scale, search: str) -> Array:
         """Return the errors in per cent, shape ``(trials, budget)``."""
         rows = []
         for seed in range(scale.trials):
             truth = results[Job("truth", "pendulum", seed)]["distance"]
-            found = distances_of(results[Job("search", "pendulum", seed, search=search, budget=_BUDGET)])
-            rows.append(100 * (1 - running_estimate(found, search) / truth))
+            distances = distances_of(results[Job("search", "pendulum", seed, search=search, budget=_BUDGET)])
+            rows.append(100 * (1 - running_estimate(distances, search) / truth))
         return np.array(rows)
 
-    def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return a figure of the median errors with their quartiles."""
-        figure = new_figure()
-        axes = figure.add_subplot()
-        counts = np.arange(1, _BUDGET + 1)
-        for search, (label, colour, line, marker) in TECHNIQUES.items():
-            errors = np.maximum(self.errors(results, scale, search), 1e-3)
-            low, median, high = np.percentile(errors, [25, 50, 75], axis=0)
-            axes.fill_between(counts, low, high, color=colour, alpha=0.2, linewidth=0)
-            axes.semilogy(
-                counts, median, color=colour, linestyle=line, marker=marker, markevery=10, markersize=5, label=label
-            )
+    def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
+        draw_quartiles(axes, {name: np.maximum(self.errors(results, scale, name), 1e-3) for name in TECHNIQUES})
+        axes.set_yscale("log")
         axes.axvline(5.5, color=GREY, linewidth=1)
         axes.annotate("five common first samples", (5.7, 60), fontsize=7, color=BLACK)
         axes.axhline(1, color=GREY, linewidth=0.8, linestyle=":")
-        axes.set_xlabel("executions of S")
-        axes.set_ylabel("error of the estimated d* [%], median and quartiles\n(below 0.001 % drawn at 0.001 %)")
         axes.set_ylim(1e-3, 110)
-        axes.grid(alpha=0.25)
-        figure.legend(loc="outside upper center", ncols=3, fontsize=8)
-        return figure
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return medians and quartiles."""
         names, values = ["executions"], [list(range(1, _BUDGET + 1))]
         for search in TECHNIQUES:
             quartiles = np.percentile(self.errors(results, scale, search), [25, 50, 75], axis=0)
@@ -267,7 +235,6 @@ class Techniques:
         return Columns(names, values)
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return the paper's claims about the three techniques and about priors, with the measured numbers."""
         names = (*TECHNIQUES, *INFORMED)
         errors = {name: self.errors(results, scale, name) for name in names}
         ucb, sc, sd = (np.median(errors[name], axis=0) for name in TECHNIQUES)
@@ -275,7 +242,9 @@ class Techniques:
         median = {name: spread(counts)[0] for name, counts in within.items()}
         beyond = {name: ranged(counts, 1).replace(".0", "") for name, counts in within.items()}
         near = _first(sc <= _NEAR)
-        found = int((errors["random"][:, -1] <= ucb[19]).sum())
+        as_near = int((errors["random"][:, -1] <= ucb[19]).sum())
+        profiles = [results[job]["custom"] for job in FourFrameworks().jobs(scale)[: scale.trials]]
+        broad = 100 * np.median([np.mean(np.array(d) >= (1 - _NEAR / 100) * max(d)) for d in profiles])
         return [
             Claim(
                 "CuSTOM is within 1 % after 3 samples beyond five common first ones, and at 0 % by 20",
@@ -286,12 +255,12 @@ class Techniques:
                 f"SC is within {_NEAR} % only after 60 samples",
                 f"within {_NEAR} % after {near:g}; median error {sc[19]:.2f} % at 20, {sc[59]:.2f} % at 60",
                 agreement(30 <= near <= 90, near > median["gp-ucb"] + _COMMON),
-                f"random samples fall near a broad maximum sooner: {self._broad(results, scale):.1f} % of the goals "
+                f"random samples fall near a broad maximum sooner: {broad:.1f} % of the goals "
                 f"are within {_NEAR} % of d*",
             ),
             Claim(
                 "SC does not find the maximum even in 100 samples",
-                f"median error {sc[99]:.4f} % at 100; {found} of {scale.trials} trials are as near as CuSTOM at 20",
+                f"median error {sc[99]:.4f} % at 100; {as_near} of {scale.trials} trials are as near as CuSTOM at 20",
                 agreement(sc[99] > ucb[19]),
             ),
             Claim(
@@ -319,59 +288,43 @@ class Techniques:
             ),
         ]
 
-    def _broad(self, results: Results, scale: Scale) -> float:
-        """Return how many of the goals are within the percentage of d* that the paper calls near, in per cent."""
-        profiles = [results[job] for job in Frameworks().jobs(scale)[: scale.trials]]
-        shares = [np.mean(np.array(one["custom"]) >= (1 - _NEAR / 100) * max(one["custom"])) for one in profiles]
-        return 100 * float(np.median(shares))
-
 
 def _first(reached: Mask) -> float:
     """Return the number of the first execution at which something is reached; infinity for never."""
     return float(np.argmax(reached) + 1) if reached.any() else np.inf
 
 
-class ConvergedGP:
+class ConvergedGP(Study):
     """The paper's Fig. 4: the converged GP over the true distance."""
 
     name = "converged-gp"
     title = "Pendulum: converged GP"
     case = "pendulum"
+    axes = "goal angle [rad]", "distance [rad]"
+    legend = 3
 
     campaign = Job("search", "pendulum", SHOWN, search="gp-ucb", budget=25)
     curve = Job("profile", "pendulum", SHOWN, budget=801)
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one campaign and the true profile."""
         return [self.campaign, self.curve]
 
-    def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return a figure of the GP with its band, the truth, the samples and the maximum."""
+    def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
+        """Draw the GP with its band, the truth, the samples and the maximum."""
         x, y = np.ravel(results[self.campaign]["points"]), np.array(results[self.campaign]["distances"])
-        columns = self.data(results, scale)
-        goals, truth, mean, deviation = (np.array(column) for column in columns.values)
-        figure = new_figure()
-        axes = figure.add_subplot()
-        band = 1.96 * deviation
-        axes.fill_between(
-            goals, mean - band, mean + band, color=GREY, alpha=0.5, linewidth=0, label="95 % band of the GP"
-        )
+        goals, truth, mean, deviation = (np.array(column) for column in self.data(results, scale).values)
+        low, high = mean - 1.96 * deviation, mean + 1.96 * deviation
+        axes.fill_between(goals, low, high, color=GREY, alpha=0.5, linewidth=0, label="95 % band of the GP")
         axes.plot(goals, mean, color=BLUE, linewidth=1.8, label="GP mean")
         axes.plot(goals, truth, color="#D55E00", linestyle="--", linewidth=1.6, label="true distance")
-        axes.plot(
-            x[:5], y[:5], "o", markerfacecolor="white", markeredgecolor=BLACK, markersize=5, label="first samples"
-        )
-        axes.plot(x[5:], y[5:], "o", color=BLACK, markersize=5, label="acquired samples")
-        axes.plot(
-            x[y.argmax()], y.max(), "*", color=ORANGE, markeredgecolor=BLACK, markersize=14, label="maximum found"
-        )
-        axes.set_xlabel("goal angle [rad]")
-        axes.set_ylabel("distance [rad]")
-        figure.legend(loc="outside upper center", ncols=3, fontsize=8)
-        return figure
+        marks: dict[str, Any] = {"marker": "o", "linestyle": "", "markeredgecolor": BLACK, "markersize": 5}
+        axes.plot(x[:5], y[:5], **marks, color="white", label="first samples")
+        axes.plot(x[5:], y[5:], **marks, color=BLACK, label="acquired samples")
+        best = y.argmax()
+        axes.plot(x[best], y[best], "*", color=ORANGE, markeredgecolor=BLACK, markersize=14, label="maximum found")
+        axes.grid(False)
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return truth, mean and standard deviation over the goals."""
         found, curve = results[self.campaign], results[self.curve]
         space = cases.by_name("pendulum", SHOWN).validation.space
         surrogate = fit_surrogate(space.to_unit(np.array(found["points"])), np.array(found["distances"]))
@@ -380,7 +333,6 @@ class ConvergedGP:
         return Columns(names, [curve["points"], curve["distances"], mean.tolist(), deviation.tolist()])
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        """Return the paper's claim about the converged GP, with the measured numbers."""
         goals, truth, mean, deviation = (np.array(column) for column in self.data(results, scale).values)
         inside = np.abs(truth - mean) <= 1.96 * deviation + 1e-9
         near = np.abs(goals - goals[truth.argmax()]) < 0.3

@@ -37,8 +37,8 @@ def libraries() -> str:
     """Return the versions of Python, numpy and scipy, and the linear algebra with the kernels that it chose."""
     pools = [pool for pool in threadpool_info() if pool["user_api"] == "blas"]
     blas = {f"{pool['internal_api']} {pool['version']} {pool.get('architecture', '')}".strip() for pool in pools}
-    own = [f"Python {platform.python_version()}", f"numpy {np.__version__}", f"scipy {scipy.__version__}"]
-    return ", ".join([*own, *sorted(blas)])
+    versions = [f"Python {platform.python_version()}", f"numpy {np.__version__}", f"scipy {scipy.__version__}"]
+    return ", ".join([*versions, *sorted(blas)])
 
 
 def provenance(folders: tuple[str, ...] = SEARCHES) -> dict[str, Any]:
@@ -57,6 +57,6 @@ def measured_with(results: Iterable[Mapping[str, Any]], folders: tuple[str, ...]
         "before their last change": before,
         "before results named their sources and libraries": without,
     }
-    said = "; ".join(f"{when}: {count:,}" for when, count in counts.items() if count)
+    measured = "; ".join(f"{when}: {count:,}" for when, count in counts.items() if count)
     used = sorted({result["libraries"] for result in known if "libraries" in result})
-    return f"Results measured {said}." + (f" Libraries: {'; '.join(used)}." if used else "")
+    return f"Results measured {measured}." + (f" Libraries: {'; '.join(used)}." if used else "")

@@ -1,17 +1,18 @@
-"""The contract of a study of one figure, with its jobs, picture, data and claims, and helpers for all studies."""
+"""A study of one figure, with its jobs, picture, data and claims, and the figures that several studies share."""
 
 from __future__ import annotations
 
 import csv
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.reproduce.jobs import DISCARDED, Job, Results
+from ctxval.reproduce.jobs import DISCARDED, Job, Results, distances_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -90,31 +91,131 @@ class Columns:
             writer.writerows(zip(*self.values, strict=True))
 
 
-class Study(Protocol):
-    """One figure of the paper."""
+class Study(ABC):
+    """One figure of the paper.
+
+    Attributes:
+        name: its name on the command line, and the name of its files.
+        title: its title.
+        case: the case that it runs on.
+        axes: the labels of the two axes.
+        legend: the number of columns of the legend.
+    """
 
     name: str
     title: str
     case: str
+    axes: tuple[str, str] = ("executions of S", "")
+    legend = 2
 
+    @abstractmethod
     def jobs(self, scale: Scale) -> list[Job]:
         """Return the jobs whose results the study needs."""
 
-    def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the figure."""
+    def fill(self, axes: Axes, results: Results, scale: Scale) -> None:  # noqa: B027, if draw is another one
+        """Draw the results into the axes of the figure."""
 
+    @abstractmethod
     def data(self, results: Results, scale: Scale) -> Columns:
         """Return the numbers that the figure shows."""
 
+    @abstractmethod
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
         """Return the paper's claims about the figure, with the measured numbers."""
 
+    def draw(self, results: Results, scale: Scale) -> Figure:
+        """Return the figure."""
+        from matplotlib.figure import Figure  # imported here, because only figures need it
 
-def new_figure(width: float = 6.4, height: float = 4.2) -> Figure:
-    """Return an empty figure."""
-    from matplotlib.figure import Figure  # imported here, because only figures need it
+        figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+        axes = figure.add_subplot()
+        axes.set_xlabel(self.axes[0])
+        axes.set_ylabel(self.axes[1])
+        axes.grid(alpha=0.25)
+        self.fill(axes, results, scale)
+        figure.legend(loc="outside upper center", ncols=self.legend, fontsize=8)
+        return figure
 
-    return Figure(figsize=(width, height), layout="constrained")
+
+class Place(NamedTuple):
+    """A place on the horizontal axis: its value, the options of the case, and how near to d* the estimate must be."""
+
+    x: float
+    options: tuple[tuple[str, Any], ...]
+    percent: float
+
+
+class ExecutionsWithin(Study):
+    """Executions until the estimate is within some per cent of d*, for each technique and place.
+
+    Attributes:
+        column: the name of the places in the data.
+        places: the places on the horizontal axis.
+        dodge: the horizontal distance between the triangles of two techniques.
+    """
+
+    column: str
+    places: tuple[Place, ...]
+    dodge: float
+
+    @abstractmethod
+    def budget(self, search: str, scale: Scale) -> int:
+        """Return the number of executions of a technique."""
+
+    def jobs(self, scale: Scale) -> list[Job]:
+        """Return one campaign for each technique, set of options and trial, and the truths."""
+        runs = [
+            (options, seed)
+            for options in dict.fromkeys(place.options for place in self.places)
+            for seed in range(scale.trials)
+        ]
+        searches = [self._job(search, *run, scale) for search in ("gp-ucb", "random") for run in runs]
+        return searches + [Job("truth", self.case, seed, options) for options, seed in runs]
+
+    def _job(self, search: str, options: tuple[tuple[str, Any], ...], seed: int, scale: Scale) -> Job:
+        ran = "gp-ucb" if search == "gp-ucb" else "random"  # SD uses the same samples as SC, so one run serves both
+        return Job("search", self.case, seed, options, ran, self.budget(search, scale))
+
+    def executions(self, results: Results, scale: Scale, search: str) -> Array:
+        """Return the numbers of executions, shape ``(places, trials)``; infinity if the estimate never gets there."""
+        counts = np.empty((len(self.places), scale.trials))
+        for i, seed in np.ndindex(counts.shape):
+            options = self.places[i].options
+            truth = results[Job("truth", self.case, seed, options)]["distance"]
+            distances = distances_of(results[self._job(search, options, seed, scale)])
+            counts[i, seed] = executions_within(distances, search, truth, self.places[i].percent)
+        return counts
+
+    def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
+        """Draw the medians; an open triangle at the budget means that the median never gets there."""
+        x = np.array([place.x for place in self.places])
+        for i, (search, (label, colour, line, marker)) in enumerate(TECHNIQUES.items()):
+            medians = np.array([spread(row)[0] for row in self.executions(results, scale, search)])
+            never = np.isinf(medians)
+            axes.semilogy(x[~never], medians[~never], color=colour, linestyle=line, marker=marker, label=label)
+            at = np.full(int(never.sum()), self.budget(search, scale))
+            axes.semilogy(x[never] + (i - 1) * self.dodge, at, "^", color=colour, markersize=8, fillstyle="none")
+        axes.plot([], [], "^", color=BLACK, fillstyle="none", label="not within the budget")
+
+    def data(self, results: Results, scale: Scale) -> Columns:
+        """Return median, smallest and largest value for each technique and place."""
+        names = [self.column]
+        values = [[place.x for place in self.places]]
+        for search in TECHNIQUES:
+            spreads = np.array([spread(row) for row in self.executions(results, scale, search)])
+            names += [f"{search}_{part}" for part in ("median", "min", "max")]
+            values += spreads.T.tolist()
+        return Columns(names, values)
+
+
+def draw_quartiles(axes: Axes, rows: dict[str, Array]) -> None:
+    """Draw the median and the quartiles of each technique over the executions, from rows ``(trials, budget)``."""
+    for search, (label, colour, line, marker) in TECHNIQUES.items():
+        low, median, high = np.percentile(rows[search], [25, 50, 75], axis=0)
+        counts = np.arange(1, len(median) + 1)
+        every = max(1, len(median) // 10)
+        axes.fill_between(counts, low, high, color=colour, alpha=0.2, linewidth=0)
+        axes.plot(counts, median, color=colour, linestyle=line, marker=marker, markevery=every, label=label)
 
 
 def running_estimate(distances: Sequence[float] | Array, search: str) -> Array:
@@ -149,21 +250,6 @@ def ranged(values: Sequence[float] | Array, digits: int) -> str:
     """Return the median of values with their range, as text with so many decimals."""
     median, low, high = (f"{value:.{digits}f}" for value in spread(values))
     return f"{median} (from {low} to {high})"
-
-
-def draw_executions(axes: Axes, x: Array, medians: dict[str, Array], budgets: dict[str, int], dodge: float) -> None:
-    """Draw the median executions of each technique; an open triangle at the budget stands for never.
-
-    ``dodge`` is the horizontal distance between the triangles of two techniques.
-    """
-    for i, (search, (label, colour, line, marker)) in enumerate(TECHNIQUES.items()):
-        never = np.isinf(medians[search])
-        known = medians[search][~never]
-        axes.semilogy(x[~never], known, color=colour, linestyle=line, marker=marker, label=label)
-        at = np.full(int(never.sum()), budgets[search])
-        axes.semilogy(x[never] + (i - 1) * dodge, at, "^", color=colour, markersize=8, fillstyle="none")
-    axes.plot([], [], "^", color=BLACK, fillstyle="none", label="not within the budget")
-    axes.grid(alpha=0.25)
 
 
 def counted(value: float, budget: int) -> str:

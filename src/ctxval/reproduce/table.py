@@ -12,15 +12,8 @@ from ctxval.reproduce.revision import measured_with
 from ctxval.reproduce.study import Scale, Study
 
 
-def write_table(out: Path, studies: Sequence[Study], results: Results, scale: Scale) -> Path:
-    """Write ``<out>.md`` with the claims, the figures and every free parameter; return its path."""
-    path = out.with_name(f"{out.name}.md")
-    path.write_text(table_text(out, studies, results, scale))
-    return path
-
-
 def table_text(out: Path, studies: Sequence[Study], results: Results, scale: Scale) -> str:
-    """Return the text of ``<out>.md``."""
+    """Return the text of ``<out>.md``: the claims, the figures and every free parameter."""
     jobs = dict.fromkeys(job for study in studies for job in study.jobs(scale))
     searches = [job for job in jobs if job.kind == "search"]
     lines = [

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections import Counter
+from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
@@ -21,13 +22,7 @@ _NASA, _V10, _V20 = "NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry of the appendix.
-
-    Attributes:
-        term: the term of the standard.
-        standard: the standards that use it.
-        content: what this campaign has to say about it, in sentences.
-    """
+    """One entry of the appendix."""
 
     term: str
     standard: str
@@ -41,7 +36,7 @@ class AppendixSection(ShortRepr):
 
     def render(self, context: ReportContext) -> Markup:
         """Return the entries as a table."""
-        rows = [(one.term, text(one.content, UNCUT), one.standard) for one in appendix(context)]
+        rows = [(entry.term, text(entry.content, UNCUT), entry.standard) for entry in appendix(context)]
         return joined(
             [
                 paragraph(
@@ -55,7 +50,9 @@ class AppendixSection(ShortRepr):
 
 def appendix(context: ReportContext) -> list[Entry]:
     """Return the entries of the appendix."""
-    changes = [f"{one.at[:19]} {one.what}: {one.why}" for one in context.changes]
+    changes = [f"{change.at[:19]} {change.what}: {change.why}" for change in context.changes]
+    certificate = context.certificate
+    assumptions = "None beyond the recorded executions" if certificate is None else "; ".join(certificate.assumptions)
     return [
         Entry("Intended use", f"{_NASA}, {_V10}", _intended_use(context)),
         Entry("Response quantity of interest and validation metric", f"{_V10}, {_V20}", _metric(context)),
@@ -65,18 +62,18 @@ def appendix(context: ReportContext) -> list[Entry]:
         Entry("Domain of validation, and what lies outside it", f"{_NASA}, {_V10}, {_V20}", _domain(context)),
         Entry("Uncertainty characterization", f"{_NASA}, {_V10}, {_V20}", _uncertainty(context)),
         Entry("Results robustness (sensitivity)", _NASA, _robustness(context)),
-        Entry("Assumptions", f"{_NASA}, {_V10}", _assumptions(context)),
+        Entry("Assumptions", f"{_NASA}, {_V10}", f"{assumptions}."),
         Entry("Limits of the assessment: what was not tested", f"{_NASA}, {_V10}", " ".join(not_tested(context))),
         Entry("Verification", f"{_NASA}, {_V10}", _verification(context)),
         Entry("Changes during the campaign", _NASA, "; ".join(changes) or "None is recorded."),
-        Entry("Provenance", _NASA, _provenance(context)),
+        Entry(
+            "Provenance",
+            _NASA,
+            f"Store {context.store.name}; ctxval {VERSION}; command: {command_of(context) or 'none'}; digest of the "
+            f"description of the model: {_part_digest(context, 'model')}.",
+        ),
         Entry("Conclusion", f"{_NASA}, {_V10}", str(context.verdict or "No verdict, because no threshold was stated.")),
     ]
-
-
-def appendix_json(context: ReportContext) -> list[dict[str, str]]:
-    """Return the entries of the appendix, ready for JSON."""
-    return [asdict(one) for one in appendix(context)]
 
 
 def _intended_use(context: ReportContext) -> str:
@@ -87,9 +84,8 @@ def _intended_use(context: ReportContext) -> str:
     )
     spread = context.provenance.distribution
     how = "uniform" if spread is None else spread
-    design = ""
-    if context.validation is not None:
-        design = f", with the synthesizer {type(context.validation.synthesizer).__name__}"
+    synthesizer = None if context.validation is None else type(context.validation.synthesizer).__name__
+    design = "" if synthesizer is None else f", with the synthesizer {synthesizer}"
     return (
         f"The model predicts closed loops under controllers that are designed on it{design}, for the tasks of "
         f"{context.name or 'this experiment'}: {ranges}. Distribution of tasks: {how}."
@@ -116,11 +112,8 @@ def _criterion(context: ReportContext) -> str:
 
 
 def _referent(context: ReportContext) -> str:
-    origins = {
-        origin: sum(trial.origin == origin for trial in context.trials)
-        for origin in sorted({t.origin for t in context.trials})
-    }
-    listed = ", ".join(f"{count} {origin}" for origin, count in origins.items())
+    origins = Counter(trial.origin for trial in context.trials)
+    listed = ", ".join(f"{count} {origin}" for origin, count in sorted(origins.items()))
     return (
         f"{context.executions} executions of the system in {len(context.trials)} trials ({listed or 'none'}), of which "
         f"{len(context.completed)} gave a distance and {len(context.recordings)} a recorded trajectory. Digest of the "
@@ -153,16 +146,17 @@ def _domain(context: ReportContext) -> str:
 
 
 def _uncertainty(context: ReportContext) -> str:
-    found = context.certificate
-    if found is None:
+    certificate = context.certificate
+    if certificate is None:
         return "No certificate was computed, so no uncertainty is stated for tasks that were not executed."
-    bound = with_error(found.upper_bound, found.error)
-    said = (
-        f"By the certificate {found.kind}, d* is at most {bound} with confidence {number(found.confidence)}"
-        f"{f', except for {at_most(100 * found.volume, 3)} % of the tasks' if found.volume else ''}. The uncertainty "
-        "of the measured trajectories themselves is not part of it."
+    bound = with_error(certificate.upper_bound, certificate.error)
+    except_for = f", except for {at_most(100 * certificate.volume, 3)} % of the tasks" if certificate.volume else ""
+    withdrawn = "" if certificate.doubt is None else f" The certificate is withdrawn: {certificate.doubt}."
+    return (
+        f"By the certificate {certificate.kind}, d* is at most {bound} with confidence "
+        f"{number(certificate.confidence)}{except_for}. The uncertainty of the measured trajectories themselves is not "
+        f"part of it.{withdrawn}"
     )
-    return f"{said} The certificate is withdrawn: {found.doubt}." if found.doubt is not None else said
 
 
 def _robustness(context: ReportContext) -> str:
@@ -174,23 +168,11 @@ def _robustness(context: ReportContext) -> str:
     return f"Total Sobol indices of the predicted distance, the largest first: {listed}."
 
 
-def _assumptions(context: ReportContext) -> str:
-    found = context.certificate
-    return "None beyond the recorded executions." if found is None else f"{'; '.join(found.assumptions)}."
-
-
 def _verification(context: ReportContext) -> str:
-    said = "; ".join(f"{one.name}: {WORDS[one.light]}" for one in diagnostics(context)) or "nothing is unusual"
+    lights = [f"{finding.name}: {WORDS[finding.light]}" for finding in diagnostics(context)]
     return (
         "Software and solution verification of the model itself are not part of this campaign. Diagnostics of the "
-        f"campaign: {said}."
-    )
-
-
-def _provenance(context: ReportContext) -> str:
-    return (
-        f"Store {context.store.name}; ctxval {VERSION}; command: {command_of(context) or 'none'}; digest of the "
-        f"description of the model: {_part_digest(context, 'model')}."
+        f"campaign: {'; '.join(lights) or 'nothing is unusual'}."
     )
 
 

@@ -33,12 +33,9 @@ def distances_in_order(context: ReportContext) -> Chart | None:
     so_far = np.maximum.accumulate(context.distances)
     last = float(max(trial.number for trial in context.trials))
     limits = [one for one in (context.threshold, context.bound) if one is not None]
-    beforehand = [(trial.number, one.median) for trial, one in stored_predictions(context)]
-    chart = Chart(
-        "Distance of each trial, and the largest one so far",
-        _trial_axis(last),
-        Axis.over(context.distance_label, context.distances, limits, zero=True),
-    )
+    beforehand = [(trial.number, prediction.median) for trial, prediction in stored_predictions(context)]
+    axes = _trial_axis(last), Axis.over(context.distance_label, context.distances, limits, zero=True)
+    chart = Chart("Distance of each trial, and the largest one so far", *axes)
     risen = np.flatnonzero(np.diff(so_far, prepend=-1.0) > 0)  # the line is the same without all other points
     steps = np.repeat(numbers[risen], 2)[1:], np.repeat(so_far[risen], 2)[:-1]
     chart.line(np.append(steps[0], last), np.append(steps[1], so_far[-1]), "best", "largest so far")
@@ -60,11 +57,8 @@ def _times(context: ReportContext) -> Chart | None:
     if not timed:
         return None
     numbers, seconds = np.array(timed, dtype=np.float64).T
-    chart = Chart(
-        "Time of each execution",
-        _trial_axis(float(numbers.max())),
-        Axis.over("time [s]", seconds, zero=True),
-    )
+    axes = _trial_axis(float(numbers.max())), Axis.over("time [s]", seconds, zero=True)
+    chart = Chart("Time of each execution", *axes)
     return chart.marks(numbers, seconds, "sample", "time of the execution")
 
 
@@ -75,11 +69,10 @@ def _trial_axis(last: float) -> Axis:
 def _spent(context: ReportContext) -> Markup | None:
     timed = [trial.seconds for trial in context.trials if trial.seconds is not None]
     attempts = sum(trial.attempts for trial in context.trials)
-    said = []
+    sentences = []
     if attempts > len(context.trials):
-        said.append(f"{attempts} attempts were made in {len(context.trials)} trials.")
+        sentences.append(f"{attempts} attempts were made in {len(context.trials)} trials.")
     if timed:
-        said.append(
-            f"The executions took {number(float(np.sum(timed)))} s, {number(float(np.median(timed)))} s in the median."
-        )
-    return paragraph(" ".join(said)) if said else None
+        total, median = number(float(np.sum(timed))), number(float(np.median(timed)))
+        sentences.append(f"The executions took {total} s, {median} s in the median.")
+    return paragraph(" ".join(sentences)) if sentences else None

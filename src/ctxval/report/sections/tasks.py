@@ -11,27 +11,21 @@ from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import ShortRepr
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, Kind, colour_scale, small_charts
-from ctxval.report.context import ReportContext
+from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.diagnostics import stored_predictions
 from ctxval.report.distance_model import Band, DistanceModel
 from ctxval.report.markup import bar, element, heading, joined, number, paragraph, percent, table
-from ctxval.report.parallel import parallel_coordinates
-from ctxval.report.region import region_map
 
-_CURVE, _GRID = 121, 32
-"""Number of points of a curve, and of each side of a map."""
-
-_SLOW_CURVE = 31
-"""Number of points of a curve, if each needs the design of a controller that cannot be made in a batch."""
-
-_SLICES = 12
-"""Largest number of slices: of the parameters to which the distance is most sensitive."""
+_CURVE, _GRID = 121, 32  # number of points of a curve, and of each side of a map
 
 _ORIGINS: tuple[tuple[Kind, str, tuple[str, ...]], ...] = (
     ("initial", "initial or chosen by a person", ("iid", "initial", "manual")),
     ("covering", "chosen to decide the verdict", ("covering",)),
     ("sample", "chosen by the search", ("acquisition",)),
 )
+
+Place = Callable[[Sequence[Trial]], tuple[Array, Array]]
+"""A function from trials to the positions of their marks in a chart."""
 
 
 class TasksSection(ShortRepr):
@@ -49,36 +43,30 @@ class TasksSection(ShortRepr):
         else:
             second = element("div", _sensitivity(context, model), _predicted(context, model), class_="charts")
             parts = [_space_charts(context, model), second]
-        mapped = region_map(context)
+        mapped = _region(context)
         if mapped is not None:
             parts += [heading("Where the threshold is kept"), mapped]
         return joined(parts)
 
 
-def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:
-    d = context.space.dimension
-    said = paragraph("Lines, bands and maps are pictures of what the trials suggest, and no certificate.")
-    if d == 2:
-        both = (_slice(context, axis) for axis in range(2))
-        return joined([said, element("div", _map(context, model), *both, class_="charts")])
-    axes = [int(j) for j in np.argsort(-model.sensitivity, kind="stable")[:_SLICES]]
-    if d > len(axes):
-        said += paragraph(f"{d - len(axes)} parameters with less influence have no slice here.")
-    slices = filter(None, (_slice(context, axis, small=True) for axis in axes))
-    return joined(
-        [
-            said,
-            heading("Slices through the worst task"),
-            small_charts(list(slices)),
-            heading("All tasks at once"),
-            parallel_coordinates(context),
-        ]
-    )
-
-
 def distance_over_task(context: ReportContext) -> Chart | None:
     """Return the distance over the only parameter with the executed tasks; None if too few distances are known."""
     return _slice(context, 0) if context.worst_first else None
+
+
+def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:
+    d = context.space.dimension
+    note = paragraph("Lines, bands and maps are pictures of what the trials suggest, and no certificate.")
+    if d == 2:
+        values = (_estimated(context, _grid_of_tasks()) or model.predict(_grid_of_tasks())).median
+        drawn = _map(context, "Map of the distance over the two parameters, with the executed tasks", values)
+        return joined([note, element("div", drawn, *(_slice(context, axis) for axis in range(2)), class_="charts")])
+    axes = [int(j) for j in np.argsort(-model.sensitivity, kind="stable")[:12]]
+    if d > len(axes):
+        note += paragraph(f"{d - len(axes)} parameters with less influence have no slice here.")
+    slices = filter(None, (_slice(context, axis, small=True) for axis in axes))
+    parts = heading("Slices through the worst task"), small_charts(list(slices))
+    return joined([note, *parts, heading("All tasks at once"), _parallel_coordinates(context)])
 
 
 def _estimated(context: ReportContext, unit: Array) -> Band | None:
@@ -92,7 +80,8 @@ def _estimated(context: ReportContext, unit: Array) -> Band | None:
 def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart | None:
     """Return the distance along one parameter, through the worst executed task; None if it cannot be estimated."""
     space, worst = context.space, context.worst_first[0]
-    count = _CURVE if context.batched or context.validation is None else _SLOW_CURVE
+    # Designs that cannot be made in a batch take long.
+    count = _CURVE if context.batched or context.validation is None else 31
     unit = np.tile(worst.unit_point, (count, 1))
     unit[:, axis] = np.linspace(0, 1, count)
     x, band = space.from_unit(unit)[:, axis], _estimated(context, unit)
@@ -107,46 +96,51 @@ def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart |
     else:
         chart.band(x, band.low, band.high, "95 % band").line(x, band.median, "mean", "Gaussian process of the distance")
     chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
+
+    def place(trials: Sequence[Trial]) -> tuple[Array, Array]:
+        distances = [0.03 * chart.y.ends[1] if trial.distance is None else trial.distance for trial in trials]
+        return context.coordinates(trials)[:, axis], np.array(distances)
+
     if space.dimension == 1:
-        _add_samples(chart, context, lambda trials: (context.coordinates(trials)[:, axis], _distances(trials)))
-        _add_failed(chart, context, axis)
-    at = context.coordinates([worst])[:, axis]
-    return chart.marks(at, _distances([worst]), "worst", "worst executed task", [_named(worst)])
+        _add_samples(chart, context, place)
+        _mark(chart, place, context.failed, "failed", "no distance is known")
+    _mark(chart, place, [worst], "worst", "worst executed task")
+    return chart
 
 
 def _distance_axis(context: ReportContext, band: Band) -> Axis:
     limits = [one for one in (context.threshold, context.bound) if one is not None]
     # A threshold far above all distances would flatten the curve, so it may lie outside.
     top = 3 * max(float(context.distances.max()), float(np.nanmax(band.median)))
-    shown = [one for one in limits if one <= top or top == 0]
+    shown = [value for value in limits if value <= top or top == 0]
     high = np.minimum(band.high, max(top, *shown, 1e-300))
     return Axis.over(context.distance_label, context.distances, high, shown, zero=True)
 
 
-def _map(context: ReportContext, model: DistanceModel) -> Markup:
-    """Return the map of two parameters, with the executed tasks."""
-    space = context.space
+def _grid_of_tasks() -> Array:
+    """Return the tasks of a map, points of the unit cube ``(_GRID**2, 2)``."""
     side = np.linspace(0, 1, _GRID)
-    unit = np.stack(np.meshgrid(side, side, indexing="xy"), axis=-1).reshape(-1, 2)
-    found = _estimated(context, unit) or model.predict(unit)
-    values = np.nan_to_num(found.median, nan=float(context.distances.max())).reshape(_GRID, _GRID)
-    low, high = 0.0, max(float(values.max()), float(context.distances.max()))
+    return np.stack(np.meshgrid(side, side, indexing="xy"), axis=-1).reshape(-1, 2)
+
+
+def _map(context: ReportContext, title: str, values: Array, label: str = "") -> Markup:
+    """Return a map of values on the grid of tasks, with the edge of the threshold and the executed tasks."""
+    space, tau, largest = context.space, context.threshold, float(context.distances.max())
+    values = np.nan_to_num(values, nan=np.nanmax(values) if label else largest)
+    low, high = 0.0, max(float(values.max()), largest)
     x, y = (Axis(space.labels[i], float(space.low[i]), float(space.high[i])) for i in range(2))
-    chart = Chart("Map of the distance over the two parameters, with the executed tasks", x, y, height=360)
-    chart.image(values, low, high)
-    tau = context.threshold
+    chart = Chart(title, x, y, height=360).image(values.reshape(_GRID, _GRID), low, high)
     if tau is not None and (values > tau).any() and (values <= tau).any():
-        _add_contour(chart, space.from_unit(unit), values.ravel() > tau)
+        _add_contour(chart, space.from_unit(_grid_of_tasks()), values > tau)
 
     def place(trials: Sequence[Trial]) -> tuple[Array, Array]:
         at = context.coordinates(trials)
         return at[:, 0], at[:, 1]
 
     _add_samples(chart, context, place)
-    if context.failed:
-        _mark(chart, place, context.failed, "failed", "no distance is known")
+    _mark(chart, place, context.failed, "failed", "no distance is known")
     _mark(chart, place, context.worst_first[:1], "worst", "worst executed task")
-    return chart.render(colour_scale(low, high, context.distance_label))
+    return chart.render(colour_scale(low, high, label or context.distance_label))
 
 
 def _add_contour(chart: Chart, points: Array, above: Mask) -> None:
@@ -160,36 +154,44 @@ def _add_contour(chart: Chart, points: Array, above: Mask) -> None:
     chart.edges(np.concatenate([upright, level]), "edge of the region above the threshold")
 
 
-Place = Callable[[Sequence[Trial]], tuple[Array, Array]]
-"""A function from trials to the positions of their marks in a chart."""
-
-
 def _mark(chart: Chart, place: Place, trials: Sequence[Trial], kind: Kind, label: str) -> None:
-    x, y = place(trials)
-    chart.marks(x, y, kind, label, list(map(_named, trials)))
+    if trials:
+        chart.marks(*place(trials), kind, label, list(map(_named, trials)))
 
 
 def _add_samples(chart: Chart, context: ReportContext, place: Place) -> None:
     """Add the executed tasks, with a mark for each origin."""
     for kind, label, origins in _ORIGINS:
-        trials = [trial for trial in context.completed if trial.origin in origins]
-        if trials:
-            _mark(chart, place, trials, kind, label)
-
-
-def _add_failed(chart: Chart, context: ReportContext, axis: int) -> None:
-    if context.failed:
-        x = context.coordinates(context.failed)[:, axis]
-        y = np.full(len(x), 0.03 * chart.y.ends[1])
-        chart.marks(x, y, "failed", "no distance is known", list(map(_named, context.failed)))
-
-
-def _distances(trials: Sequence[Trial]) -> Array:
-    return np.array([trial.distance for trial in trials], dtype=np.float64)
+        _mark(chart, place, [trial for trial in context.completed if trial.origin in origins], kind, label)
 
 
 def _named(trial: Trial) -> str:
     return f"trial {trial.number}: {'no distance' if trial.distance is None else number(trial.distance)}"
+
+
+def _parallel_coordinates(context: ReportContext) -> Markup:
+    """Return one line for each executed task, the worst fifth in another style and on top."""
+    trials, d = context.worst_first, context.space.dimension
+    rows = np.arange(len(trials))
+    if len(trials) > 300:  # those with the largest distances, and others evenly from the rest
+        rows = np.unique(np.concatenate([rows[:150], np.linspace(0, len(trials) - 1, 150).astype(int)]))
+    top = max(float(context.distances.max()), 1e-300)
+    worst = max(1, round(0.2 * len(rows)))
+    title = "Parallel coordinates: one line for each executed task, through its parameters and its distance"
+    x, y = Axis("number of the parameter", -0.1, d + 0.1, whole=True), Axis("share of the range", 0.0, 1.0)
+    chart = Chart(title, x, y, width=max(480, 70 * d + 76))
+    for axis in range(d + 1):
+        chart.line([axis, axis], [0, 1], "axis")
+    for rank, row in reversed(list(enumerate(rows))):
+        shares = [*trials[row].unit_point, distance_of(trials[row]) / top]
+        of_worst = rank < worst
+        label = f"the {worst} worst tasks" if of_worst else "the other tasks"
+        chart.line(np.arange(d + 1), shares, "weak" if of_worst else "rest", label)
+    ends = zip([*context.space.labels, context.distance_label], [*context.space.low, 0.0], [*context.space.high, top],
+               strict=True)  # fmt: skip
+    names = [f"{j}: {label} from {number(low, 3)} to {number(high, 3)}" for j, (label, low, high) in enumerate(ends)]
+    scroll = {"class_": "scroll", "tabindex": "0", "role": "region", "aria_label": "Parallel coordinates"}
+    return joined([element("div", chart, **scroll), paragraph("; ".join(names), class_="note")])
 
 
 def _sensitivity(context: ReportContext, model: DistanceModel) -> Markup:
@@ -207,7 +209,7 @@ def _sensitivity(context: ReportContext, model: DistanceModel) -> Markup:
 def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
     """Return predicted against executed distances, each predicted without its own execution."""
     band = model.left_out
-    replayed = {k: one.distance for k, one in context.replays.items() if np.isfinite(one.distance)}
+    replayed = {k: replay.distance for k, replay in context.replays.items() if np.isfinite(replay.distance)}
     by_number = {trial.number: trial.distance or 0.0 for trial in context.completed}
     # A wide interval would hide everything else.
     top = 2 * float(context.distances.max())
@@ -226,5 +228,49 @@ def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
     beforehand = stored_predictions(context)
     if beforehand:
         x = [trial.distance or 0.0 for trial, _ in beforehand]
-        chart.marks(x, [one.median for _, one in beforehand], "covering", "stored before the execution")
+        chart.marks(x, [prediction.median for _, prediction in beforehand], "covering", "stored before the execution")
     return chart
+
+
+def _region(context: ReportContext) -> Markup | None:
+    """Return where the threshold is kept; None if the certificate is of another kind or the experiment is not loaded.
+
+    A task keeps it if its prediction from the trials before the independent draws, plus the margin of the certificate
+    ``region``, is at most the threshold.
+    """
+    certificate, learned, tau = context.certificate, context.provenance.learned, context.threshold
+    if certificate is None or certificate.kind != "region" or learned is None or tau is None:
+        return None
+    margin, before = float(certificate.details["margin"]), int(certificate.details["learned_before"])
+    space, d = context.space, context.space.dimension
+    unit = _grid_of_tasks() if d == 2 else np.random.default_rng(0).random((400, d))
+    if d == 1:
+        unit = np.linspace(0, 1, _CURVE)[:, None]
+    bounds = learned.expected(unit, before) + margin
+    inside, points, label = bounds <= tau, space.from_unit(unit), f"predicted {context.distance_label} + margin"
+    text = paragraph(
+        f"A task keeps the threshold {number(tau)} if its predicted distance plus the margin {number(margin)} of the "
+        f"certificate is at most the threshold. This holds for {percent(float(inside.mean()))} of the tasks that are "
+        f"drawn here. {certificate.statement}"
+    )
+    title = "Tasks that keep the threshold by the prediction plus its margin"
+    drawn: object
+    if d == 2:
+        drawn = _map(context, title, bounds, label)
+    elif d == 1:
+        x = Axis(space.labels[0], float(space.low[0]), float(space.high[0]))
+        chart = Chart("Predicted distance plus margin, and the threshold", x, Axis.over(label, bounds, tau, zero=True))
+        drawn = chart.line(points[:, 0], bounds, "mean", label).limit(tau, "threshold", "threshold")
+    else:  # the map shows the two parameters to which the distance is most sensitive
+        model = context.distance_model
+        order = np.argsort(-model.sensitivity, kind="stable") if model is not None else np.arange(d)
+        i, j = int(order[0]), int(order[1])
+        x, y = (Axis(space.labels[k], float(space.low[k]), float(space.high[k])) for k in (i, j))
+        chart = Chart(title, x, y, height=360)
+        outside = points[~inside]
+        if len(outside):
+            chart.marks(outside[:, i], outside[:, j], "weak", "above the threshold or not predicted")
+        if inside.any():
+            chart.marks(points[inside, i], points[inside, j], "sample", "keeps the threshold")
+        drawn = chart
+    return joined([text, element("div", drawn, class_="charts wide")])

@@ -11,24 +11,22 @@ from markupsafe import Markup
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import parted
+from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
-from ctxval.report.charts import SMALL, Axis, Chart, small_charts
-from ctxval.report.context import Recording, ReportContext
+from ctxval.report.charts import SMALL, Axis, Chart, Kind, small_charts
+from ctxval.report.context import ReportContext
 from ctxval.report.markup import cell, details, element, heading, joined, paragraph, quantity
 from ctxval.report.recorded_lines import RecordedLines, recorded_lines
 
-DATA = "trial-data"
-"""Identifier of the element with the trajectories."""
-
-_ROWS = 1000
-"""Largest number of trials in the table: those with the largest distances, and those without a distance."""
+_ROWS = 1000  # largest number of trials in the table: those with the largest distances, and those without a distance
 
 _WORST = 5
-_SIGNALS = 10
-"""Largest number of states and inputs that are drawn for each of the worst trials: those with the largest errors."""
-
-_POINTS = 90
-"""Number of points of a line of the worst trials."""
+_LINES: dict[Kind, str] = {
+    "reference": "reference",
+    "corrected": "corrected model",
+    "system": "system S",
+    "model": "model M",
+}
 
 
 class TrialsSection(ShortRepr):
@@ -46,7 +44,7 @@ class TrialsSection(ShortRepr):
                 _left_out(context, lines),
                 _table(context, lines),
                 element("div", id="trial", aria_live="polite", class_="needs-script"),
-                data_element(DATA, lines.data),
+                data_element("trial-data", lines.data),
                 _worst(context),
             ]
         )
@@ -61,19 +59,19 @@ def data_element(identifier: str, data: Any) -> Markup:
 
 
 def _left_out(context: ReportContext, lines: RecordedLines) -> Markup:
-    said = []
+    notes = []
     if lines.left_out:
-        said.append(
+        notes.append(
             f"The page has the trajectories of {len(lines.kept)} of {len(context.trials)} trials. Those of "
             f"{len(lines.left_out)} trials with smaller distances are left out, so that the page stays small."
         )
     if lines.thinned:
-        said.append(f"Each line has about {lines.points} of the recorded points; `ctxval export` writes all of them.")
+        notes.append(f"Each line has about {lines.points} of the recorded points; `ctxval export` writes all of them.")
     if not context.replays and context.missing:
-        said.append("The corrected model is not drawn, because the experiment is not loaded.")
+        notes.append("The corrected model is not drawn, because the experiment is not loaded.")
     elif context.replays:
-        said.append("The corrected model in each trial is learned from the other trials.")
-    return paragraph(" ".join(said)) if said else Markup("")
+        notes.append("The corrected model in each trial is learned from the other trials.")
+    return paragraph(" ".join(notes)) if notes else Markup("")
 
 
 def _table(context: ReportContext, lines: RecordedLines) -> Markup:
@@ -100,13 +98,11 @@ def _row(trial: Trial, point: Array, recorded: bool) -> Markup:
         )
     remarks = "; ".join(filter(None, (trial.failure, trial.because)))
     values = (trial.distance, trial.state, trial.origin, *point.tolist(), trial.seconds, trial.attempts, remarks)
-    head = element("th", cell(first) if recorded else cell(trial.number), scope="row", data_value=trial.number)
-    return element("tr", head, *map(_cell, values))
-
-
-def _cell(value: object) -> Markup:
-    exact = repr(float(value)) if isinstance(value, int | float) else None
-    return element("td", cell(value) if value != "" else "", data_value=exact)
+    cells = [element("th", cell(first), scope="row", data_value=trial.number)]
+    for value in values:
+        exact = repr(float(value)) if isinstance(value, int | float) else None
+        cells.append(element("td", cell(value) if value != "" else "", data_value=exact))
+    return element("tr", *cells)
 
 
 def _worst(context: ReportContext) -> Markup:
@@ -129,47 +125,27 @@ def task_of(context: ReportContext, trial: Trial) -> str:
     return ", ".join(listed[:4]) + (f" and {len(listed) - 4} more" if len(listed) > 4 else "")
 
 
-def _signals(context: ReportContext, number_: int) -> list[Chart]:
+def _signals(context: ReportContext, trial: int) -> list[Chart]:
     """Return one chart for each state and input of a trial, those with the largest errors if they are many."""
-    recording = context.recordings[number_]
-    replay = context.replays.get(number_)
+    pair, replay = context.recordings[trial], context.replays.get(trial)
     corrected = None if replay is None else replay.corrected
-    labels = [label for named in context.signals for label in named]
-    of_model, of_system = _joined(recording, "model"), _joined(recording, "system")
-    n = recording.model.states.shape[-1]
-    sizes = [
-        float(np.abs(s - m).max(initial=0.0) / max(np.ptp(m), 1e-300)) for m, s in zip(of_model, of_system, strict=True)
-    ]
-    chosen = sorted(np.argsort(sizes)[::-1][:_SIGNALS].tolist())
-    drawn = []
-    for j in chosen:
-        lines = {"system": of_system[j], "model": of_model[j]}
-        if corrected is not None:
-            lines["corrected"] = corrected.states[:, j] if j < n else corrected.inputs[:, j - n]
-        target = None if replay is None or j >= n else replay.task.reference[:, j]
-        reference = target if target is not None and target.any() else None
-        drawn.append(_signal(f"{labels[j]} in trial {number_}", labels[j], recording.system.times, lines, reference))
-    return drawn
-
-
-def _joined(recording: Recording, side: str) -> list[Array]:
-    one = getattr(recording, side)
-    return [*one.states.T, *one.inputs.T]
-
-
-def _signal(title: str, label: str, times: Array, lines: dict[str, Array], reference: Array | None) -> Chart:
-    every = [*lines.values(), *([] if reference is None else [reference])]
-    chart = Chart(title, Axis("time [s]", float(times[0]), float(times[-1])), Axis.over(label, *every), **SMALL)
-    if reference is not None:
-        _thin(chart, times, reference, "reference", "reference")
     # The corrected model is drawn first, as a wide line, because it often coincides with S.
-    kinds = (("corrected", "corrected model"), ("system", "system S"), ("model", "model M"))
-    for kind, name in kinds:
-        if kind in lines:
-            _thin(chart, times, lines[kind], kind, name)
-    return chart
-
-
-def _thin(chart: Chart, times: Array, values: Array, kind: Any, name: str) -> None:
-    rows = np.unique(np.linspace(0, len(values) - 1, min(_POINTS, len(values))).astype(int))
-    chart.line(times[: len(values)][rows], values[rows], kind, name)
+    runs: dict[Kind, Trajectory | None] = {"corrected": corrected, "system": pair.system, "model": pair.model}
+    signals = {kind: [*run.states.T, *run.inputs.T] for kind, run in runs.items() if run is not None}
+    labels, times = [label for names in context.signals for label in names], pair.system.times
+    errors = [
+        float(np.abs(s - m).max(initial=0.0) / max(np.ptp(m), 1e-300))
+        for m, s in zip(signals["model"], signals["system"], strict=True)
+    ]
+    charts = []
+    for j in sorted(np.argsort(errors)[::-1][:10].tolist()):
+        lines = {name: values[j] for name, values in signals.items()}
+        if replay is not None and j < pair.model.states.shape[-1] and replay.task.reference[:, j].any():
+            lines = {"reference": replay.task.reference[:, j], **lines}
+        x, y = Axis("time [s]", float(times[0]), float(times[-1])), Axis.over(labels[j], *lines.values())
+        chart = Chart(f"{labels[j]} in trial {trial}", x, y, **SMALL)
+        for kind, values in lines.items():
+            rows = np.unique(np.linspace(0, len(values) - 1, min(90, len(values))).astype(int))
+            chart.line(times[: len(values)][rows], values[rows], kind, _LINES[kind])
+        charts.append(chart)
+    return charts

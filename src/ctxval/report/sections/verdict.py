@@ -20,14 +20,10 @@ from ctxval.report.sections.tasks import distance_over_task
 from ctxval.report.sections.trials import task_of
 from ctxval.storage.other_stores import other_stores
 
+# A shape for each verdict, because colours alone tell nothing in grey print.
 _SHAPES = {"validated": "\u2714", "falsified": "\u2718", "undecided": "?", "no verdict": "\u2013"}
-"""A shape for each verdict, because colours alone tell nothing in grey print."""
 
-_MORE = 10
-"""Number of further executions that are advised if none can be forecast."""
-
-_STORES = 5
-"""Largest number of other stores that are named."""
+_MORE = 10  # number of further executions that are advised if none can be forecast
 
 
 class VerdictSection(ShortRepr):
@@ -42,9 +38,9 @@ class VerdictSection(ShortRepr):
         word = element("p", shape, " ", answer.capitalize(), class_="word")
         chart = (distance_over_task(context) if context.space.dimension == 1 else None) or distances_in_order(context)
         drawn = paragraph("No distance is known yet.") if chart is None else chart
-        said, command = _next(context)
+        advice, command = _next(context)
         block = code(command, "Next command") if command else None
-        beside = element("div", heading("What next"), paragraph(said), block, _facts(context), *_remarks(context))
+        beside = element("div", heading("What next"), paragraph(advice), block, _facts(context), *_remarks(context))
         return joined(
             [
                 element("div", word, paragraph(_sentence(context), class_="sentence"), class_=f"answer {answer}"),
@@ -75,36 +71,38 @@ def _next(context: ReportContext) -> tuple[str, str]:
     if not context.executions:
         return "Execute tasks.", command_of(context)
     if verdict is None:
-        said = "State the threshold that the distance must keep. The recorded trials are then judged."
-        return said, shlex.join(["ctxval", "report", path, "--threshold", "VALUE"])
+        advice = "State the threshold that the distance must keep. The recorded trials are then judged."
+        return advice, shlex.join(["ctxval", "report", path, "--threshold", "VALUE"])
     if verdict.answer == "validated":
-        said = (
+        advice = (
             "Use the model for these tasks. Validate it again if the system, the model, the design of the controllers "
             "or the tasks change."
         )
         budget = max(context.budget or 0, context.executions + _MORE)
         command = command_of(context, budget, "--audited", "--store", path)
         if not command or context.settings.get("audited") or getattr(verdict.certificate, "kind", "") != "dynamics":
-            return said, ""
-        return f"{said} If an error would be costly, test the assumptions with eight fresh random tasks:", command
+            return advice, ""
+        return f"{advice} If an error would be costly, test the assumptions with eight fresh random tasks:", command
     if verdict.answer == "falsified":
         largest = quantity(distance_of(context.worst_first[0]), context.labels.units)
-        said = f"Do not rely on the model at this threshold. Improve it, narrow the tasks, or accept {largest} or more."
+        advice = (
+            f"Do not rely on the model at this threshold. Improve it, narrow the tasks, or accept {largest} or more."
+        )
         if not context.settings:
-            return said, ""
+            return advice, ""
         better = "This learns a better model from the recorded executions, and validates it:"
-        return f"{said} {better}", shlex.join(["ctxval", "refine", path])
+        return f"{advice} {better}", shlex.join(["ctxval", "refine", path])
     by_hand = any(trial.told for trial in context.trials)
     if context.failed:
         number = context.failed[0].number
         again = shlex.join(["ctxval", "ask", path, "--again", str(number)]) if by_hand else ""
         return f"Find out why trial {number} has no distance, and execute its task again.", again
     expected = None if verdict.expected is None else verdict.expected.executions
-    said = f"about {expected} are expected to decide" if expected else "how many will decide cannot be forecast"
+    advice = f"about {expected} are expected to decide" if expected else "how many will decide cannot be forecast"
     # A search that explores may never execute what the certificate lacks.
     decide = ["--decide"] if getattr(verdict.certificate, "kind", "") in ("dynamics", "posterior") else []
     command = command_of(context, context.executions + (expected or _MORE), *decide, "--store", path)
-    return f"Execute more tasks: {said}.", shlex.join(["ctxval", "ask", path]) if by_hand else command
+    return f"Execute more tasks: {advice}.", shlex.join(["ctxval", "ask", path]) if by_hand else command
 
 
 def _bound(context: ReportContext, certificate: Certificate) -> str:
@@ -133,20 +131,20 @@ def _facts(context: ReportContext) -> Markup:
 
 def _remarks(context: ReportContext) -> list[Markup]:
     """Return what must not be overlooked in what is folded below, and around the store."""
-    said = []
+    remarks = []
     # The sentence of the verdict says why a certificate is refused or withdrawn.
-    found = [one for one in [*diagnostics(context), *insights(context)] if one.name != "Certificate"]
+    findings = [finding for finding in [*diagnostics(context), *insights(context)] if finding.name != "Certificate"]
     for light in ("bad", "attention"):
-        names = [one.name for one in found if one.light == light]
+        names = [finding.name for finding in findings if finding.light == light]
         if names:
             word = element("span", WORDS[light].capitalize(), class_=f"light {light}")
-            said.append(paragraph(word, f" {'; '.join(names)} (below)"))
+            remarks.append(paragraph(word, f" {'; '.join(names)} (below)"))
     if context.missing:
-        said.append(paragraph(f"The experiment is not loaded: {context.missing}", class_="note"))
+        remarks.append(paragraph(f"The experiment is not loaded: {context.missing}", class_="note"))
     others = [] if context.store.path is None else other_stores(context.store.path)
     if others:
         count = counted(len(others), "other store")
-        names = [other.name for other in others[:_STORES]]
+        names = [other.name for other in others[:5]]
         sentence = f"The folder contains {count} of this experiment: {', '.join(names)}. The best result of several "
-        said.append(paragraph(f"{sentence}campaigns is wrong more often than its confidence states.", class_="note"))
-    return said
+        remarks.append(paragraph(f"{sentence}campaigns is wrong more often than its confidence states.", class_="note"))
+    return remarks
