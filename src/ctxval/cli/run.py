@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import suppress
+import os
+import sys
+import webbrowser
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ctxval._util.progress import also_listening
 from ctxval._util.texts import reason_of, shortened
 from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.certificates.base import Certificate
 from ctxval.certificates.verdict import Verdict, usable_bound
 from ctxval.cli.base import (
@@ -55,6 +60,10 @@ from ctxval.errors import CertificateError, InputError
 from ctxval.report.context import context_of_campaign
 from ctxval.report.page import write_page
 from ctxval.storage.other_stores import other_stores
+from ctxval.web.served import ServedCampaign
+
+if TYPE_CHECKING:
+    from ctxval.web.live import LiveCampaign
 
 Target = Annotated[
     str,
@@ -112,6 +121,14 @@ WithReport = Annotated[
         help="Write a report next to the store: one HTML page with the verdict, insights and charts.",
     ),
 ]
+Live = Annotated[
+    bool,
+    typer.Option(
+        "--live",
+        help="Show the campaign in a browser as it goes: serve a page on this computer until the command ends, and "
+        "print its address. The page needs the extra web.",
+    ),
+]
 Variant = Annotated[str | None, typer.Option(help="Variant of a case; the same as --option variant=VALUE.")]
 ModelName = Annotated[str | None, typer.Option(help="Learned model of a case; the same as --option model=VALUE.")]
 Dimension = Annotated[int | None, typer.Option(help="Number of states of a case; the same as --option dim=VALUE.")]
@@ -138,6 +155,7 @@ def run(
     timeout: Timeout = None,
     accept_change: AcceptChange = None,
     with_report: WithReport = True,
+    live: Live = False,
     as_json: AsJson = False,
     option: PartOptions = None,
     variant: Variant = None,
@@ -169,34 +187,65 @@ def run(
         certificate.kind.require_usable(certificate.confidence, total)  # before executions are paid for
     if not as_json:
         _print_parts(experiment, limit)
-    with worker_options(workers, dask, timeout) as execution:
-        campaign.run(
-            total,
-            limit,
-            explore=settings.explores,
-            within=settings.within,
-            certificate=certificate,
-            audited=settings.audited,
-            **execution,
-        )
-    known = experiment.truth() if truth and experiment.truth is not None else None
-    digest = campaign.store.digest()
-    verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
-    bound = None if verdict is None else verdict.certificate
-    if verdict is None and not settings.explores:
-        with suppress(CertificateError):
-            bound = campaign.certify(certificate=certificate)
-    report = _report(campaign, experiment, settings, total, path, verdict, bound, known)
-    said = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
-    page = page_path(path) if with_report else None
-    if page is not None:
-        report["report"] = (
-            str(page) if _is_current(page, campaign, said) else _write_report(page, campaign, verdict, total)
-        )
-    campaign.store.keep_computed(RUN, {**said, "report": report.get("report")}, digest)
+    with _live_page(live, ServedCampaign(experiment, campaign, limit, certificate, total), settings) as shown:
+        with worker_options(workers, dask, timeout) as execution:
+            campaign.run(
+                total,
+                limit,
+                None if shown is None else shown.take,
+                explore=settings.explores,
+                within=settings.within,
+                certificate=certificate,
+                audited=settings.audited,
+                **execution,
+            )
+        known = experiment.truth() if truth and experiment.truth is not None else None
+        digest = campaign.store.digest()
+        verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
+        bound = None if verdict is None else verdict.certificate
+        if verdict is None and not settings.explores:
+            with suppress(CertificateError):
+                bound = campaign.certify(certificate=certificate)
+        report = _report(campaign, experiment, settings, total, path, verdict, bound, known)
+        said = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
+        page = page_path(path) if with_report else None
+        if page is not None:
+            report["report"] = (
+                str(page) if _is_current(page, campaign, said) else _write_report(page, campaign, verdict, total)
+            )
+        campaign.store.keep_computed(RUN, {**said, "report": report.get("report")}, digest)
+        if shown is not None:
+            shown.end(verdict, bound, report.get("report"))
     if not as_json:
         _print_report(report, verdict, bound)
     return report, _status(campaign, verdict)
+
+
+@contextmanager
+def _live_page(wanted: bool, served: ServedCampaign, settings: Settings) -> Iterator[LiveCampaign | None]:
+    """Serve the page of the campaign while the command runs, if it is wanted."""
+    if not wanted:
+        yield None
+        return
+    from ctxval.cli.serve import web_server  # it needs an extra
+
+    web, search = web_server(), None
+    if not settings.explores:
+        search = IntervalSearch(
+            served.campaign.recorder,
+            served.certificate,
+            served.budget,
+            served.threshold,
+            settings.within,
+            settings.audited,
+        )
+    page = web.LiveCampaign(served, search)
+    with web.showing(page) as address, also_listening(page.hear):
+        out.say(f"the page is at {address}")
+        screen = sys.platform in ("win32", "darwin") or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
+        if sys.stdout.isatty() and screen:
+            webbrowser.open(address)
+        yield page
 
 
 def _print_parts(experiment: Experiment, limit: float | None) -> None:

@@ -71,7 +71,7 @@ def serve(
     The page shows the next task and its files. It takes recordings and failures, and shows the verdict. Ctrl-C stops
     the server.
     """
-    web = _web()
+    web = web_server()
     address = web.Address(host, port, token, tuple(allow_host or ()))
     again = _Reopening(settings_of(Store.existing(store), experiment, trust), store, threshold, budget)
 
@@ -105,7 +105,7 @@ def _served(opened: Opened, threshold: float | None, budget: int | None) -> Serv
     return ServedCampaign(opened.experiment, opened.campaign, limit, opened.settings.certificate_options, total)
 
 
-def _web() -> Any:
+def web_server() -> Any:
     """Return the module of the server, which needs the extra ``web``."""
     try:
         return importlib.import_module("ctxval.web.server")

@@ -28,10 +28,8 @@ from ctxval.web.access import Access
 from ctxval.web.desk import recording_in
 from ctxval.web.page import Page, Problem
 from ctxval.web.security import MOST_UPLOAD, Guard, Hosts
-from ctxval.web.service import CampaignService, Work
-
-_LISTENERS = 64
-"""Largest number of browsers that are kept up to date at a time."""
+from ctxval.web.service import CampaignService
+from ctxval.web.state import PageState, Work
 
 _KINDS = ("recording", "distance", "failure")
 
@@ -44,32 +42,26 @@ _OUT_OF_DATE = (
 Handler = Callable[[Request, str], Awaitable[Response]]
 
 
-class OperatorPage:
-    """The routes of the page.
+class PageRoutes:
+    """The routes of a page that shows a campaign, and takes nothing.
 
     Args:
-        service: the campaign.
+        state: what the page shows.
         access: who may use the page.
     """
 
-    def __init__(self, service: CampaignService, access: Access) -> None:
-        self.service, self.access = service, access
-        self.page = Page(service)
-        self._listeners = 0
+    def __init__(self, state: PageState, access: Access) -> None:
+        self.state, self.access = state, access
+        self.page = Page(state)
 
     def routes(self) -> list[Route]:
         """Return all routes; every one but the static files and the entrance needs a session."""
-        inside = self._inside
         return [
             Route("/", self.start, methods=["GET"]),
             Route("/enter", self.enter, methods=["POST"]),
             Route("/static/{name}", static, methods=["GET"]),
-            Route("/choose", inside(self.choose), methods=["POST"]),
-            Route("/trials/{number:int}/{kind}", inside(self.tell), methods=["POST"]),
-            Route("/trials/{number:int}/files.zip", inside(self.archive), methods=["GET"]),
-            Route("/trials/{number:int}/files/{name}", inside(self.file), methods=["GET"]),
-            Route("/pictures/{name}.svg", inside(self.picture), methods=["GET"]),
-            Route("/events", inside(self.events), methods=["GET"]),
+            Route("/pictures/{name}.svg", self._inside(self.picture), methods=["GET"]),
+            Route("/events", self._inside(self.events), methods=["GET"]),
         ]
 
     # Entrance
@@ -130,6 +122,56 @@ class OperatorPage:
         session = self.access.session({self.access.cookie: cookie})
         assert session is not None
         return session, cookie
+
+    def _campaign(self, request: Request, session: str, problem: Problem | None = None) -> str:
+        replaces = problem is not None and "replace" in problem.fields
+        return self.page.campaign(
+            self.access.form_token(session),
+            problem=problem,
+            told=_number(request.query_params.get("told", "")),
+            replaced=request.path_params["number"] if replaces else _number(request.query_params.get("replace", "")),
+            all_="all" in request.query_params,
+        )
+
+    async def picture(self, request: Request, session: str) -> Response:
+        """Return a picture of the campaign."""
+        found = self.state.background.pictures.images.get(request.path_params["name"])
+        if found is None:
+            return HTMLResponse(self.page.message("No picture", "There is no such picture yet."), 404)
+        # A picture has styles of its own, and must not run anything if it is opened alone.
+        policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
+        return Response(found, media_type=_TYPES[".svg"], headers=policy)
+
+    async def events(self, request: Request, session: str) -> Response:
+        """Send an event for each change of the page."""
+        if self.state.listeners >= 64:
+            return Response("too many pages are open", 503, media_type="text/plain")
+        events = (_event(kind, content) async for kind, content in self.state.events())
+        return StreamingResponse(events, media_type="text/event-stream")
+
+
+class OperatorPage(PageRoutes):
+    """The routes of a page that also takes what operators do.
+
+    Args:
+        service: the campaign.
+        access: who may use the page.
+    """
+
+    def __init__(self, service: CampaignService, access: Access) -> None:
+        super().__init__(service, access)
+        self.service = service
+
+    def routes(self) -> list[Route]:
+        """Return the further routes, too."""
+        inside = self._inside
+        return [
+            *super().routes(),
+            Route("/choose", inside(self.choose), methods=["POST"]),
+            Route("/trials/{number:int}/{kind}", inside(self.tell), methods=["POST"]),
+            Route("/trials/{number:int}/files.zip", inside(self.archive), methods=["GET"]),
+            Route("/trials/{number:int}/files/{name}", inside(self.file), methods=["GET"]),
+        ]
 
     # Forms
 
@@ -198,20 +240,10 @@ class OperatorPage:
         shown = [trial for trial in snapshot.trials if trial.told] if "replace" in fields else snapshot.waiting
         return f"{kind}-{number}" if any(trial.number == number for trial in shown) else "trial"
 
-    def _campaign(self, request: Request, session: str, problem: Problem | None = None) -> str:
-        replaces = problem is not None and "replace" in problem.fields
-        return self.page.campaign(
-            self.access.form_token(session),
-            problem=problem,
-            told=_number(request.query_params.get("told", "")),
-            replaced=request.path_params["number"] if replaces else _number(request.query_params.get("replace", "")),
-            all_="all" in request.query_params,
-        )
-
     def _problem(self, request: Request, session: str, problem: Problem) -> Response:
         return HTMLResponse(self._campaign(request, session, problem), problem.status)
 
-    # Files and pictures
+    # Files
 
     async def file(self, request: Request, session: str) -> Response:
         """Return one file of an open trial."""
@@ -237,31 +269,6 @@ class OperatorPage:
             for name, data in found.items():
                 archive.writestr(f"trial-{number}/{name}", data)
         return _download(content.getvalue(), f"trial-{number}.zip")
-
-    async def picture(self, request: Request, session: str) -> Response:
-        """Return a picture of the campaign."""
-        found = self.service.background.pictures.images.get(request.path_params["name"])
-        if found is None:
-            return HTMLResponse(self.page.message("No picture", "There is no such picture yet."), 404)
-        # A picture has styles of its own, and must not run anything if it is opened alone.
-        policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
-        return Response(found, media_type=_TYPES[".svg"], headers=policy)
-
-    # Live
-
-    async def events(self, request: Request, session: str) -> Response:
-        """Send an event for each change of the page."""
-        if self._listeners >= _LISTENERS:
-            return Response("too many pages are open", 503, media_type="text/plain")
-        return StreamingResponse(self._events(), media_type="text/event-stream")
-
-    async def _events(self) -> AsyncIterator[str]:
-        self._listeners += 1
-        try:
-            async for kind, content in self.service.events():
-                yield _event(kind, content)
-        finally:
-            self._listeners -= 1
 
 
 def _number(text: str) -> int | None:
@@ -311,15 +318,16 @@ async def static(request: Request) -> Response:
     return Response(_STATIC[name], media_type=_TYPES[name[name.rindex(".") :]], headers=headers)
 
 
-def application(service: CampaignService, access: Access, hosts: Hosts, most: int = MOST_UPLOAD) -> Guard:
+def application(state: PageState, access: Access, hosts: Hosts, most: int = MOST_UPLOAD) -> Guard:
     """Return the ASGI application of a campaign."""
 
     @contextlib.asynccontextmanager
     async def running(app: Starlette) -> AsyncIterator[None]:
-        await service.start()
+        await state.start()
         try:
             yield
         finally:
-            await service.stop()
+            await state.stop()
 
-    return Guard(Starlette(routes=OperatorPage(service, access).routes(), lifespan=running), hosts, access, most)
+    page = OperatorPage(state, access) if isinstance(state, CampaignService) else PageRoutes(state, access)
+    return Guard(Starlette(routes=page.routes(), lifespan=running), hosts, access, most)

@@ -139,7 +139,7 @@ def _serve(pipe: Connection, open_campaign: OpenCampaign) -> None:
                 if served is None:
                     pipe.send(("stage", Stage("loading the experiment")))
                     served = open_campaign()
-                tell = _Teller(pipe)
+                tell = StageSender(lambda stage: pipe.send(("stage", stage)))
                 with listening(tell.hear):
                     reply = "done", job(served, tell, *arguments)
             except CtxvalError as error:
@@ -153,19 +153,26 @@ _INTERVAL = 0.2
 """Least number of seconds between two messages that only count."""
 
 
-class _Teller:
-    """Sends stages through a pipe, and not too many of them."""
+class StageSender:
+    """Sends stages to somebody, and not too many of them."""
 
-    def __init__(self, pipe: Connection) -> None:
-        self._pipe, self._text, self._at = pipe, "", 0.0
+    def __init__(self, send: TellStage) -> None:
+        self._send, self._text, self._at = send, "", 0.0
+        self._running: dict[int, Progress] = {}
 
     def __call__(self, stage: Stage) -> None:
+        """Send a stage, unless it only counts and was sent a moment ago."""
         now = time.monotonic()
         if stage.text != self._text or now - self._at >= _INTERVAL:
             self._text, self._at = stage.text, now
-            self._pipe.send(("stage", stage))
+            self._send(stage)
 
     def hear(self, progress: Progress) -> None:
-        """Send a report of long work as a stage."""
-        if not progress.ended:
-            self(Stage(progress.stage, progress.done, progress.expected, progress.unit))
+        """Send the innermost stage of long work."""
+        if progress.ended:
+            self._running.pop(progress.depth, None)
+        else:
+            self._running[progress.depth] = progress
+        if self._running:
+            innermost = self._running[max(self._running)]
+            self(Stage(innermost.stage, innermost.done, innermost.expected, innermost.unit))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures as cf
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -12,8 +12,10 @@ from typing import TypeVar
 import numpy as np
 
 from ctxval._util.texts import reason_of
+from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.interval_search import require_decisive
 from ctxval.campaign.telling import ToldResult, tell_result
+from ctxval.certificates import CertificateOptions
 from ctxval.core.labels import labels_of
 from ctxval.core.space import TaskSpace
 from ctxval.core.task import Task
@@ -36,6 +38,7 @@ class Description:
         threshold: tau; None if there is none.
         budget: the number of executions that are planned.
         decides: whether executions can be chosen that decide the verdict.
+        live: whether a command executes the tasks, so that the page only shows them.
     """
 
     name: str
@@ -45,6 +48,7 @@ class Description:
     threshold: float | None
     budget: int
     decides: bool
+    live: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +96,37 @@ class Snapshot:
         return [trial for trial in self.trials if trial.state == "open"]
 
 
+def description_of(served: ServedCampaign, *, live: bool = False) -> Description:
+    """Return what does not change while a campaign is served."""
+    campaign, experiment = served.campaign, served.experiment
+    path = campaign.store.path
+    return Description(
+        experiment.name,
+        "a store in memory" if path is None else path.name,
+        campaign.validation.space,
+        experiment.units,
+        served.threshold,
+        served.budget,
+        served.threshold is not None and _can_decide(served.certificate),
+        live,
+    )
+
+
+def _can_decide(certificate: CertificateOptions) -> bool:
+    try:
+        require_decisive(certificate)
+    except InputError:
+        return False
+    return True
+
+
+def snapshot_of(campaign: Campaign, tasks: Mapping[int, OpenTask], changes: int = 0) -> Snapshot:
+    """Return the trials of a campaign at present."""
+    trials = campaign.trials
+    signature = (len(trials), sum(trial.state == "open" for trial in trials), changes)
+    return Snapshot(signature, trials, dict(tasks), sum(trial.executed for trial in trials), campaign.worst)
+
+
 class Desk:
     """The only user of the server's own campaign: everything runs in its thread, one thing at a time.
 
@@ -109,7 +144,7 @@ class Desk:
         self._closed = False
         try:
             self._served: ServedCampaign = self._thread.submit(open_campaign).result()
-            self.description = self._thread.submit(self._describe).result()
+            self.description = self._thread.submit(description_of, self._served).result()
             self.first = self._thread.submit(self._snapshot).result()
         except BaseException:
             self._thread.shutdown()
@@ -139,36 +174,12 @@ class Desk:
 
     # In the thread of the campaign
 
-    def _describe(self) -> Description:
-        campaign, experiment = self._served.campaign, self._served.experiment
-        path = campaign.store.path
-        return Description(
-            experiment.name,
-            "a store in memory" if path is None else path.name,
-            campaign.validation.space,
-            experiment.units,
-            self._served.threshold,
-            self._served.budget,
-            self._decides(),
-        )
-
-    def _decides(self) -> bool:
-        if self._served.threshold is None:
-            return False
-        try:
-            require_decisive(self._served.certificate)
-        except InputError:
-            return False
-        return True
-
     def _snapshot(self) -> Snapshot:
         campaign = self._served.campaign
         campaign.refresh()
-        trials = campaign.trials
-        # The trials were read after this process's last change, so the counts below are those of the trials.
-        signature = (len(trials), sum(trial.state == "open" for trial in trials), campaign.store.signature()[2])
-        tasks = {trial.number: self._task(trial) for trial in trials if trial.state == "open"}
-        return Snapshot(signature, trials, tasks, campaign.executions, campaign.worst)
+        # The trials were read after this process's last change, so their counts are those of the signature.
+        tasks = {trial.number: self._task(trial) for trial in campaign.trials if trial.state == "open"}
+        return snapshot_of(campaign, tasks, campaign.store.signature()[2])
 
     def _task(self, trial: Trial) -> OpenTask:
         validation = self._served.campaign.validation

@@ -145,17 +145,19 @@ def judge(served: ServedCampaign, tell: TellStage) -> Judgement | None:
     served.campaign.refresh()
     ended = [trial for trial in served.campaign.trials if trial.state != "open"]
     verdict = judge_trials(ended, served.threshold, served.certificate, served.campaign.provenance)
-    return _judgement(verdict, verdict.certificate, served.experiment.units)
+    return judgement_of(verdict, verdict.certificate, served.experiment.units)
 
 
-def _judgement(verdict: Verdict, certificate: Certificate | None, units: str) -> Judgement:
+def judgement_of(verdict: Verdict | None, certificate: Certificate | None, units: str) -> Judgement:
+    """Return a verdict, or a certificate without one, as texts."""
+    answer, reason, rests_on = ("", "", None) if verdict is None else (verdict.answer, verdict.reason, verdict.rests_on)
     if certificate is None:
-        return Judgement(verdict.answer, verdict.reason, verdict.rests_on)
+        return Judgement(answer, reason, rests_on)
     bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
     return Judgement(
-        verdict.answer,
-        verdict.reason,
-        verdict.rests_on,
+        answer,
+        reason,
+        rests_on,
         f"{bound}, with confidence {certificate.confidence:g}",
         certificate.doubt,
         certificate.statement,
@@ -167,6 +169,11 @@ def draw(served: ServedCampaign, tell: TellStage) -> Pictures:
     """Return the pictures of the present trials."""
     tell(Stage("drawing the pictures"))
     served.campaign.refresh()
+    return pictures_of(served)
+
+
+def pictures_of(served: ServedCampaign) -> Pictures:
+    """Return the pictures of the trials that the campaign knows."""
     pictures = Pictures()
     if served.campaign.completed:
         _draw(pictures, "distance", lambda: _distance_picture(served))

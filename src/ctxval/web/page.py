@@ -16,7 +16,7 @@ from ctxval.core.trial import Trial
 from ctxval.web.desk import Snapshot
 from ctxval.web.jobs import Files
 from ctxval.web.security import MOST_UPLOAD
-from ctxval.web.service import CampaignService
+from ctxval.web.state import PageState
 from ctxval.web.words import in_words, text, values_of, why
 
 _SHOWN = 200
@@ -74,11 +74,11 @@ class Page:
     """Renders the templates of this package.
 
     Args:
-        service: the campaign.
+        state: what the page shows.
     """
 
-    def __init__(self, service: CampaignService) -> None:
-        self._service = service
+    def __init__(self, state: PageState) -> None:
+        self._state = state
         self._templates = Environment(
             loader=PackageLoader("ctxval.web"),
             autoescape=select_autoescape(),
@@ -98,8 +98,8 @@ class Page:
         all_: bool,
     ) -> str:
         """Return the page of the campaign, with the forms of a trial whose result is to be replaced."""
-        service = self._service
-        snapshot, background, description = service.snapshot, service.background, service.description
+        state = self._state
+        snapshot, background, description = state.snapshot, state.background, state.description
         opened = [self._open_view(trial, snapshot) for trial in snapshot.waiting]
         shown = snapshot.trials if all_ else snapshot.trials[-_SHOWN:]
         return self._render(
@@ -120,7 +120,7 @@ class Page:
             problem=problem,
             given=_given(problem),
             token=form_token,
-            version=service.version,
+            version=state.version,
             pictures={name: f"{zlib.crc32(image):08x}" for name, image in background.pictures.images.items()},
             most=MOST_UPLOAD,
             submission=lambda: secrets.token_urlsafe(12),
@@ -138,26 +138,26 @@ class Page:
         return self._templates.get_template(name).render(**values)
 
     def _open_view(self, trial: Trial, snapshot: Snapshot) -> OpenView:
-        task = snapshot.tasks[trial.number]
-        found = self._service.background.files.get(trial.number)
+        task = snapshot.tasks.get(trial.number)
+        found = self._state.background.files.get(trial.number)
         files: Files = found if isinstance(found, dict) else {}
         return OpenView(
             trial.number,
             bool(trial.attempts),
-            values_of(trial.parameters, self._service.description.space.units),
-            [(text(name, 80), f"{value:.6g}") for name, value in task.start],
-            f"{task.horizon} steps of {task.dt:g} s, {task.horizon * task.dt:g} s in total",
-            why(trial, self._service.description.units),
+            values_of(trial.parameters, self._state.description.space.units),
+            [] if task is None else [(text(name, 80), f"{value:.6g}") for name, value in task.start],
+            "" if task is None else f"{task.horizon} steps of {task.dt:g} s, {task.horizon * task.dt:g} s in total",
+            why(trial, self._state.description.units),
             tuple(files),
             text(found, 1_000) if isinstance(found, str) else None,
             _header(files),
         )
 
     def _row(self, trial: Trial) -> dict[str, Any]:
-        units = self._service.description.units
+        units = self._state.description.units
         return {
             "number": trial.number,
-            "task": in_words(trial, self._service.description.space.units),
+            "task": in_words(trial, self._state.description.space.units),
             "origin": trial.origin,
             "state": trial.state,
             "told": trial.told,
@@ -167,7 +167,7 @@ class Page:
 
     def _parameters(self) -> list[tuple[int, str, str, str]]:
         """Return the place, the label and the bounds of each task parameter."""
-        space = self._service.description.space
+        space = self._state.description.space
         bounds = zip(space.labels, space.low.tolist(), space.high.tolist(), strict=True)
         return [
             (place, text(label, 80), f"{low:.6g}", f"{high:.6g}") for place, (label, low, high) in enumerate(bounds)
@@ -175,7 +175,9 @@ class Page:
 
     def _news(self) -> str:
         """Return what is new, for a screen reader."""
-        background = self._service.background
+        background = self._state.background
+        if self._state.description.live:
+            return background.outcome or ""
         if background.choosing is not None:
             return "A task is being chosen."
         if background.choice_error is not None:
@@ -186,8 +188,8 @@ class Page:
 
     def _enough(self) -> str | None:
         """Return why no further task is needed for the verdict; None if one may be."""
-        service, snapshot = self._service, self._service.snapshot
-        work, about = service.background, service.description
+        state, snapshot = self._state, self._state.snapshot
+        work, about = state.background, state.description
         if not about.decides or snapshot.waiting or work.choosing is not None:
             return None
         judged = work.judgement if work.judged == snapshot.ended else None
@@ -201,10 +203,10 @@ class Page:
 
     def ended(self, number: int) -> str | None:
         """Return the result of a trial in one sentence without its full stop; None if it has none."""
-        trials = self._service.snapshot.trials
+        trials = self._state.snapshot.trials
         if not 0 <= number < len(trials) or trials[number].state == "open":
             return None
-        return text(result_sentence(trials[number], self._service.description.units), 1_000)
+        return text(result_sentence(trials[number], self._state.description.units), 1_000)
 
 
 def _given(problem: Problem | None) -> Callable[[str, str], str]:

@@ -1,12 +1,10 @@
-"""The state of the page, and everything that changes it. All of it runs in the event loop of the server."""
+"""A campaign that people execute: what changes the state of its page."""
 
 from __future__ import annotations
 
 import asyncio
-import time
 from collections import OrderedDict
-from collections.abc import AsyncIterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 from ctxval.campaign.telling import ToldResult
@@ -15,140 +13,44 @@ from ctxval.errors import CtxvalError, InputError
 from ctxval.web import jobs
 from ctxval.web.background import BackgroundProcess, Job, Stage
 from ctxval.web.desk import Desk, Snapshot
-from ctxval.web.jobs import Files, Judgement, Pictures, TaskRequest
+from ctxval.web.jobs import Files, TaskRequest
 from ctxval.web.served import OpenCampaign
+from ctxval.web.state import PageState, Work
 
 _POLL = 1.0
 """Seconds between two looks at a store that other processes may change."""
-
-_HEARTBEAT = 15.0
-"""Seconds after which a listener hears something, so that a lost connection is noticed."""
 
 _REMEMBERED = 1_000
 """Number of submitted forms that are remembered, to recognise a form that is sent twice."""
 
 
-@dataclass(frozen=True)
-class Work:
-    """Work of a background process that is not done yet.
-
-    Attributes:
-        stage: what it does at present.
-        started: the time of its start, on the clock of ``time.monotonic``.
-        reached: the time of the start of the stage.
-        counted: the time at which the stage told how much is done.
-    """
-
-    stage: Stage
-    started: float
-    reached: float
-    counted: float
-
-    @staticmethod
-    def begun(stage: str) -> Work:
-        """Return work that begins now."""
-        now = time.monotonic()
-        return Work(Stage(stage), now, now, now)
-
-    def at(self, stage: Stage) -> Work:
-        """Return the same work at a later stage, or at the same one with another count."""
-        now = time.monotonic()
-        reached = self.reached if stage.text == self.stage.text else now
-        return replace(self, stage=stage, reached=reached, counted=now)
-
-    @property
-    def seconds(self) -> int:
-        """Whole seconds since the start."""
-        return int(time.monotonic() - self.started)
-
-    @property
-    def left(self) -> int | None:
-        """Expected seconds until the end of the stage; None if they cannot be estimated."""
-        done, expected = self.stage.done, self.stage.expected
-        if expected is None or not 0 < done <= expected:
-            return None
-        left = (self.counted - self.reached) * (expected - done) / done - (time.monotonic() - self.counted)
-        return max(round(left), 0)
-
-    @property
-    def text(self) -> str:
-        """The stage, how much of it is done, and how long it takes, in words."""
-        stage, unit = self.stage, f" {self.stage.unit}".rstrip()
-        counted = "" if stage.expected is None else f", {stage.done:g} of {stage.expected:g}{unit}"
-        return f"{stage.text}{counted}" + ("" if self.left is None else f", about {self.left} s left")
-
-
-@dataclass(frozen=True, eq=False)
-class Background:
-    """What the background processes have found, and what they do.
-
-    Attributes:
-        choosing, judging: present work; None if there is none.
-        choice_error: why the last choice failed; None if it did not.
-        enough: whether the last choice found that the verdict is reached or the budget is spent.
-        chosen: the number of the trial that was opened last from this page; None if none was.
-        judgement: the last verdict; None if there is none.
-        judged: the trials that it is about, as :attr:`Snapshot.ended`.
-        judgement_error: why it failed; None if it did not.
-        pictures: the last pictures.
-        files: the files of open trials by number; a text says why there are none.
-        store_error: why the store cannot be read at present; None if it can.
-    """
-
-    choosing: Work | None = None
-    judging: Work | None = None
-    choice_error: str | None = None
-    enough: bool = False
-    chosen: int | None = None
-    judgement: Judgement | None = None
-    judged: tuple[int, int] | None = None
-    judgement_error: str | None = None
-    pictures: Pictures = field(default_factory=Pictures)
-    files: dict[int, Files | str] = field(default_factory=dict)
-    store_error: str | None = None
-
-
-class CampaignService:
+class CampaignService(PageState):
     """One campaign, with the work in progress, for any number of operators.
 
     Args:
         desk: the server's own campaign.
         reopen: opens the campaign in a child process; it must be picklable.
-
-    Attributes:
-        description: what does not change.
-        snapshot: the trials as they were last read.
-        background: what the background processes have found.
-        version: a number that grows with each change, also when the server is started again.
     """
 
     def __init__(self, desk: Desk, reopen: OpenCampaign) -> None:
+        super().__init__(desk.description, desk.first)
         self._desk = desk
-        self.description, self.snapshot = desk.description, desk.first
-        self.background = Background()
-        self.version = time.time_ns()  # it grows when the server is started again, too
-        self._changed = asyncio.Event()
-        self._tasks: set[asyncio.Task[Any]] = set()
         self._preparing: dict[int, asyncio.Task[None]] = {}
         self._submitted: OrderedDict[str, int] = OrderedDict()
         self._telling = asyncio.Lock()
-        self._closing = False
         self._chooser = BackgroundProcess(reopen, lambda stage: self._told("choosing", stage))
         self._judge = BackgroundProcess(reopen, lambda stage: self._told("judging", stage))
 
     async def start(self) -> None:
         """Start the background processes and the observation of the store."""
-        self._loop = asyncio.get_running_loop()
+        await super().start()
         self._spawn(self._background(self._chooser, jobs.warm_up))
         self._follow()
         self._spawn(self._watch())
 
     async def stop(self) -> None:
         """End all work in progress, and close everything."""
-        self.end_events()
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await super().stop()
         await self._loop.run_in_executor(None, self.close)
 
     def close(self) -> None:
@@ -192,61 +94,11 @@ class CampaignService:
             return found
         raise InputError(found or f"trial {number} is not open, so there are no files of it.")
 
-    # What operators see
-
-    async def events(self) -> AsyncIterator[tuple[str, Any]]:
-        """Yield the version of the page after each change, the work in progress, and now and then a heartbeat."""
-        seen = None
-        while not self._closing:
-            changed = self._changed
-            if seen != self.version:
-                seen = self.version
-                yield "version", seen
-            else:
-                both = {"choosing": self.background.choosing, "judging": self.background.judging}
-                work = {name: one for name, one in both.items() if one is not None}
-                yield ("work", work) if work else ("heartbeat", None)
-            try:
-                async with asyncio.timeout(_HEARTBEAT):
-                    await changed.wait()
-            except TimeoutError:
-                continue
-
-    def end_events(self) -> None:
-        """Let all listeners end, because the server stops."""
-        self._closing = True
-        self._notify()
-
     # Changes
-
-    def _update(self, **changes: Any) -> None:
-        self.background = replace(self.background, **changes)
-        self.version += 1
-        self._notify()
-
-    def _notify(self) -> None:
-        changed, self._changed = self._changed, asyncio.Event()
-        changed.set()
 
     def _told(self, kind: str, stage: Stage) -> None:
         """Take a stage from the thread of a background process."""
         self._loop.call_soon_threadsafe(self._set_stage, kind, stage)
-
-    def _set_stage(self, kind: str, stage: Stage) -> None:
-        work: Work | None = getattr(self.background, kind)
-        if work is None:
-            return
-        counts = stage.text == work.stage.text
-        changes: dict[str, Any] = {kind: work.at(stage)}
-        self.background = replace(self.background, **changes)
-        self.version += not counts
-        self._notify()
-
-    def _spawn(self, work: Any) -> asyncio.Task[Any]:
-        task = asyncio.create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        return task
 
     async def _background(self, process: BackgroundProcess, job: Job, *arguments: Any) -> Any:
         return await asyncio.wrap_future(process.submit(job, *arguments))
