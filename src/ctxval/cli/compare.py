@@ -8,17 +8,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from ctxval import plot
 from ctxval._util.files import write_text
 from ctxval._util.texts import reason_of
 from ctxval.certificates.options import CONFIDENCE
-from ctxval.cli.base import command, err, failures_of, out, print_failures
+from ctxval.cli.base import command, err, failures_of, out, print_columns, print_failures
 from ctxval.cli.commands import app
 from ctxval.cli.options import AsJson, Confidence, PartOptions, named_values
 from ctxval.cli.outputs import Force, require_outputs
-from ctxval.cli.screen import line
 from ctxval.comparison.candidates import Candidate, require_comparable
 from ctxval.comparison.compare import BUDGET, race_of, store_name
 from ctxval.comparison.result import WORDS, Comparison
@@ -170,11 +168,8 @@ def _print(found: Comparison) -> None:
     for question in found.questions:
         out.say((f"{WORDS[question]}: ", "bold"), found.ranking_text(question), wrap=True)
     for headers, rows in ((CANDIDATES, candidate_rows(found)), (PAIRS, pair_rows(found))):
-        table = Table(*headers, box=None, pad_edge=False)
-        for row in rows:
-            table.add_row(*map(line, row))
         out.say("")
-        out.print(table)
+        print_columns(headers, (), rows)
     out.say("")
     for pair in found.pairs:
         out.say(f"{pair.first}, {pair.second}: {pair.reason}.", wrap=True)

@@ -6,17 +6,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from ctxval._util.texts import shortened
-from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, out
+from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, out, print_columns
 from ctxval.cli.commands import app
 from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingFile, States, TimeField, print_breaks
 from ctxval.cli.model_options import Vectorized, print_parameters, require_model_file, step_function
 from ctxval.cli.options import AsJson, named_values
 from ctxval.cli.outputs import Force
-from ctxval.cli.replay import numbers, print_titled
-from ctxval.cli.screen import line
+from ctxval.cli.replay import numbers
 from ctxval.config.named_model import named_model
 from ctxval.errors import InputError
 from ctxval.fitting import FitReport, FittedModel, fit
@@ -153,20 +151,22 @@ def _print(report: FitReport) -> None:
         f"learned from {own.steps} steps of {len(own.runs)} recordings; errors on {held.steps} steps of "
         f"{len(held.runs)} others"
     )
-    table = Table(box=None, pad_edge=False)
-    for name in ("model", "state"):
-        table.add_column(name)
-    for name in ("steps", "rms error", "of the change"):
-        table.add_column(name, justify="right")
-    for one in report.fitted:
-        for error in sorted(one.errors, key=lambda error: list(held.states).index(error.state)):
-            rms = f"{error.rms:.3g} {error.unit}".rstrip()
-            cells = (one.kind, error.state, str(error.steps), rms, f"{100 * error.relative:.3g} %")
-            table.add_row(*map(line, cells))
-    print_titled("error on held-out recordings", table)
-    for one in report.fitted:
-        print_parameters(one.parameters)
-        for note in one.notes:
-            out.say((f"{one.kind}: ", "bold"), note, wrap=True)
+    rows = [
+        (
+            model.kind,
+            error.state,
+            str(error.steps),
+            f"{error.rms:.3g} {error.unit}".rstrip(),
+            f"{100 * error.relative:.3g} %",
+        )
+        for model in report.fitted
+        for error in sorted(model.errors, key=lambda error: list(held.states).index(error.state))
+    ]
+    columns = ("steps", "rms error", "of the change")
+    print_columns(("model", "state"), columns, rows, "error on held-out recordings")
+    for model in report.fitted:
+        print_parameters(model.parameters)
+        for note in model.notes:
+            out.say((f"{model.kind}: ", "bold"), note, wrap=True)
     for failure in report.failed:
         err.say((f"{failure.kind}: ", "yellow"), shortened(failure.reason))

@@ -29,7 +29,7 @@ from ctxval.web.desk import recording_in
 from ctxval.web.page import Page, Problem
 from ctxval.web.security import MOST_UPLOAD, Guard, Hosts
 from ctxval.web.service import CampaignService
-from ctxval.web.state import PageState, Work
+from ctxval.web.state import PageState
 
 _KINDS = ("recording", "distance", "failure")
 
@@ -135,8 +135,8 @@ class PageRoutes:
 
     async def picture(self, request: Request, session: str) -> Response:
         """Return a picture of the campaign."""
-        found = self.state.background.pictures.images.get(request.path_params["name"])
-        if found is None:
+        found = self.state.pictures.get(request.path_params["name"])
+        if not isinstance(found, bytes):
             return HTMLResponse(self.page.message("No picture", "There is no such picture yet."), 404)
         # A picture has styles of its own, and must not run anything if it is opened alone.
         policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
@@ -169,7 +169,7 @@ class OperatorPage(PageRoutes):
             *super().routes(),
             Route("/choose", inside(self.choose), methods=["POST"]),
             Route("/trials/{number:int}/{kind}", inside(self.tell), methods=["POST"]),
-            Route("/trials/{number:int}/files.zip", inside(self.archive), methods=["GET"]),
+            Route("/trials/{number:int}/files.zip", inside(self.file), methods=["GET"]),
             Route("/trials/{number:int}/files/{name}", inside(self.file), methods=["GET"]),
         ]
 
@@ -246,29 +246,22 @@ class OperatorPage(PageRoutes):
     # Files
 
     async def file(self, request: Request, session: str) -> Response:
-        """Return one file of an open trial."""
-        number, name = request.path_params["number"], request.path_params["name"]
+        """Return one file of an open trial, or all of them in one archive."""
+        number, name = request.path_params["number"], request.path_params.get("name")
         try:
-            found = await self.service.files(number)
+            files = await self.service.files_of(number)
         except CtxvalError as error:
             return HTMLResponse(self.page.message("No file", str(error)), 404)
-        if name not in found:
-            sentence = f"There is no file {visible(name)[:80]} of trial {number}; there are {', '.join(found)}."
+        if name is None:
+            content = io.BytesIO()
+            with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+                for each, data in files.items():
+                    archive.writestr(f"trial-{number}/{each}", data)
+            return _download(content.getvalue(), f"trial-{number}.zip")
+        if name not in files:
+            sentence = f"There is no file {visible(name)[:80]} of trial {number}; there are {', '.join(files)}."
             return HTMLResponse(self.page.message("No file", sentence), 404)
-        return _download(found[name], f"trial-{number}-{name}")
-
-    async def archive(self, request: Request, session: str) -> Response:
-        """Return all files of an open trial in one archive."""
-        number = request.path_params["number"]
-        try:
-            found = await self.service.files(number)
-        except CtxvalError as error:
-            return HTMLResponse(self.page.message("No file", str(error)), 404)
-        content = io.BytesIO()
-        with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, data in found.items():
-                archive.writestr(f"trial-{number}/{name}", data)
-        return _download(content.getvalue(), f"trial-{number}.zip")
+        return _download(files[name], f"trial-{number}-{name}")
 
 
 def _number(text: str) -> int | None:
@@ -279,12 +272,11 @@ def _event(kind: str, content: Any) -> str:
     if kind == "heartbeat":
         return ": the server is there\n\n"
     if kind == "work":
-        content = {name: _plain(work) for name, work in content.items()}
+        content = {
+            name: {"text": work.text, "done": work.stage.done, "expected": work.stage.expected, "seconds": work.seconds}
+            for name, work in content.items()
+        }
     return f"event: {kind}\ndata: {json.dumps(content)}\n\n"
-
-
-def _plain(work: Work) -> dict[str, Any]:
-    return {"text": work.text, "done": work.stage.done, "expected": work.stage.expected, "seconds": work.seconds}
 
 
 @contextlib.asynccontextmanager

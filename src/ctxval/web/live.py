@@ -13,7 +13,6 @@ from ctxval.certificates import Certificate, Verdict
 from ctxval.core.trial import Trial
 from ctxval.web import jobs
 from ctxval.web.background import Stage, StageSender
-from ctxval.web.desk import description_of, snapshot_of
 from ctxval.web.served import ServedCampaign
 from ctxval.web.state import PageState, Work
 
@@ -29,7 +28,7 @@ class LiveCampaign(PageState):
     """
 
     def __init__(self, served: ServedCampaign, search: IntervalSearch | None) -> None:
-        super().__init__(description_of(served, live=True), snapshot_of(served.campaign, {}))
+        super().__init__(served.description(live=True), served.snapshot({}))
         self._served, self._search = served, search
         self._stages = StageSender(self._take_stage)
         self._drawn = self._cost = 0.0
@@ -66,14 +65,9 @@ class LiveCampaign(PageState):
 
     def end(self, verdict: Verdict | None, certificate: Certificate | None, report: str | None) -> None:
         """Show the verdict, and the path of the report."""
-        judgement = None
-        if verdict is not None or certificate is not None:
-            judgement = jobs.judgement_of(verdict, certificate, self._served.experiment.units)
         outcome = "the campaign has ended, and so will this page" + (f". The report is {report}" if report else "")
-        pictures = jobs.pictures_of(self._served)
-        self._post(
-            {"judgement": judgement, "pictures": pictures, "choosing": None, "interval": None, "outcome": outcome}
-        )
+        shown = {"verdict": verdict, "certificate": certificate, "pictures": jobs.pictures_of(self._served)}
+        self._post({**shown, "choosing": None, "interval": None, "outcome": outcome})
 
     def wait_until_seen(self) -> None:
         """Give open pages a second to load the last state."""
@@ -81,22 +75,22 @@ class LiveCampaign(PageState):
             time.sleep(1)
 
     def _post(self, changes: dict[str, Any]) -> None:
-        self._loop.call_soon_threadsafe(lambda: self._update(**changes))
+        self._loop.call_soon_threadsafe(lambda: self.update(**changes))
 
     # In the event loop of the server
 
     def _show_stage(self, stage: Stage) -> None:
-        if self.background.outcome is not None:
+        if self.outcome is not None:
             return
-        present = self.background.choosing
+        present = self.choosing
         if present is None or present.stage.text != stage.text:
-            self._update(choosing=Work.begun(stage.text))
+            self.update(choosing=Work.begun(stage.text))
         self._set_stage("choosing", stage)
 
     async def _watch(self) -> None:
         while True:
-            fresh = snapshot_of(self._served.campaign, {})
+            fresh = self._served.snapshot({})
             if (fresh.signature, fresh.executions) != (self.snapshot.signature, self.snapshot.executions):
                 self.snapshot = fresh
-                self._update()
+                self.update()
             await asyncio.sleep(0.5)

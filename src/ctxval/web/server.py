@@ -25,9 +25,6 @@ from ctxval.web.served import OpenCampaign
 from ctxval.web.service import CampaignService
 from ctxval.web.state import PageState
 
-_CONNECTIONS = 256
-"""Largest number of requests and open pages at a time."""
-
 
 @dataclass(frozen=True, repr=False)
 class Address:
@@ -100,7 +97,7 @@ def _server(state: PageState, access: Access, hosts: Hosts) -> _Server:
         access_log=False,  # an address may contain the token
         server_header=False,
         proxy_headers=False,
-        limit_concurrency=_CONNECTIONS,
+        limit_concurrency=256,  # requests and open pages
         timeout_graceful_shutdown=5,
         lifespan="on",
         http=partial(Connection, Waiting()),  # type: ignore[arg-type]
@@ -135,8 +132,8 @@ def listening(host: str, port: int) -> socket.socket:
     if not 0 <= port <= 65535:
         raise InputError(f"the port must be from 0 to 65535, got {port}.")
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        return socket.create_server(found[4][:2], family=found[0], backlog=128)
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        return socket.create_server(address[:2], family=family, backlog=128)
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"the page cannot be served at {host}, port {port}: {reason}.") from error

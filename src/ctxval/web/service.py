@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections import OrderedDict
-from dataclasses import replace
 from typing import Any
 
 from ctxval.campaign.telling import ToldResult
@@ -12,16 +11,10 @@ from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError, InputError
 from ctxval.web import jobs
 from ctxval.web.background import BackgroundProcess, Job, Stage
-from ctxval.web.desk import Desk, Snapshot
+from ctxval.web.desk import Desk
 from ctxval.web.jobs import Files, TaskRequest
 from ctxval.web.served import OpenCampaign
 from ctxval.web.state import PageState, Work
-
-_POLL = 1.0
-"""Seconds between two looks at a store that other processes may change."""
-
-_REMEMBERED = 1_000
-"""Number of submitted forms that are remembered, to recognise a form that is sent twice."""
 
 
 class CampaignService(PageState):
@@ -38,8 +31,8 @@ class CampaignService(PageState):
         self._preparing: dict[int, asyncio.Task[None]] = {}
         self._submitted: OrderedDict[str, int] = OrderedDict()
         self._telling = asyncio.Lock()
-        self._chooser = BackgroundProcess(reopen, lambda stage: self._told("choosing", stage))
-        self._judge = BackgroundProcess(reopen, lambda stage: self._told("judging", stage))
+        self._chooser = BackgroundProcess(reopen, lambda stage: self._take_stage("choosing", stage))
+        self._judge = BackgroundProcess(reopen, lambda stage: self._take_stage("judging", stage))
 
     async def start(self) -> None:
         """Start the background processes and the observation of the store."""
@@ -62,41 +55,37 @@ class CampaignService(PageState):
 
     def choose(self, request: TaskRequest) -> None:
         """Start to choose the next task."""
-        if self.background.choosing is not None:
+        if self.choosing is not None:
             raise InputError("a task is already being chosen.")
-        if request.trials is not None and request.trials != len(self.snapshot.trials):
-            raise InputError(
-                f"another task was opened since this page was loaded, as trial {len(self.snapshot.trials) - 1}. If you "
-                "need one more task, ask again."
-            )
-        self._update(choosing=Work.begun("choosing a task"), choice_error=None, chosen=None, enough=False)
+        request.require_current(len(self.snapshot.trials))
+        self.update(choosing=Work.begun("choosing a task"), choice_error=None, chosen=None, enough=False)
         self._spawn(self._choose(request))
 
-    async def tell(self, number: int, told: ToldResult, submission: str) -> Trial:
+    async def tell(self, number: int, result: ToldResult, submission: str) -> Trial:
         """Record the result of an open trial, or replace an earlier result, once for each submitted form."""
         async with self._telling:
             if not submission or self._submitted.get(submission) != number:
                 try:
-                    await self._desk.tell(number, told)
+                    await self._desk.tell(number, result)
                 finally:
                     await self._look()
                 self._submitted[submission] = number
-                if len(self._submitted) > _REMEMBERED:
+                if len(self._submitted) > 1_000:  # forms that are remembered, to recognise one that is sent twice
                     self._submitted.popitem(last=False)
             return self.snapshot.trials[number]
 
-    async def files(self, number: int) -> Files:
+    async def files_of(self, number: int) -> Files:
         """Return the files of an open trial, after they are prepared."""
         if number in self._preparing:
             await asyncio.shield(self._preparing[number])
-        found = self.background.files.get(number)
-        if isinstance(found, dict):
-            return found
-        raise InputError(found or f"trial {number} is not open, so there are no files of it.")
+        files = self.files.get(number)
+        if isinstance(files, dict):
+            return files
+        raise InputError(files or f"trial {number} is not open, so there are no files of it.")
 
     # Changes
 
-    def _told(self, kind: str, stage: Stage) -> None:
+    def _take_stage(self, kind: str, stage: Stage) -> None:
         """Take a stage from the thread of a background process."""
         self._loop.call_soon_threadsafe(self._set_stage, kind, stage)
 
@@ -105,20 +94,20 @@ class CampaignService(PageState):
 
     async def _choose(self, request: TaskRequest) -> None:
         try:
-            found = await self._background(self._chooser, jobs.choose, request)
+            opened = await self._background(self._chooser, jobs.choose, request)
         except CtxvalError as error:
-            self._update(choosing=None, choice_error=str(error))
+            self.update(choosing=None, choice_error=str(error))
         else:
-            number, files = found or (None, {})
-            kept = self.background.files if number is None else {**self.background.files, number: files}
-            self._update(choosing=None, chosen=number, enough=found is None, files=kept)
+            number, files = opened or (None, {})
+            kept = self.files if number is None else {**self.files, number: files}
+            self.update(choosing=None, chosen=number, enough=opened is None, files=kept)
         await self._look()
 
     async def _watch(self) -> None:
         while True:
-            await asyncio.sleep(_POLL)
+            await asyncio.sleep(1.0)
             try:
-                if await self._desk.signature() == self.snapshot.signature and self.background.store_error is None:
+                if await self._desk.signature() == self.snapshot.signature and self.store_error is None:
                     continue
             except CtxvalError:
                 pass  # looking again says why
@@ -127,55 +116,50 @@ class CampaignService(PageState):
     async def _look(self) -> None:
         """Read the store; if it has changed, bring everything else up to date."""
         try:
-            found = await self._desk.snapshot()
+            snapshot = await self._desk.snapshot()
         except CtxvalError as error:
-            if self.background.store_error != str(error):
-                self._update(store_error=str(error))
+            if self.store_error != str(error):
+                self.update(store_error=str(error))
             return
-        if self.background.store_error is not None:
-            self._update(store_error=None)
-        if not _same(found, self.snapshot):
-            self.snapshot = found
+        if self.store_error is not None:
+            self.update(store_error=None)
+        # An execution that starts changes no signature.
+        states = [[(trial.state, trial.attempts) for trial in each.trials] for each in (snapshot, self.snapshot)]
+        if snapshot.signature != self.snapshot.signature or states[0] != states[1]:
+            self.snapshot = snapshot
             self._follow()
-            self._update(enough=False)
+            self.update(enough=False)
 
     def _follow(self) -> None:
         """Prepare the files of open trials, forget those of others, and judge the trials that have ended."""
         waiting = {trial.number for trial in self.snapshot.waiting if not trial.attempts}
-        files = self.background.files
-        self.background = replace(self.background, files={n: kept for n, kept in files.items() if n in waiting})
-        for number in waiting - set(files) - set(self._preparing):
+        self.files = {number: kept for number, kept in self.files.items() if number in waiting}
+        for number in waiting - set(self.files) - set(self._preparing):
             self._preparing[number] = self._spawn(self._prepare(number))
-        if self.background.judging is None and self.background.judged != self.snapshot.ended:
-            self.background = replace(self.background, judging=Work.begun("drawing the pictures"))
+        if self.judging is None and self.judged != self.snapshot.ended:
+            self.judging = Work.begun("drawing the pictures")
             self._spawn(self._evaluate())
 
     async def _prepare(self, number: int) -> None:
-        found: Files | str
+        files: Files | str
         try:
-            found = await self._background(self._chooser, jobs.files_of, number)
+            files = await self._background(self._chooser, jobs.files_of, number)
         except CtxvalError as error:
-            found = str(error)
+            files = str(error)
         finally:
             self._preparing.pop(number, None)
         if any(trial.number == number for trial in self.snapshot.waiting):
-            self._update(files={**self.background.files, number: found})
+            self.update(files={**self.files, number: files})
 
     async def _evaluate(self) -> None:
         """Draw and judge until the results are those of the present trials."""
-        while self.background.judged != self.snapshot.ended:
+        while self.judged != self.snapshot.ended:
             ended = self.snapshot.ended
             try:
-                self._update(pictures=await self._background(self._judge, jobs.draw))
-                judgement = await self._background(self._judge, jobs.judge)
+                self.update(pictures=await self._background(self._judge, jobs.draw))
+                verdict = await self._background(self._judge, jobs.judge)
             except CtxvalError as error:
-                self._update(judged=ended, judgement=None, judgement_error=str(error))
+                self.update(judged=ended, verdict=None, judgement_error=str(error))
             else:
-                self._update(judged=ended, judgement=judgement, judgement_error=None)
-        self._update(judging=None)
-
-
-def _same(one: Snapshot, other: Snapshot) -> bool:
-    """Return whether two snapshots show the same; an execution that starts changes no signature."""
-    states = [[(trial.state, trial.attempts) for trial in each.trials] for each in (one, other)]
-    return one.signature == other.signature and states[0] == states[1]
+                self.update(judged=ended, verdict=verdict, judgement_error=None)
+        self.update(judging=None)

@@ -6,21 +6,22 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
+from ctxval.certificates import Certificate, Verdict
 from ctxval.web.background import Stage
-from ctxval.web.desk import Description, Snapshot
-from ctxval.web.jobs import Files, Judgement, Pictures
+from ctxval.web.jobs import Files, Pictures
+from ctxval.web.served import Description, Snapshot
 
 
 @dataclass(frozen=True)
 class Work:
-    """Work of a background process that is not done yet.
+    """Work that is not done yet, with times on the clock of ``time.monotonic``.
 
     Attributes:
-        stage: what it does at present.
-        started: the time of its start, on the clock of ``time.monotonic``.
+        stage: what is done at present.
+        started: the time of its start.
         reached: the time of the start of the stage.
         counted: the time at which the stage told how much is done.
     """
@@ -64,40 +65,6 @@ class Work:
         return f"{stage.text}{counted}" + ("" if self.left is None else f", about {self.left} s left")
 
 
-@dataclass(frozen=True, eq=False)
-class Background:
-    """What the background processes have found, and what they do.
-
-    Attributes:
-        choosing, judging: present work; None if there is none.
-        choice_error: why the last choice failed; None if it did not.
-        enough: whether the last choice found that the verdict is reached or the budget is spent.
-        chosen: the number of the trial that was opened last from this page; None if none was.
-        judgement: the last verdict; None if there is none.
-        judged: the trials that it is about, as :attr:`Snapshot.ended`.
-        judgement_error: why it failed; None if it did not.
-        pictures: the last pictures.
-        files: the files of open trials by number; a text says why there are none.
-        store_error: why the store cannot be read at present; None if it can.
-        interval: the largest executed distance and a preliminary bound, while a command executes the tasks.
-        outcome: how the command that executed the tasks has ended; None if it has not.
-    """
-
-    choosing: Work | None = None
-    judging: Work | None = None
-    choice_error: str | None = None
-    enough: bool = False
-    chosen: int | None = None
-    judgement: Judgement | None = None
-    judged: tuple[int, int] | None = None
-    judgement_error: str | None = None
-    pictures: Pictures = field(default_factory=Pictures)
-    files: dict[int, Files | str] = field(default_factory=dict)
-    store_error: str | None = None
-    interval: str | None = None
-    outcome: str | None = None
-
-
 class PageState:
     """What the page shows, for any number of browsers. All of it belongs to the event loop of the server.
 
@@ -107,19 +74,45 @@ class PageState:
 
     Attributes:
         snapshot: the trials as they were last read.
-        background: the work in progress, and its results.
+        choosing, judging: present work; None if there is none.
+        choice_error: why the last choice failed; None if it did not.
+        enough: whether the last choice found that the verdict is reached or the budget is spent.
+        chosen: the number of the trial that was opened last from this page; None if none was.
+        verdict: the last verdict; None if there is none.
+        certificate: the certificate of a campaign without a threshold, which has no verdict.
+        judged: the trials that the verdict is about, as :attr:`Snapshot.ended`.
+        judgement_error: why there is no verdict; None if there is no reason.
+        pictures: the last pictures.
+        files: the files of open trials by number; a text says why there are none.
+        store_error: why the store cannot be read at present; None if it can.
+        interval: the largest executed distance and a preliminary bound, while a command executes the tasks.
+        outcome: how the command that executed the tasks has ended; None if it has not.
         version: a number that grows with each change, also when the server is started again.
         listeners: the number of browsers that are kept up to date.
     """
 
+    choosing: Work | None = None
+    judging: Work | None = None
+    choice_error: str | None = None
+    enough: bool = False
+    chosen: int | None = None
+    verdict: Verdict | None = None
+    certificate: Certificate | None = None
+    judged: tuple[int, int] | None = None
+    judgement_error: str | None = None
+    store_error: str | None = None
+    interval: str | None = None
+    outcome: str | None = None
+
     def __init__(self, description: Description, snapshot: Snapshot) -> None:
         self.description, self.snapshot = description, snapshot
-        self.background = Background()
+        self.pictures: Pictures = {}
+        self.files: dict[int, Files | str] = {}
         self.version = time.time_ns()
+        self.listeners = 0
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Task[Any]] = set()
         self._closing = False
-        self.listeners = 0
 
     async def start(self) -> None:
         """Begin to follow the campaign."""
@@ -143,7 +136,7 @@ class PageState:
                     seen = self.version
                     yield "version", seen
                 else:
-                    both = {"choosing": self.background.choosing, "judging": self.background.judging}
+                    both = {"choosing": self.choosing, "judging": self.judging}
                     present = {name: work for name, work in both.items() if work is not None}
                     yield ("work", present) if present else ("heartbeat", None)
                 with contextlib.suppress(TimeoutError):
@@ -157,8 +150,9 @@ class PageState:
         self._closing = True
         self._notify()
 
-    def _update(self, **changes: Any) -> None:
-        self.background = replace(self.background, **changes)
+    def update(self, **changes: Any) -> None:
+        """Change what the page shows."""
+        vars(self).update(changes)
         self.version += 1
         self._notify()
 
@@ -167,14 +161,11 @@ class PageState:
         changed.set()
 
     def _set_stage(self, kind: str, stage: Stage) -> None:
-        work: Work | None = getattr(self.background, kind)
-        if work is None:
-            return
-        counts = stage.text == work.stage.text
-        changes: dict[str, Any] = {kind: work.at(stage)}
-        self.background = replace(self.background, **changes)
-        self.version += not counts
-        self._notify()
+        work: Work | None = getattr(self, kind)
+        if work is not None:
+            setattr(self, kind, work.at(stage))
+            self.version += stage.text != work.stage.text
+            self._notify()
 
     def _spawn(self, work: Any) -> asyncio.Task[Any]:
         task = asyncio.create_task(work)
