@@ -15,7 +15,7 @@ from ctxval.aspect1 import TASKS
 from ctxval.cli.aspect1_findings import aspect1_findings
 from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, out
 from ctxval.cli.commands import app
-from ctxval.cli.options import TARGET, AsJson, PartOptions, named_values
+from ctxval.cli.options import AsJson, PartOptions, Target, named_values
 from ctxval.config.check import check_experiment
 from ctxval.config.settings import read_settings
 from ctxval.core.experiment import UnitsWarning
@@ -134,13 +134,7 @@ def init(
 @app.command()
 @command
 def check(
-    target: Annotated[
-        str,
-        typer.Argument(
-            metavar=TARGET,
-            help="Experiment to check: a case, an experiment file, or a reference to an object in Python.",
-        ),
-    ],
+    target: Target,
     execute: Annotated[
         bool, typer.Option("--execute", help="Also execute one task twice and compare the two executions.")
     ] = False,

@@ -10,11 +10,30 @@ import typer
 from ctxval._util.texts import shortened
 from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, out, print_columns
 from ctxval.cli.commands import app
-from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingFile, States, TimeField, print_breaks
-from ctxval.cli.model_options import Vectorized, print_parameters, require_model_file, step_function
+from ctxval.cli.log_options import (
+    Delay,
+    Dt,
+    Inputs,
+    LogOptions,
+    Logs,
+    MappingFile,
+    RandomSeed,
+    States,
+    Steps,
+    TimeField,
+    numbers,
+    print_breaks,
+)
+from ctxval.cli.model_options import (
+    Parameters,
+    StepFunction,
+    Vectorized,
+    print_parameters,
+    require_model_file,
+    step_function,
+)
 from ctxval.cli.options import AsJson, named_values
 from ctxval.cli.outputs import Force
-from ctxval.cli.replay import numbers
 from ctxval.config.named_model import named_model
 from ctxval.errors import InputError
 from ctxval.fitting import FitReport, FittedModel, fit
@@ -29,20 +48,6 @@ Kinds = Annotated[
         "if --step is given).",
     ),
 ]
-StepFunction = Annotated[
-    str | None,
-    typer.Option(
-        "--step", metavar="MODULE:ATTR", help="Your function (x, u, theta) -> x_next, whose parameters are estimated."
-    ),
-]
-Parameters = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--parameter",
-        metavar="NAME=[LOW, HIGH]",
-        help="Bounds of a parameter of --step, such as mass=[0.5, 2.0]. Repeat --parameter in the order of theta.",
-    ),
-]
 HoldOut = Annotated[
     float, typer.Option(help="Share of the recordings that is held out, from which no model is learned.")
 ]
@@ -55,10 +60,6 @@ Given = Annotated[
         "a result of mujoco.sysid, or any model that `ctxval replay --model` takes.",
     ),
 ]
-Steps = Annotated[
-    str | None,
-    typer.Option(help=f"Numbers of steps after which errors are computed (default: {','.join(map(str, STEPS))})."),
-]
 Out = Annotated[
     Path | None,
     typer.Option(
@@ -68,7 +69,6 @@ Out = Annotated[
         "the table model of an experiment file.",
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
 
 @app.command("fit")
@@ -90,7 +90,7 @@ def fit_models(
     steps: Steps = None,
     out_file: Out = None,
     force: Force = False,
-    seed: Seed = 0,
+    seed: RandomSeed = 0,
     as_json: AsJson = False,
 ) -> Any:
     """Learn models from recordings, and compare their errors on recordings that were held out.

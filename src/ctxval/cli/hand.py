@@ -17,7 +17,7 @@ from ctxval.campaign.known import KnownExecution
 from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
 from ctxval.cli.base import FALSIFIED, command, out, print_verdict
 from ctxval.cli.commands import app
-from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, Threshold, named_values
+from ctxval.cli.options import TARGET, AsJson, PartOptions, SearchName, StoreArgument, Threshold, named_values
 from ctxval.cli.outputs import Force, require_folder
 from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, budget_of, limit_of, open_store, open_target
 from ctxval.core.exchange import TASK_FORMAT
@@ -76,9 +76,6 @@ Budget = Annotated[
     ),
 ]
 Reopened = Annotated[int | None, typer.Option(help="Write the files of this open trial again.")]
-SearchName = Annotated[
-    str | None, typer.Option(help=f"Search method of a new store: {SEARCH_METHODS} (default: auto).")
-]
 Seed = Annotated[int | None, typer.Option(help="Seed of the random numbers of a new store (default: 0).")]
 Resample = Annotated[bool, typer.Option("--resample", help="Interpolate a recording to the time steps of the task.")]
 StartTolerance = Annotated[

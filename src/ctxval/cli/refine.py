@@ -12,7 +12,14 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions
 from ctxval.cli.base import FALSIFIED, command, out, print_columns
 from ctxval.cli.commands import app
-from ctxval.cli.model_options import Vectorized, print_parameters, require_model_file, step_function
+from ctxval.cli.model_options import (
+    Parameters,
+    StepFunction,
+    Vectorized,
+    print_parameters,
+    require_model_file,
+    step_function,
+)
 from ctxval.cli.options import (
     TARGET,
     AsJson,
@@ -66,19 +73,6 @@ Fit = Annotated[
         help="Your function fit(data) -> model, for the method fit. It must return the same model for the same data.",
     ),
 ]
-StepFunction = Annotated[
-    str | None,
-    typer.Option("--step", metavar="MODULE:ATTR", help="Your function (x, u, theta) -> x_next, for parameters."),
-]
-Bounds = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--parameter",
-        metavar="NAME=[LOW, HIGH]",
-        help="Bounds of a parameter, such as mass=[0.5, 2.0], for the method parameters. Repeat --parameter in the "
-        "order of theta.",
-    ),
-]
 Out = Annotated[
     Path | None,
     typer.Option(
@@ -99,7 +93,7 @@ def refine_model(
     method: MethodName = "residual",
     fit: Fit = None,
     step: StepFunction = None,
-    parameter: Bounds = None,
+    parameter: Parameters = None,
     vectorized: Vectorized = False,
     out_file: Out = None,
     force: Force = False,

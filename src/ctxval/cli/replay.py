@@ -10,7 +10,20 @@ import typer
 
 from ctxval.cli.base import command, out, print_columns
 from ctxval.cli.commands import app
-from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingFile, States, TimeField, print_breaks
+from ctxval.cli.log_options import (
+    Delay,
+    Dt,
+    Inputs,
+    LogOptions,
+    Logs,
+    MappingFile,
+    RandomSeed,
+    States,
+    Steps,
+    TimeField,
+    numbers,
+    print_breaks,
+)
 from ctxval.cli.options import AsJson, named_values
 from ctxval.cli.outputs import Force, require_outputs
 from ctxval.config.named_model import named_model
@@ -46,16 +59,11 @@ Target = Annotated[
         "recordings is the mapping of the logs, unless another one is given. Its system is never executed.",
     ),
 ]
-Steps = Annotated[
-    str | None,
-    typer.Option(help=f"Numbers of steps after which errors are computed (default: {','.join(map(str, STEPS))})."),
-]
 Executions = Annotated[int, typer.Option(min=1, help="Number of executions that are proposed with --experiment.")]
 Html = Annotated[
     Path | None,
     typer.Option("--html", help="Also write everything as one HTML page, which opens no connection, to this file."),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
 
 @app.command()
@@ -73,7 +81,7 @@ def replay(
     delay: Delay = None,
     steps: Steps = None,
     executions: Executions = 10,
-    seed: Seed = 0,
+    seed: RandomSeed = 0,
     html: Html = None,
     force: Force = False,
     as_json: AsJson = False,
@@ -119,17 +127,6 @@ def _name(model: str | None, experiment: Experiment | None) -> str:
     if model is not None:
         return Path(model).name
     return "" if experiment is None else experiment.name
-
-
-def numbers(text: str) -> list[int]:
-    """Return the numbers of steps in a text with commas between them."""
-    parts = [part.strip() for part in text.split(",")]
-    if not all(part.isdecimal() and int(part) > 0 for part in parts):
-        raise InputError(f"--steps must be positive integers with commas between them, such as 1,10,50, got {text!r}.")
-    return [int(part) for part in parts]
-
-
-# What is printed
 
 
 def _print(report: ReplayReport, found: Recordings, units: str) -> None:

@@ -78,7 +78,13 @@ def serve(
     def first() -> ServedCampaign:
         return _served(open_store(Store.existing(store), store, experiment, trust, accept_change), threshold, budget)
 
-    web.serve(first, again, address, _say_started)
+    def say_started(place: str, secret: str | None) -> None:
+        out.say(f"the page is at {place}" + ("" if secret is None else f"?token={secret}"))
+        if secret is not None:
+            out.say("everybody who has this address can record results. It is sent without encryption.")
+        out.say("Ctrl-C stops the server; all results are stored.")
+
+    web.serve(first, again, address, say_started)
 
 
 @dataclass(frozen=True)
@@ -111,12 +117,3 @@ def web_server() -> Any:
         return importlib.import_module("ctxval.web.server")
     except ImportError as error:
         raise InputError(f"the page needs {error.name}: pip install 'ctxval[web]'.") from error
-
-
-def _say_started(address: str, token: str | None) -> None:
-    if token is None:
-        out.say(f"the page is at {address}")
-    else:
-        out.say(f"the page is at {address}?token={token}")
-        out.say("everybody who has this address can record results. It is sent without encryption.")
-    out.say("Ctrl-C stops the server; all results are stored.")

@@ -17,9 +17,6 @@ from ctxval.errors import StoreAccessError
 from ctxval.storage.recovery import export, recover
 from ctxval.storage.store import Store
 
-_SENTENCES = 20
-"""Largest number of sentences about damage that are printed."""
-
 
 @app.command()
 @command
@@ -91,9 +88,9 @@ def export_store(
         "folder": str(target),
     }
     if not as_json:
-        for sentence in found.damaged[:_SENTENCES]:
+        for sentence in found.damaged[:20]:
             out.say(("cannot be read", "yellow"), f": {sentence}")
-        if len(found.damaged) > _SENTENCES:
-            out.say(f"and {len(found.damaged) - _SENTENCES} others; trials.json lists them.")
+        if len(found.damaged) > 20:
+            out.say(f"and {len(found.damaged) - 20} others; trials.json lists them.")
         out.say(f"{len(found.trials)} trials and {len(found.trajectories)} trajectories in {target}")
     return report

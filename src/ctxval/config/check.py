@@ -43,14 +43,7 @@ FindingState = Literal["ok", "noted", "failed", "skipped"]
 
 @dataclass(frozen=True)
 class Checked:
-    """The result of one check.
-
-    Attributes:
-        check: the name of the check.
-        state: ``ok``; ``failed`` if there is an error; ``noted`` if the user should read the text; ``skipped`` if the
-            check was not made.
-        text: one sentence that explains the result.
-    """
+    """The result of one check: a sentence, and whether it is ok, failed, not made, or to be read by the user."""
 
     check: str
     state: FindingState

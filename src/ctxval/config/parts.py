@@ -152,14 +152,7 @@ def _transitions(path: Path) -> Transitions | None:
 
 @dataclass(frozen=True)
 class TaskTable:
-    """A task function without code: every component is a number, or a task parameter by name.
-
-    Attributes:
-        initial_state: one component for each state: ``1.5``, ``"name"``, ``"-name"`` or ``"name[2]"``.
-        goal: components in the same form; None for the origin.
-        horizon: number of steps.
-        dt: time step in seconds.
-    """
+    """A task function without code: every component is a number, or a task parameter by name."""
 
     initial_state: tuple[float | str, ...]
     goal: tuple[float | str, ...] | None
@@ -261,12 +254,9 @@ def with_distribution(
 ) -> TaskSpace:
     """Return a task space with the distribution of tasks of an experiment file.
 
-    Args:
-        space: the task space.
-        tables: for each parameter, ``{type = "normal", mean = ..., deviation = ...}``, ``{type = "uniform"}`` or
-            ``{ref = "module:attr"}`` of a frozen distribution of scipy.stats; or only ``sampler``, the reference of a
-            function ``(rng, n) -> tasks (n, d)``.
-        folder: the folder of the modules; the current folder by default.
+    The tables are, for each parameter, ``{type = "normal", mean = ..., deviation = ...}``, ``{type = "uniform"}`` or
+    ``{ref = "module:attr"}`` of a frozen distribution of scipy.stats; or only ``sampler``, the reference of a function
+    ``(rng, n) -> tasks (n, d)``.
     """
     if set(tables) == {"sampler"} and set(tables["sampler"]) == {"ref"} and "sampler" not in space.names:
         return space.sampled(argument(tables["sampler"], folder))

@@ -17,11 +17,10 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.interval_search import is_decisive
 from ctxval.certificates import CertificateOptions
 from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, WITHIN
-from ctxval.config.aspect1_table import Aspect1Table
-from ctxval.config.certificate_table import CertificateTable
 from ctxval.config.experiments import named_experiment
-from ctxval.config.parts import argument, part, require_types, space_of, task_function, with_distribution
+from ctxval.config.parts import part, space_of, task_function, with_distribution
 from ctxval.config.signatures import code_named, signed
+from ctxval.config.tables import Aspect1Table, CertificateTable, SearchTable
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.validation import Validation
@@ -29,30 +28,7 @@ from ctxval.data import LogMapping
 from ctxval.errors import InputError, UnknownNameError
 from ctxval.models import Refined, read_refined
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH
-from ctxval.searches import REGISTRY as SEARCHES
-from ctxval.searches import Search, by_name
 from ctxval.storage.store import Store
-
-
-class SearchTable(BaseModel):
-    """The table ``[search]``: the name of a search, and its options.
-
-    Attributes:
-        name: the name in the registry of searches.
-        repeats: the number of executions of each task; more than 1 if the system is noisy.
-    """
-
-    model_config = ConfigDict(extra="allow")
-
-    name: str = DEFAULT_SEARCH
-    repeats: int = Field(default=1, ge=1)
-
-    def build(self, folder: Path | None = None) -> Search:
-        """Return the search."""
-        options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
-        options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
-        return by_name(self.name, repeats=self.repeats, **options)
-
 
 Part = str | dict[str, Any]
 """``module:attr``, or a table with a type and its arguments."""

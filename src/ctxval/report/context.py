@@ -37,12 +37,7 @@ _SLOW_REPLAYS = 40
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """The trajectories of one trial.
-
-    Attributes:
-        model: the closed loop on M.
-        system: the execution of S.
-    """
+    """The trajectories of one trial: the closed loop on M, and the execution of S."""
 
     model: Trajectory
     system: Trajectory
@@ -261,24 +256,15 @@ def context_of_campaign(
     certificate: CertificateOptions | None = None,
     budget: int | None = None,
 ) -> ReportContext:
-    """Return what a report of a campaign is made from.
-
-    Args:
-        campaign: the campaign.
-        verdict: its verdict, if it was computed before.
-        threshold: tau, for a verdict that is computed now; None to use ``verdict``.
-        certificate: the kind and the options of the certificate of that verdict.
-        budget: the budget of the campaign.
-    """
-    found = verdict
-    if found is None and threshold is not None:
-        found = campaign.verdict(threshold, certificate=certificate)
+    """Return what a report of a campaign is made from: its verdict, or the verdict on a threshold."""
+    if verdict is None and threshold is not None:
+        verdict = campaign.verdict(threshold, certificate=certificate)
     return ReportContext(
         campaign.name,
         campaign.validation.space,
         campaign.trials,
         campaign.store,
-        found,
+        verdict,
         campaign.validation,
         labels=campaign.validation.labels,
         budget=budget,
@@ -297,19 +283,7 @@ def context_of_store(
     missing: str = "",
     labels: Labels | None = None,
 ) -> ReportContext:
-    """Return what a report of a store is made from, if its experiment is not loaded. No code is imported or run.
-
-    Args:
-        store: the store.
-        threshold: tau; without it there is no verdict.
-        certificate: the kind and the options of the certificate.
-        missing: why the experiment is not loaded, as a sentence.
-        labels: names and units.
-
-    Raises:
-        InputError: if the store does not describe its task space, or its trials do not lie in it.
-        StoreError: if the store cannot be read.
-    """
+    """Return what a report of a store is made from, if its experiment is not loaded. No code is imported or run."""
     with store.snapshot():
         description, changes, trials = store.description(), store.history(), store.trials()
     provenance = Provenance.of(description, changes)

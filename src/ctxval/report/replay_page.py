@@ -18,18 +18,11 @@ from ctxval.report.page import Rendered, SectionOf, framed, now, rendered_sectio
 
 __all__ = ["replay_page", "write_replay_page"]
 
-_LISTED = 20
-"""Largest number of sources and of splits that are listed."""
-
 _CHARTED = 12
 """Largest number of states and inputs with charts of their own."""
 
 
-class _Section:
-    """What all sections share."""
-
-
-class InsightsOfReplay(_Section):
+class InsightsOfReplay:
     """What follows from the recordings, in sentences."""
 
     title = "What follows"
@@ -41,7 +34,7 @@ class InsightsOfReplay(_Section):
         return bullets(_sentence(one) for one in context.insights)
 
 
-class ErrorsOfReplay(_Section):
+class ErrorsOfReplay:
     """The errors of the prediction after one and several steps."""
 
     title = "Error of the prediction"
@@ -60,7 +53,19 @@ class ErrorsOfReplay(_Section):
             "Share of the change",
             "Diverged",
         )
-        rows = [_error_row(one) for errors in by_state.values() for one in errors]
+        rows = [
+            (
+                error.state,
+                error.steps,
+                quantity(error.rms, error.unit),
+                f"{number(error.lowest, 3)} to {number(error.highest, 3)}",
+                number(error.upper, 3),
+                percent(error.relative, 3) if np.isfinite(error.relative) else "more than any change",
+                percent(error.diverged),
+            )
+            for errors in by_state.values()
+            for error in errors
+        ]
         meaning = (
             "A share of 100 % of the change is the error of a model that predicts no change. The errors are those of "
             "recordings that the model has not seen, unless it has seen all of them."
@@ -75,7 +80,7 @@ class ErrorsOfReplay(_Section):
         )
 
 
-class RegionsOfReplay(_Section):
+class RegionsOfReplay:
     """Where in state and input the one-step error is large."""
 
     title = "Where the error is large"
@@ -99,7 +104,7 @@ class RegionsOfReplay(_Section):
         return joined([paragraph(meaning), small_charts(charts), numbers])
 
 
-class ResidualsOfReplay(_Section):
+class ResidualsOfReplay:
     """How much of the error a better model could explain."""
 
     title = "What a better model could explain"
@@ -130,7 +135,7 @@ class ResidualsOfReplay(_Section):
         return joined([paragraph(meaning), table("One-step residual", headers, rows)])
 
 
-class TasksOfReplay(_Section):
+class TasksOfReplay:
     """What the recordings predict of the tasks of an experiment.
 
     Args:
@@ -152,24 +157,24 @@ class TasksOfReplay(_Section):
             f"{tasks.draws} draws of the dynamics, and at most {quantity(tasks.upper, self.units)} in 95 % of them. "
             "No execution has tested this, and it is no verdict."
         )
+        numbers = np.arange(1.0, len(tasks.worst) + 1)
+        low, median, high = (
+            np.array([getattr(one, name) for one in tasks.worst]) for name in ("low", "median", "high")
+        )
+        label = f"distance [{self.units}]" if self.units else "distance"
+        axes = Axis("task in the table below", 0.5, len(numbers) + 0.5), Axis.over(label, high, zero=True)
+        chart = Chart("Predicted distances of the worst tasks, with 90 % of the draws", *axes)
+        chart.whiskers(numbers, low, high, "corrected").marks(numbers, median, "corrected", "predicted")
         left = paragraph(f"No controller can be designed for {percent(tasks.unplanned)} of the tasks.")
         return joined(
             [
                 paragraph(bound),
                 *([left] if tasks.unplanned else []),
-                self._chart(tasks.worst),
+                chart,
                 self._table("Tasks with the largest predicted distances", tasks.worst),
                 self._table("Executions that would tell most of the largest distance", tasks.executions),
             ]
         )
-
-    def _chart(self, tasks: Sequence[PredictedTask]) -> Chart:
-        numbers = np.arange(1.0, len(tasks) + 1)
-        low, median, high = (np.array([getattr(one, name) for one in tasks]) for name in ("low", "median", "high"))
-        label = f"distance [{self.units}]" if self.units else "distance"
-        axes = Axis("task in the table below", 0.5, len(tasks) + 0.5), Axis.over(label, high, zero=True)
-        chart = Chart("Predicted distances of the worst tasks, with 90 % of the draws", *axes)
-        return chart.whiskers(numbers, low, high, "corrected").marks(numbers, median, "corrected", "predicted")
 
     def _table(self, caption: str, tasks: Sequence[PredictedTask]) -> Markup:
         resolved = any(one.resolved is not None for one in tasks)
@@ -177,7 +182,7 @@ class TasksOfReplay(_Section):
         rows = [
             (
                 str(row),
-                _task(one),
+                ", ".join(f"{name} = {number(value)}" for name, value in one.parameters.items()),
                 quantity(one.median, self.units),
                 f"{number(one.low)} and {number(one.high)}",
                 *((percent(one.resolved or 0.0),) if resolved else ()),
@@ -187,7 +192,7 @@ class TasksOfReplay(_Section):
         return table(caption, headers, rows)
 
 
-class RecordingsOfReplay(_Section):
+class RecordingsOfReplay:
     """The recordings, how they were read and where they were split."""
 
     title = "Recordings"
@@ -248,23 +253,12 @@ def _named(name: str, unit: str) -> str:
 
 
 def _cut(lines: Sequence[str]) -> list[str]:
-    more = [f"and {len(lines) - _LISTED} others; --json lists them"] if len(lines) > _LISTED else []
-    return [*lines[:_LISTED], *more]
+    more = [f"and {len(lines) - 20} others; --json lists them"] if len(lines) > 20 else []
+    return [*lines[:20], *more]
 
 
 def _bar(share: float) -> Markup:
     return joined([percent(share, 3), bar(min(max(share, 0.0), 1.0))])
-
-
-def _task(one: PredictedTask) -> str:
-    return ", ".join(f"{name} = {number(value)}" for name, value in one.parameters.items())
-
-
-def _error_row(one: StepError) -> tuple[object, ...]:
-    share = percent(one.relative, 3) if np.isfinite(one.relative) else "more than any change"
-    spread = f"{number(one.lowest, 3)} to {number(one.highest, 3)}"
-    diverged = percent(one.diverged)
-    return (one.state, one.steps, quantity(one.rms, one.unit), spread, number(one.upper, 3), share, diverged)
 
 
 def _error_chart(errors: Sequence[StepError]) -> Chart:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import Any
 from xml.etree import ElementTree
 
@@ -16,10 +17,8 @@ from ctxval.report.diagnostics import diagnostics, not_tested
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.insights import insights
 from ctxval.report.markup import UNCUT, number, quantity
-from ctxval.report.sections.appendix import appendix, appendix_json
+from ctxval.report.sections.appendix import appendix
 from ctxval.report.sections.repeat import command_snippet, identity, python_snippet, repeating_command
-
-_WORST = 5
 
 
 def to_json(context: ReportContext) -> dict[str, Any]:
@@ -45,11 +44,11 @@ def to_json(context: ReportContext) -> dict[str, Any]:
                     "python": python_snippet(context, trial),
                     "command": command_snippet(context, trial),
                 }
-                for trial in context.worst_tasks(_WORST)
+                for trial in context.worst_tasks(5)
             ],
             "command": repeating_command(context) or None,
             "identity": identity(context),
-            "appendix": appendix_json(context),
+            "appendix": [asdict(entry) for entry in appendix(context)],
         }
         plain: dict[str, Any] = json.loads(json.dumps(describe(report, depth=12), allow_nan=False))
     return plain
@@ -61,8 +60,15 @@ def junit(context: ReportContext) -> str:
     The verdict fails if M is falsified, and is skipped if it is undecided. A diagnostic fails if it speaks against the
     verdict, and is skipped if it is not known.
     """
-    checks = diagnostics(context)
-    cases = [_verdict_case(context), *(_case(finding) for finding in checks)]
+    answers = {"validated": None, "falsified": "failure", "undecided": "skipped"}
+    if context.verdict is None:
+        cases = [_case("ctxval", "verdict", "skipped", "no threshold was given")]
+    else:
+        tag = answers[context.verdict.answer]
+        cases = [_case("ctxval", "verdict", tag, "" if tag is None else str(context.verdict))]
+    lights = {"bad": "failure", "unknown": "skipped"}
+    for finding in diagnostics(context):
+        cases.append(_case("ctxval.diagnostics", finding.name, lights.get(finding.light), finding.text))
     counts = {kind: sum(case.find(kind) is not None for case in cases) for kind in ("failure", "skipped")}
     suite = ElementTree.Element(
         "testsuite",
@@ -82,24 +88,13 @@ def junit(context: ReportContext) -> str:
     )
 
 
-def _verdict_case(context: ReportContext) -> ElementTree.Element:
-    case = ElementTree.Element("testcase", classname="ctxval", name="verdict")
-    verdict = context.verdict
-    if verdict is None:
-        ElementTree.SubElement(case, "skipped", message="no threshold was given")
-    elif verdict.answer != "validated":
-        tag = "failure" if verdict.answer == "falsified" else "skipped"
-        ElementTree.SubElement(case, tag, message=_xml_text(str(verdict)))
-    return case
-
-
-def _case(finding: Finding) -> ElementTree.Element:
-    case = ElementTree.Element("testcase", classname="ctxval.diagnostics", name=_xml_text(finding.name))
-    if finding.light in ("bad", "unknown"):
-        tag = "failure" if finding.light == "bad" else "skipped"
-        ElementTree.SubElement(case, tag, message=_xml_text(finding.text))
-    else:
-        ElementTree.SubElement(case, "system-out").text = _xml_text(finding.text)
+def _case(group: str, name: str, tag: str | None, message: str) -> ElementTree.Element:
+    """Return one test, which has passed unless there is a tag that says how it ended."""
+    case = ElementTree.Element("testcase", classname=group, name=_xml_text(name))
+    if tag is not None:
+        ElementTree.SubElement(case, tag, message=_xml_text(message))
+    elif message:
+        ElementTree.SubElement(case, "system-out").text = _xml_text(message)
     return case
 
 
@@ -110,7 +105,11 @@ def _xml_text(words: str) -> str:
 
 def markdown(context: ReportContext) -> str:
     """Return the report without its charts as Markdown; texts of the store cannot become markup."""
-    units, verdict = context.labels.units, context.verdict
+    units, verdict, worst = context.labels.units, context.verdict, context.worst_tasks(5)
+    rows = [
+        f"| {trial.number} | {markdown_text(quantity(distance_of(trial), units))} | {' | '.join(map(number, point))} |"
+        for trial, point in zip(worst, context.coordinates(worst).tolist(), strict=True)
+    ]
     answer = "No verdict: no threshold was given." if verdict is None else f"{verdict}"
     lines = [
         f"# Validation of {markdown_text(context.name) or 'campaign'}",
@@ -135,7 +134,7 @@ def markdown(context: ReportContext) -> str:
         "",
         f"| trial | distance | {' | '.join(map(markdown_text, context.space.labels))} |",
         f"|{'---|' * (2 + context.space.dimension)}",
-        *_worst_rows(context, units),
+        *rows,
         "",
         "## For the file",
         "",
@@ -153,12 +152,4 @@ def markdown(context: ReportContext) -> str:
 def _items(findings: list[Finding]) -> list[str]:
     return [f"- {WORDS[one.light]}: **{markdown_text(one.name)}.** {markdown_text(one.text)}" for one in findings] or [
         "Nothing is unusual."
-    ]
-
-
-def _worst_rows(context: ReportContext, units: str) -> list[str]:
-    trials = context.worst_tasks(_WORST)
-    return [
-        f"| {trial.number} | {markdown_text(quantity(distance_of(trial), units))} | {' | '.join(map(number, point))} |"
-        for trial, point in zip(trials, context.coordinates(trials).tolist(), strict=True)
     ]

@@ -20,9 +20,6 @@ class Access:
     Args:
         token: the token that a browser must show once; None if every browser on this computer may use the page.
         port: the port of the server. Browsers share cookies among the ports of one computer.
-
-    Raises:
-        InputError: if the token is too short, or has other characters than visible ones of ASCII.
     """
 
     def __init__(self, token: str | None, port: int) -> None:

@@ -43,12 +43,7 @@ Handler = Callable[[Request, str], Awaitable[Response]]
 
 
 class PageRoutes:
-    """The routes of a page that shows a campaign, and takes nothing.
-
-    Args:
-        state: what the page shows.
-        access: who may use the page.
-    """
+    """The routes of a page that shows a campaign, and takes nothing."""
 
     def __init__(self, state: PageState, access: Access) -> None:
         self.state, self.access = state, access
@@ -151,12 +146,7 @@ class PageRoutes:
 
 
 class OperatorPage(PageRoutes):
-    """The routes of a page that also takes what operators do.
-
-    Args:
-        service: the campaign.
-        access: who may use the page.
-    """
+    """The routes of a page that also takes what operators do."""
 
     def __init__(self, service: CampaignService, access: Access) -> None:
         super().__init__(service, access)

@@ -23,14 +23,7 @@ from ctxval.web.served import OpenCampaign, ServedCampaign
 
 @dataclass(frozen=True)
 class Stage:
-    """What a background process does at present.
-
-    Attributes:
-        text: the work, as the beginning of a sentence.
-        done: how much of it is done.
-        expected: how much there will be in all; None if it is not known.
-        unit: what is counted, such as "designs".
-    """
+    """What is done at present: the beginning of a sentence, and how much of it; expected is None if not known."""
 
     text: str
     done: float = 0.0
@@ -63,10 +56,7 @@ class BackgroundProcess:
         self._closed = False
 
     def submit(self, job: Job, *arguments: Any) -> cf.Future[Any]:
-        """Do a job after the earlier ones; return its future result.
-
-        The future raises a CampaignError if the job fails or the process ends.
-        """
+        """Do a job after the earlier ones; its future raises a CampaignError if the job fails or the process ends."""
         return self._thread.submit(self._do, job, arguments)
 
     def close(self) -> None:

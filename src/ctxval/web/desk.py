@@ -24,12 +24,6 @@ class Desk:
     """The only user of the server's own campaign: everything runs in its thread, one thing at a time.
 
     Nothing here takes long. Choosing, judging and drawing are jobs of background processes.
-
-    Args:
-        open_campaign: opens the campaign; it is called in the thread.
-
-    Raises:
-        CtxvalError: if the campaign cannot be opened.
     """
 
     def __init__(self, open_campaign: OpenCampaign) -> None:

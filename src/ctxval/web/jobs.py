@@ -37,7 +37,6 @@ class TaskRequest:
     """What the operator asks for: by default, the task that the search chooses.
 
     Attributes:
-        parameters: the parameters of a task that the operator chooses.
         again: the number of an earlier trial whose task is executed again.
         because: what was changed since that trial.
         draw: whether the task is an independent draw, for an audit.

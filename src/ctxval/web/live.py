@@ -20,11 +20,8 @@ from ctxval.web.state import PageState, Work
 class LiveCampaign(PageState):
     """The state of a campaign that this process executes in another thread.
 
-    The thread of the campaign calls :meth:`hear`, :meth:`take` and :meth:`end`; the rest belongs to the server.
-
-    Args:
-        served: the campaign that is executed.
-        search: chooses its tasks by an interval; None if the campaign explores.
+    The thread of the campaign calls :meth:`hear`, :meth:`take` and :meth:`end`; the rest belongs to the server. There
+    is no search if the campaign explores.
     """
 
     def __init__(self, served: ServedCampaign, search: IntervalSearch | None) -> None:

@@ -39,11 +39,7 @@ class Problem:
 
 
 class Page:
-    """Renders the templates of this package.
-
-    Args:
-        state: what the page shows.
-    """
+    """Renders the templates of this package."""
 
     def __init__(self, state: PageState) -> None:
         self._state = state

@@ -111,15 +111,7 @@ def refusal(method: str, headers: Headers, hosts: Hosts) -> str | None:
 
 
 class _Body:
-    """Receives a body of a limited size, of which parts arrive in limited time.
-
-    Args:
-        receive: receives the next part.
-        most: largest size in bytes.
-
-    Attributes:
-        refused: the status and the sentence of the response, if the body has more bytes or takes too long.
-    """
+    """Receives a body of a limited size, of which parts arrive in limited time."""
 
     def __init__(self, receive: Receive, most: int) -> None:
         self.receive, self.most = receive, most
@@ -147,14 +139,7 @@ class _Body:
 
 
 class Guard:
-    """Refuses requests before the application reads them, and adds the security headers to every response.
-
-    Args:
-        app: the application.
-        hosts: the names of this server.
-        access: who may use the page.
-        most: largest size of a recording in bytes. It is counted as the body arrives.
-    """
+    """Refuses requests before the application reads them, and adds the security headers to every response."""
 
     def __init__(self, app: ASGIApp, hosts: Hosts, access: Access, most: int = MOST_UPLOAD) -> None:
         self.app, self.hosts, self.access, self.most = app, hosts, access, most

@@ -16,15 +16,7 @@ from ctxval.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class ServedCampaign:
-    """A campaign with what the page needs besides it.
-
-    Attributes:
-        experiment: the experiment of the campaign.
-        campaign: the campaign; only the thread that opened it may use it.
-        threshold: tau; None if there is no verdict.
-        certificate: the kind and the options of the certificate.
-        budget: the largest number of executions that are chosen for the verdict.
-    """
+    """A campaign with what the page needs besides it; only the thread that opened the campaign may use it."""
 
     experiment: Experiment
     campaign: Campaign
@@ -96,15 +88,7 @@ class OpenTask:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The trials of the store at one moment.
-
-    Attributes:
-        signature: identifies the state of the store.
-        trials: all trials in the order of asking.
-        tasks: the tasks of the open trials, by the number of the trial.
-        executions: the number of executions that have ended.
-        worst: the trial with the largest distance; None if no distance is known.
-    """
+    """The trials of the store at one moment: the open ones with their tasks by number, and the number of executions."""
 
     signature: tuple[int, int, int]
     trials: tuple[Trial, ...]

@@ -18,12 +18,7 @@ from ctxval.web.state import PageState, Work
 
 
 class CampaignService(PageState):
-    """One campaign, with the work in progress, for any number of operators.
-
-    Args:
-        desk: the server's own campaign.
-        reopen: opens the campaign in a child process; it must be picklable.
-    """
+    """One campaign, with the work in progress, for any number of operators."""
 
     def __init__(self, desk: Desk, reopen: OpenCampaign) -> None:
         super().__init__(desk.description, desk.first)

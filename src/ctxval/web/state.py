@@ -17,14 +17,7 @@ from ctxval.web.served import Description, Snapshot
 
 @dataclass(frozen=True)
 class Work:
-    """Work that is not done yet, with times on the clock of ``time.monotonic``.
-
-    Attributes:
-        stage: what is done at present.
-        started: the time of its start.
-        reached: the time of the start of the stage.
-        counted: the time at which the stage told how much is done.
-    """
+    """Work that is not done yet: its stage, and the starts of itself, of the stage and of its last count."""
 
     stage: Stage
     started: float

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
@@ -21,13 +21,7 @@ _NASA, _V10, _V20 = "NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry of the appendix.
-
-    Attributes:
-        term: the term of the standard.
-        standard: the standards that use it.
-        content: what this campaign has to say about it, in sentences.
-    """
+    """One entry of the appendix: a term, the standards that use it, and what this campaign has to say about it."""
 
     term: str
     standard: str
@@ -57,7 +51,18 @@ class AppendixSection:
 
 def appendix(context: ReportContext) -> list[Entry]:
     """Return the entries of the appendix."""
-    changes = [f"{one.at[:19]} {one.what}: {one.why}" for one in context.changes]
+    changes = [f"{change.at[:19]} {change.what}: {change.why}" for change in context.changes]
+    certificate = context.certificate
+    assumed = ["None beyond the recorded executions"] if certificate is None else certificate.assumptions
+    checks = "; ".join(f"{finding.name}: {WORDS[finding.light]}" for finding in diagnostics(context))
+    verification = (
+        "Software and solution verification of the model itself are not part of this campaign. Diagnostics of the "
+        f"campaign: {checks or 'nothing is unusual'}."
+    )
+    provenance = (
+        f"Store {context.store.name}; ctxval {VERSION}; command: {command_of(context) or 'none'}; digest of the "
+        f"description of the model: {_part_digest(context, 'model')}."
+    )
     return [
         Entry("Intended use", f"{_NASA}, {_V10}", _intended_use(context)),
         Entry("Response quantity of interest and validation metric", f"{_V10}, {_V20}", _metric(context)),
@@ -67,18 +72,13 @@ def appendix(context: ReportContext) -> list[Entry]:
         Entry("Domain of validation, and what lies outside it", f"{_NASA}, {_V10}, {_V20}", _domain(context)),
         Entry("Uncertainty characterization", f"{_NASA}, {_V10}, {_V20}", _uncertainty(context)),
         Entry("Results robustness (sensitivity)", _NASA, _robustness(context)),
-        Entry("Assumptions", f"{_NASA}, {_V10}", _assumptions(context)),
+        Entry("Assumptions", f"{_NASA}, {_V10}", f"{'; '.join(assumed)}."),
         Entry("Limits of the assessment: what was not tested", f"{_NASA}, {_V10}", " ".join(not_tested(context))),
-        Entry("Verification", f"{_NASA}, {_V10}", _verification(context)),
+        Entry("Verification", f"{_NASA}, {_V10}", verification),
         Entry("Changes during the campaign", _NASA, "; ".join(changes) or "None is recorded."),
-        Entry("Provenance", _NASA, _provenance(context)),
+        Entry("Provenance", _NASA, provenance),
         Entry("Conclusion", f"{_NASA}, {_V10}", str(context.verdict or "No verdict, because no threshold was stated.")),
     ]
-
-
-def appendix_json(context: ReportContext) -> list[dict[str, str]]:
-    """Return the entries of the appendix, ready for JSON."""
-    return [asdict(one) for one in appendix(context)]
 
 
 def _intended_use(context: ReportContext) -> str:
@@ -174,26 +174,6 @@ def _robustness(context: ReportContext) -> str:
     order = np.argsort(-model.sensitivity, kind="stable")[:5]
     listed = "; ".join(f"{context.space.labels[j]} {number(float(model.sensitivity[j]), 2)}" for j in order)
     return f"Total Sobol indices of the predicted distance, the largest first: {listed}."
-
-
-def _assumptions(context: ReportContext) -> str:
-    found = context.certificate
-    return "None beyond the recorded executions." if found is None else f"{'; '.join(found.assumptions)}."
-
-
-def _verification(context: ReportContext) -> str:
-    said = "; ".join(f"{one.name}: {WORDS[one.light]}" for one in diagnostics(context)) or "nothing is unusual"
-    return (
-        "Software and solution verification of the model itself are not part of this campaign. Diagnostics of the "
-        f"campaign: {said}."
-    )
-
-
-def _provenance(context: ReportContext) -> str:
-    return (
-        f"Store {context.store.name}; ctxval {VERSION}; command: {command_of(context) or 'none'}; digest of the "
-        f"description of the model: {_part_digest(context, 'model')}."
-    )
 
 
 def _part_digest(context: ReportContext, part: str) -> str:
