@@ -52,7 +52,13 @@ def command(function: Callable[..., Any]) -> Callable[..., Any]:
         as_json = bool(kwargs.get("as_json"))
         try:
             with _stdout_to_stderr() if as_json else nullcontext() as stdout, progress_shown(not as_json, err):
-                return _finish(function(*args, **kwargs), stdout)
+                result = function(*args, **kwargs)
+                report, status = result if isinstance(result, tuple) else (result, 0)
+                if stdout is not None:
+                    print(dumps(describe(report), allow_nan=False), file=stdout, flush=True)
+                if status:
+                    raise typer.Exit(status)
+                return
         except CtxvalError as error:
             say_error(str(error))
             _print_failure(str(error), as_json)
@@ -88,15 +94,6 @@ def _print_failure(sentence: str, as_json: bool) -> None:
 
 
 _STOPPED = "stopped. All executions are stored; run the same command to resume."
-
-
-def _finish(result: Any, stdout: Any) -> None:
-    """Print the JSON of a command if there is a stream for it, and leave with the command's exit status."""
-    report, status = result if isinstance(result, tuple) else (result, 0)
-    if stdout is not None:
-        print(dumps(describe(report), allow_nan=False), file=stdout, flush=True)
-    if status:
-        raise typer.Exit(status)
 
 
 @contextmanager

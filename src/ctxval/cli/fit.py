@@ -36,7 +36,7 @@ from ctxval.cli.options import AsJson, named_values
 from ctxval.cli.outputs import Force
 from ctxval.config.named_model import named_model
 from ctxval.errors import InputError
-from ctxval.fitting import FitReport, FittedModel, fit
+from ctxval.fitting import FitReport, fit
 from ctxval.fitting.fit import HOLD_OUT, KINDS, STEPS
 from ctxval.fitting.model_file import SUFFIXES, write_model_file
 
@@ -121,7 +121,13 @@ def fit_models(
         _print(report)
     written, chosen = list[str](), None
     if report.fitted and out_file is not None:
-        chosen = _most_accurate(report, out_file)
+        suffix, kinds_learned = out_file.suffix, ", ".join(model.kind for model in report.fitted)
+        holds = (m for m in report.fitted if m.kind != "given" and isinstance(m.model, SUFFIXES[suffix]))
+        chosen = next(holds, None)
+        if chosen is None:
+            raise InputError(
+                f"no model that was learned ({kinds_learned}) can be written to a file that ends in {suffix}."
+            )
         written = write_model_file(out_file, chosen.model, step)
         if not as_json:
             out.say(f"the {chosen.kind} model is in {' and '.join(written)}")
@@ -134,15 +140,6 @@ def fit_models(
     if not as_json:
         err.say(("not good: ", "bold red"), f"{best.useless}.", wrap=True)
     return result, FALSIFIED
-
-
-def _most_accurate(report: FitReport, path: Path) -> FittedModel:
-    """Return the most accurate of the models that a file can hold."""
-    for one in report.fitted:
-        if one.kind != "given" and isinstance(one.model, SUFFIXES[path.suffix]):
-            return one
-    kinds = ", ".join(one.kind for one in report.fitted)
-    raise InputError(f"no model that was learned ({kinds}) can be written to a file that ends in {path.suffix}.")
 
 
 def _print(report: FitReport) -> None:

@@ -26,6 +26,10 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
     with opened.snapshot():
         description, trials, changes = opened.description(), opened.trials(), opened.history()
         kept = opened.computed(RUN)
+    verdict = None
+    match kept:
+        case {"verdict": {"verdict": str(answer), "threshold": float(threshold), "reason": str(reason)}}:
+            verdict = f"{answer} against {threshold:g}: {reason}"
     search = description.get("search")
     report: dict[str, Any] = {
         "case": description.get("name"),
@@ -39,7 +43,7 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
         "worst": worst_of(
             max((t for t in trials if t.distance is not None), key=lambda t: t.distance or 0, default=None)
         ),
-        "verdict": _verdict_of(kept),
+        "verdict": verdict,
         "changes": [asdict(change) for change in changes],
         "store": str(store),
     }
@@ -49,14 +53,6 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
             out.say(f"{change['at'][:19]} {change['what']}: {change['why']}")
         print_failures(report["failures"])
     return report
-
-
-def _verdict_of(kept: Any) -> str | None:
-    """Return the verdict of the last run on these trials as a sentence; None if there is none."""
-    match kept:
-        case {"verdict": {"verdict": str(answer), "threshold": float(threshold), "reason": str(reason)}}:
-            return f"{answer} against {threshold:g}: {reason}"
-    return None
 
 
 @app.command("export")

@@ -28,9 +28,6 @@ SMALL = {"width": 340, "height": 220}
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 12, 46
 _TICKS = 5
-_MOST_MARKS = 600
-"""More marks than this are drawn as dots, which have no names."""
-
 Kind = Literal[
     "mean", "model", "system", "corrected", "reference", "best", "threshold", "bound", "sample", "initial", "covering",
     "failed", "worst", "band", "weak", "identity",
@@ -66,14 +63,7 @@ class Axis:
 
     @classmethod
     def over(cls, label: str, *values: ArrayLike, zero: bool = False, room: float = 0.06) -> Axis:
-        """Return an axis that holds all finite values, with some room around them.
-
-        Args:
-            label: its name with the unit.
-            values: arrays or numbers that must be visible.
-            zero: whether it starts at 0; values are then expected to be at least 0.
-            room: share of the range that is left free at each end.
-        """
+        """Return an axis that holds all finite values, from 0 if ``zero``, with a share of ``room`` at each end."""
         flat = np.concatenate([np.ravel(np.asarray(one, dtype=np.float64)) for one in values] or [np.zeros(1)])
         finite = flat[np.isfinite(flat) & (np.abs(flat) < 1e300)]
         low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
@@ -103,13 +93,7 @@ class Axis:
 
 @dataclass(eq=False)
 class Chart:
-    """A chart with two axes, to which lines, bands and marks are added in the order of drawing.
-
-    Attributes:
-        title: what it shows; screen readers read it, and it stands below the chart.
-        x, y: the axes.
-        width, height: its size in its own units.
-    """
+    """A chart with two axes, to which lines, bands and marks are added in the order of drawing."""
 
     title: str
     x: Axis
@@ -139,7 +123,11 @@ class Chart:
         """Add a line; it is interrupted at values that are not finite."""
         at = np.stack([self.across(x), self.up(y)], axis=-1)
         self._named(kind, label, "line")
-        self._parts += [_path(run, f"line {kind}") for run in _runs(at) if len(run) > 1]
+        finite = np.isfinite(at).all(axis=-1)
+        edges = np.flatnonzero(np.diff(finite.astype(int))) + 1
+        for run, keep in zip(np.split(at, edges), np.split(finite, edges), strict=True):
+            if len(run) > 1 and keep[0]:
+                self._parts.append(_path(run, f"line {kind}"))
         return self
 
     def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, label: str = "") -> Chart:
@@ -157,7 +145,8 @@ class Chart:
         """Add marks; their names appear if the pointer rests on them."""
         xs, ys = np.ravel(self.across(x)), np.ravel(self.up(y))
         self._named(kind, label, "mark")
-        if len(xs) > _MOST_MARKS:
+        # More marks than this are drawn as dots, which have no names.
+        if len(xs) > 600:
             dots = "".join(
                 f"M{left:.0f},{top:.0f}h0" for left, top in zip(xs, ys, strict=True) if np.isfinite(left + top)
             )
@@ -240,23 +229,16 @@ class Chart:
             element("text", self.x.label, x=0.5 * (left + right), y=self.height - 8, class_="axis-label"),
             element("text", self.y.label, transform=f"translate(13 {middle}) rotate(-90)", class_="axis-label"),
         )
-        return element("g", *self._ticks_across(bottom), *self._ticks_up(left, right), box, *names)
-
-    def _ticks_across(self, bottom: float) -> list[Markup]:
-        found = []
+        ticks = []
         for value in self.x.ticks():
             at = round(float(self.across(value)), 1)
-            found.append(element("path", d=f"M{at},{bottom}v4", class_="axis"))
-            found.append(element("text", number(value), x=at, y=bottom + 18, class_="tick across"))
-        return found
-
-    def _ticks_up(self, left: float, right: float) -> list[Markup]:
-        found = []
+            ticks.append(element("path", d=f"M{at},{bottom}v4", class_="axis"))
+            ticks.append(element("text", number(value), x=at, y=bottom + 18, class_="tick across"))
         for value in self.y.ticks():
             at = round(float(self.up(value)), 1)
-            found.append(element("path", d=f"M{left},{at}H{right}", class_="grid"))
-            found.append(element("text", number(value), x=left - 6, y=at + 4, class_="tick up"))
-        return found
+            ticks.append(element("path", d=f"M{left},{at}H{right}", class_="grid"))
+            ticks.append(element("text", number(value), x=left - 6, y=at + 4, class_="tick up"))
+        return element("g", *ticks, box, *names)
 
     def __repr__(self) -> str:
         return f"Chart({self.title!r}, {self.x!r}, {self.y!r})"
@@ -313,15 +295,6 @@ def colour_scale(low: float, high: float, label: str) -> Markup:
     ends = element("text", number(low), x=134, y=10, class_="tick up"), element("text", number(high), x=346, y=10)
     name = element("text", label, x=240, y=28, class_="axis-label")
     return element("svg", shades, *ends, name, viewBox="0 0 480 34", class_="chart scale", aria_hidden="true")
-
-
-def _runs(at: Array) -> list[Array]:
-    """Return the stretches of points ``(k, 2)`` that are finite."""
-    finite = np.isfinite(at).all(axis=-1)
-    edges = np.flatnonzero(np.diff(finite.astype(int))) + 1
-    return [
-        run for run, keep in zip(np.split(at, edges), np.split(finite, edges), strict=True) if len(keep) and keep[0]
-    ]
 
 
 def _path(at: Array, class_: str, *, closed: bool = False) -> Markup:

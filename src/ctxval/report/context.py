@@ -31,9 +31,6 @@ MOST_REPLAYS = 120
 MOST_RECORDINGS = 400
 """Largest number of trials whose trajectories are read: those with the largest distances."""
 
-_SLOW_REPLAYS = 40
-"""The same, if the synthesizer designs one controller at a time."""
-
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -232,7 +229,8 @@ class ReportContext:
         if self.validation is None or not self.recordings:
             return {}
         by_number = {trial.number: trial for trial in self.completed}
-        numbers = list(self.recordings)[: MOST_REPLAYS if self.batched else _SLOW_REPLAYS]
+        # The same, if the synthesizer designs one controller at a time.
+        numbers = list(self.recordings)[: MOST_REPLAYS if self.batched else 40]
         executed = [(by_number[number].unit_point, one.system) for number, one in self.recordings.items()]
         with stage("replaying executed tasks", len(numbers), "tasks"):
             found = replay_executed(self.validation, executed, [by_number[number].unit_point for number in numbers])

@@ -21,9 +21,6 @@ from ctxval.report.markup import number, percent, quantity
 _IMPROVED = 0.01
 """Least increase of the largest distance that counts as an improvement, as a share of it."""
 
-_QUIET = 1 / 3
-"""Share of the executions without an improvement after which a search is taken to have converged."""
-
 _LISTED = 10
 """Largest number of failed trials that are listed one by one."""
 
@@ -106,7 +103,8 @@ def _converged(context: ReportContext) -> Finding | None:
     so_far = np.maximum.accumulate(distances)
     last = int(np.argmax(so_far >= (1 - _IMPROVED) * so_far[-1]))
     quiet = len(distances) - 1 - last
-    good = quiet >= max(3.0, _QUIET * len(distances))
+    # Share of the executions without an improvement after which a search is taken to have converged.
+    good = quiet >= max(3.0, (1 / 3) * len(distances))
     text = (
         f"The largest distance was within {percent(_IMPROVED)} of its final value after {last + 1} of "
         f"{len(distances)} measured executions; {quiet} followed without an improvement."

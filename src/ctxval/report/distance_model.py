@@ -16,25 +16,13 @@ from ctxval.gp.surrogate import Learned, learn
 NORMAL_95 = 1.96
 """Number of standard deviations of a band of 95 %."""
 
-_TASKS = 4096
-"""Number of random tasks from which shares of the task space are estimated."""
-
-_SOBOL = 256
-"""Number of base points of the sensitivity indices, a power of two; d + 2 times as many tasks are predicted."""
-
-
 _MOST = 500
 """Largest number of distances that the Gaussian process is conditioned on: half of them are the largest ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Predicted distances of several tasks.
-
-    Attributes:
-        median: the medians ``(m,)``.
-        low, high: the ends of their bands of 95 %, ``(m,)``; none is below 0.
-    """
+    """Predicted distances of several tasks: medians and bands of 95 %, each ``(m,)``; none is below 0."""
 
     median: Array
     low: Array
@@ -46,8 +34,7 @@ class DistanceModel:
     """The Gaussian process of the distance, or of its logarithm if that fits clearly better.
 
     Attributes:
-        points: points of the unit cube with a known distance ``(n, d)``.
-        values: their distances ``(n,)``.
+        points, values: points of the unit cube with a known distance ``(n, d)``, and their distances ``(n,)``.
         learned: its hyperparameters and its scale.
         process: the process, conditioned on the distances.
     """
@@ -89,7 +76,8 @@ class DistanceModel:
     @functools.cached_property
     def tasks(self) -> Array:
         """Random tasks, points of the unit cube ``(m, d)``."""
-        return np.random.default_rng(0).random((_TASKS, self.points.shape[1]))
+        # Number of random tasks from which shares of the task space are estimated.
+        return np.random.default_rng(0).random((4096, self.points.shape[1]))
 
     @functools.cached_property
     def over_tasks(self) -> Band:
@@ -108,7 +96,8 @@ class DistanceModel:
         from scipy.stats import sobol_indices, uniform  # imported here, because it is slow to load
 
         with np.errstate(all="ignore"):
-            found = sobol_indices(func=lambda x: self.predict(x.T).median[None], n=_SOBOL, dists=[uniform()] * d, rng=0)
+            # Number of base points of the sensitivity indices, a power of two; d + 2 times as many tasks are predicted.
+            found = sobol_indices(func=lambda x: self.predict(x.T).median[None], n=256, dists=[uniform()] * d, rng=0)
         return np.asarray(np.clip(np.nan_to_num(np.ravel(found.total_order)), 0.0, 1.0))
 
     def _band(self, mean: Array, variance: Array) -> Band:

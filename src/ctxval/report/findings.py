@@ -29,7 +29,6 @@ class Finding:
     """One thing that the trials show.
 
     Attributes:
-        name: what it is about, in a few words.
         light: how it is to be taken.
         text: one or more sentences with the numbers.
         numbers: the same numbers for JSON, by name.
@@ -60,12 +59,12 @@ Question = Callable[[ReportContext], Finding | None]
 
 def findings_of(questions: Iterable[tuple[str, Question]], context: ReportContext) -> list[Finding]:
     """Return what questions find; a question that fails is a finding that is not known."""
-    found = (_asked(name, question, context) for name, question in questions)
-    return [one for one in found if one is not None]
-
-
-def _asked(name: str, question: Question, context: ReportContext) -> Finding | None:
-    try:
-        return question(context)
-    except Exception as error:  # one question about odd data must not hide the answers to the others
-        return Finding(name, "unknown", f"This could not be computed: {reason_of(error)}.")
+    findings = []
+    for name, question in questions:
+        try:
+            finding = question(context)
+        except Exception as error:  # one question about odd data must not hide the answers to the others
+            finding = Finding(name, "unknown", f"This could not be computed: {reason_of(error)}.")
+        if finding is not None:
+            findings.append(finding)
+    return findings

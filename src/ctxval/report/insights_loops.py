@@ -14,9 +14,6 @@ from ctxval.report.markup import number, percent
 _WORST = 5
 """Number of trials with the largest distances that these insights look at."""
 
-_UNUSUAL = 3.0
-"""A state of M is unusual if it is this many times as large as in the median trial."""
-
 
 def components(context: ReportContext) -> Finding | None:
     """Which states err in the worst trials, and when their errors peak."""
@@ -95,7 +92,8 @@ def unusual_motion(context: ReportContext) -> Finding | None:
     row, j = (int(k) for k in np.unravel_index(int(ratios.argmax()), ratios.shape))
     trial, label, ratio = list(context.recordings)[row], context.signals[0][j], float(ratios[row, j])
     values = {"trial": trial, "state": label, "times_the_median": ratio}
-    if ratio < _UNUSUAL:
+    # A state of M is unusual if it is this many times as large as in the median trial.
+    if ratio < 3.0:
         return None
     text = (
         f"In trial {trial} M itself moves {number(float(sizes[row, j]))} in {label}, {number(ratio, 2)} times as far "

@@ -10,18 +10,6 @@ from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.findings import Finding
 from ctxval.report.markup import number, percent, quantity
 
-_NARROW = 0.7
-"""A region is described by the parameters in which it is narrower than this share of the range."""
-
-_RARE = 0.002
-"""Below this share of weak tasks the random tasks hold too few of them, and the executed ones describe the region."""
-
-_NAMED = 3
-"""Largest number of parameters that describe a region."""
-
-_EXPLAINED = 0.8
-"""Least share of the distance that a corrected model must predict to explain it."""
-
 
 def weak_region(context: ReportContext) -> Finding | None:
     """Where the distance exceeds the threshold, executed and predicted."""
@@ -36,7 +24,8 @@ def weak_region(context: ReportContext) -> Finding | None:
     if not above.any():
         text = f"No executed task exceeds {quantity(tau, units)}, but the trials predict that {percent(share)} do."
         return Finding("Where M is weak", "attention", text, numbers) if share else None
-    weak = context.points[above] if model is None or share < _RARE else model.tasks[model.over_tasks.median > tau]
+    # Below this share of weak tasks the random tasks hold too few of them, and the executed ones describe the region.
+    weak = context.points[above] if model is None or share < 0.002 else model.tasks[model.over_tasks.median > tau]
     text = (
         f"{int(above.sum())} of {len(above)} executed tasks exceed {quantity(tau, units)}, the largest with {largest}: "
         f"{region_text(context, weak)}. The trials predict that {percent(share)} of all tasks exceed it."
@@ -48,7 +37,9 @@ def region_text(context: ReportContext, points: Array) -> str:
     """Return where points of the unit cube ``(m, d)`` lie, by the parameters in which they differ from all tasks."""
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
     width = high - low
-    narrow = [int(j) for j in np.argsort(width) if width[j] < _NARROW][:_NAMED]
+    # A region is described by the parameters in which it is narrower than this share of the range.
+    # Largest number of parameters that describe a region.
+    narrow = [int(j) for j in np.argsort(width) if width[j] < 0.7][:3]
     if not narrow:
         return "they are spread over the task space"
     ends = context.space.from_unit(np.stack([low, high]))
@@ -158,7 +149,8 @@ def explained(context: ReportContext) -> Finding | None:
         f"an error of {quantity(error, context.labels.units)} (root mean square), "
         f"{percent(error / max(size, 1e-300))} of the distances."
     )
-    if share >= _EXPLAINED:
+    # Least share of the distance that a corrected model must predict to explain it.
+    if share >= 0.8:
         return Finding(
             "Corrected model", "good",
             f"{said} It explains the distance: the difference is a function of the recorded state and input, and a "

@@ -20,9 +20,6 @@ LONGEST = 2_000
 UNCUT = 100_000
 """Characters of one text that must never be shortened, such as an assumption."""
 
-_CELL = 300
-"""Characters of a cell of a table."""
-
 _VOID = ("br", "meta", "link", "input")
 
 
@@ -34,13 +31,10 @@ def text(value: object, longest: int = LONGEST) -> Markup:
 
 
 def element(name: str, *children: object, **attributes: object) -> Markup:
-    """Return one element.
+    """Return one element with children that are elements, or texts that are escaped; None is left out.
 
-    Args:
-        name: the name of the element.
-        children: elements, or texts that are escaped; None is left out.
-        attributes: its attributes. An underscore is a hyphen, and one at the end is dropped: ``class_``. An attribute
-            that is None is left out, and one that is True has no value.
+    In the name of an attribute, an underscore is a hyphen, and one at the end is dropped: ``class_``. An attribute
+    that is None is left out, and one that is True has no value.
     """
     inside = Markup("").join(text(child) for child in children if child is not None)
     given = Markup("").join(_attribute(key, value) for key, value in attributes.items() if value is not None)
@@ -78,14 +72,7 @@ def bullets(items: Iterable[object], class_: str | None = None) -> Markup:
 
 
 def table(caption: str, headers: Sequence[str], rows: Iterable[Sequence[object]], class_: str | None = None) -> Markup:
-    """Return a table with a caption; the first cell of each row is its header. Numbers have four digits.
-
-    Args:
-        caption: what the table shows.
-        headers: the names of the columns.
-        rows: one sequence of cells for each row; each cell is a number, a text or an element.
-        class_: further classes of the element.
-    """
+    """Return a table with a caption; the first cell of each row is its header. Numbers have four digits."""
     head = element("tr", *(element("th", header, scope="col") for header in headers))
     body = joined(_row(cells) for cells in rows)
     inside = element("caption", caption), element("thead", head), element("tbody", body)
@@ -111,7 +98,8 @@ def cell(value: object) -> Markup:
         return Markup("&ndash;")
     if hasattr(value, "__html__"):
         return Markup(value.__html__())
-    return text(value if isinstance(value, str) else number(value), _CELL)
+    # Characters of a cell of a table.
+    return text(value if isinstance(value, str) else number(value), 300)
 
 
 def bar(share: float) -> Markup:

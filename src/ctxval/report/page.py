@@ -42,23 +42,14 @@ class SectionOf(Protocol[Context]):
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """A section with its content.
-
-    Attributes:
-        title: the heading.
-        content: the content.
-    """
+    """A section with its content."""
 
     title: str
     content: Markup
 
 
 def page(context: ReportContext, sections: Sequence[Section] = ()) -> str:
-    """Return a report as one HTML page.
-
-    Args:
-        context: what the report is made from.
-        sections: further sections, which follow those that every report has.
+    """Return a report as one HTML page; further sections follow those that every report has.
 
     Raises:
         InputError: if a section is none.
@@ -76,7 +67,9 @@ def framed(title: str, subtitle: str, sections: Sequence[Rendered], *, folded: b
     return _template().render(
         title=text(title, 200),
         subtitle=text(subtitle, 600),
-        policy=_policy(style, script),
+        # Nothing but the style and the script of this page, and data images.
+        policy=f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data:; "
+        "base-uri 'none'; form-action 'none'",
         style=Markup(style),
         script=Markup(script),
         sections=sections,
@@ -108,14 +101,6 @@ def rendered_section(section: SectionOf[Context], context: Context) -> Rendered:
         return Rendered(title, paragraph(f"This section cannot be shown: {reason_of(error)}."))
     whole = content.__html__() if hasattr(content, "__html__") else None
     return Rendered(title, Markup(whole) if whole is not None else paragraph(str(content)))
-
-
-def _policy(style: str, script: str) -> str:
-    """Return the content security policy: nothing but the style and the script of this page, and data images."""
-    return (
-        f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data:; "
-        "base-uri 'none'; form-action 'none'"
-    )
 
 
 def _hash(content: str) -> str:

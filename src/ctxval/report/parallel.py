@@ -11,14 +11,8 @@ from ctxval.report.context import ReportContext
 from ctxval.report.markup import element, number, paragraph
 
 _HEIGHT, _TOP, _BOTTOM = 300, 26, 250
-_LEAST = 70
-"""Least distance between two axes."""
-
 _LINES = 300
 """Largest number of tasks that are drawn: those with the largest distances, and others evenly from the rest."""
-
-_HIGHEST = 0.2
-"""Share of the tasks that counts as the worst ones."""
 
 
 def parallel_coordinates(context: ReportContext) -> Markup:
@@ -32,8 +26,10 @@ def parallel_coordinates(context: ReportContext) -> Markup:
         )
     top = max(float(context.distances.max()), 1e-300)
     shares = np.array([[*trials[k].unit_point, (trials[k].distance or 0.0) / top] for k in rows])
-    limit = max(1, round(_HIGHEST * len(rows)))
-    width = max(480, _LEAST * (len(labels) - 1) + 60)
+    # Share of the tasks that counts as the worst ones.
+    limit = max(1, round(0.2 * len(rows)))
+    # Least distance between two axes.
+    width = max(480, 70 * (len(labels) - 1) + 60)
     at = 30 + (width - 60) * np.arange(len(labels)) / (len(labels) - 1)
     drawn = [_line(at, share, "weak" if k < limit else "rest") for k, share in reversed(list(enumerate(shares)))]
     low, high = [*context.space.low, 0.0], [*context.space.high, top]

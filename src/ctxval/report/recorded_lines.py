@@ -18,18 +18,13 @@ MOST_CHARACTERS = 850_000
 _POINTS = (200, 120, 70)
 """Numbers of points of a line that are tried, until the lines of all trials fit."""
 
-_LEVELS = 65_535
-"""Number of steps of a value between the smallest and the largest one of its line."""
-
 
 @dataclass(frozen=True, eq=False)
 class RecordedLines:
-    """The lines of as many trials as fit, the worst first.
+    """The lines of as many trials as fit, the worst first, ready for JSON.
 
     Attributes:
-        data: the lines, ready for JSON.
-        kept: the numbers of the trials whose lines are in it.
-        left_out: the numbers of those whose lines are not.
+        kept, left_out: the numbers of the trials whose lines are in the data, and of those whose are not.
         points: the largest number of points of a line.
         thinned: whether a trajectory has more points than its line.
     """
@@ -51,8 +46,11 @@ def recorded_lines(context: ReportContext, most: int = MOST_CHARACTERS) -> Recor
             break
     longest = max((one.system.horizon + 1 for one in context.recordings.values()), default=0)
     states, inputs = context.signals
-    signals = [{"label": _safe(label), "kind": "state"} for label in states]
-    signals += [{"label": _safe(label), "kind": "input"} for label in inputs]
+    signals = [
+        {"label": shortened(visible(label), 120), "kind": kind}
+        for kind, labels in (("state", states), ("input", inputs))
+        for label in labels
+    ]
     return RecordedLines(
         {"signals": signals, "trials": {str(number): one for number, one in found.items()}},
         tuple(found),
@@ -121,21 +119,14 @@ def _columns(values: Array) -> list[dict[str, Any]]:
 def packed(values: Array) -> dict[str, Any]:
     """Return numbers ``(k,)`` as their smallest value, a step, and multiples of the step in 16 bits each as base64."""
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
-    step = (high - low) / _LEVELS
+    # Number of steps of a value between the smallest and the largest one of its line.
+    step = (high - low) / 65_535
     if not (np.isfinite(step) and step > 0):
-        return {"low": _finite(low), "step": 0.0, "n": len(values)}
+        return {"low": low if np.isfinite(low) else 0.0, "step": 0.0, "n": len(values)}
     levels = np.rint((values - low) / step).astype("<u2")
     return {"low": low, "step": step, "data": base64.b64encode(levels.tobytes()).decode()}
-
-
-def _finite(value: float) -> float:
-    return value if np.isfinite(value) else 0.0
 
 
 def _size(lines: dict[str, Any]) -> int:
     every = [lines["t"], *lines["m"], *lines["e"], *lines.get("c", ()), *filter(None, lines.get("r", ()))]
     return sum(len(one.get("data", "")) + 60 for one in every)
-
-
-def _safe(label: str) -> str:
-    return shortened(visible(label), 120)

@@ -6,16 +6,12 @@ import numpy as np
 from markupsafe import Markup
 
 from ctxval._util.arrays import Array
-from ctxval.certificates import Certificate
 from ctxval.report.charts import Axis, Chart, colour_scale
 from ctxval.report.context import ReportContext
 from ctxval.report.markup import element, joined, number, paragraph, percent
 
 _SIDE = 31
 """Number of predicted tasks on each side of a map, and a third of those of a curve."""
-
-_DRAWN = 400
-"""Number of random tasks that are predicted if there are more than two parameters."""
 
 
 def region_map(context: ReportContext) -> Markup | None:
@@ -31,7 +27,12 @@ def region_map(context: ReportContext) -> Markup | None:
     unit = _tasks(context.space.dimension)
     bounds = learned.expected(unit, before) + margin
     charts = element("div", _drawn(context, unit, bounds, tau), class_="charts wide")
-    return joined([_said(certificate, margin, tau, bounds), charts])
+    sentence = (
+        f"A task keeps the threshold {number(tau)} if its predicted distance plus the margin {number(margin)} of the "
+        f"certificate is at most the threshold. This holds for {percent(float((bounds <= tau).mean()))} of the tasks "
+        f"that are drawn here. {certificate.statement}"
+    )
+    return joined([paragraph(sentence), charts])
 
 
 def _tasks(dimension: int) -> Array:
@@ -40,16 +41,8 @@ def _tasks(dimension: int) -> Array:
     if dimension == 2:
         side = np.linspace(0, 1, _SIDE)
         return np.stack(np.meshgrid(side, side, indexing="xy"), axis=-1).reshape(-1, 2)
-    return np.random.default_rng(0).random((_DRAWN, dimension))
-
-
-def _said(certificate: Certificate, margin: float, tau: float, bounds: Array) -> Markup:
-    kept = float((bounds <= tau).mean())
-    return paragraph(
-        f"A task keeps the threshold {number(tau)} if its predicted distance plus the margin {number(margin)} of the "
-        f"certificate is at most the threshold. This holds for {percent(kept)} of the tasks that are drawn here. "
-        f"{certificate.statement}"
-    )
+    # Number of random tasks that are predicted if there are more than two parameters.
+    return np.random.default_rng(0).random((400, dimension))
 
 
 def _drawn(context: ReportContext, unit: Array, bounds: Array, tau: float) -> Markup:

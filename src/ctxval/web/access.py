@@ -36,8 +36,8 @@ class Access:
 
     def admits(self, token: str) -> bool:
         """Return whether this is the token of the server. The comparison takes the same time for every text."""
-        known = (self._token or "").encode()
-        return self._token is not None and hmac.compare_digest(known, token.encode("utf-8", "backslashreplace"))
+        known, given = (self._token or "").encode(), token.encode("utf-8", "backslashreplace")
+        return self._token is not None and hmac.compare_digest(known, given)
 
     def new_session(self) -> str:
         """Return the cookie of a new session."""

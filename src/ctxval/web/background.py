@@ -139,10 +139,6 @@ def _serve(pipe: Connection, open_campaign: OpenCampaign) -> None:
             pipe.send(reply)
 
 
-_INTERVAL = 0.2
-"""Least number of seconds between two messages that only count."""
-
-
 class StageSender:
     """Sends stages to somebody, and not too many of them."""
 
@@ -153,7 +149,8 @@ class StageSender:
     def __call__(self, stage: Stage) -> None:
         """Send a stage, unless it only counts and was sent a moment ago."""
         now = time.monotonic()
-        if stage.text != self._text or now - self._at >= _INTERVAL:
+        # Least number of seconds between two messages that only count.
+        if stage.text != self._text or now - self._at >= 0.2:
             self._text, self._at = stage.text, now
             self._send(stage)
 

@@ -21,12 +21,6 @@ from ctxval.report.region import region_map
 _CURVE, _GRID = 121, 32
 """Number of points of a curve, and of each side of a map."""
 
-_SLOW_CURVE = 31
-"""Number of points of a curve, if each needs the design of a controller that cannot be made in a batch."""
-
-_SLICES = 12
-"""Largest number of slices: of the parameters to which the distance is most sensitive."""
-
 _ORIGINS: tuple[tuple[Kind, str, tuple[str, ...]], ...] = (
     ("initial", "initial or chosen by a person", ("iid", "initial", "manual")),
     ("covering", "chosen to decide the verdict", ("covering",)),
@@ -63,7 +57,8 @@ def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:
     if d == 2:
         both = (_slice(context, axis) for axis in range(2))
         return joined([said, element("div", _map(context, model), *both, class_="charts")])
-    axes = [int(j) for j in np.argsort(-model.sensitivity, kind="stable")[:_SLICES]]
+    # Largest number of slices: of the parameters to which the distance is most sensitive.
+    axes = [int(j) for j in np.argsort(-model.sensitivity, kind="stable")[:12]]
     if d > len(axes):
         said += paragraph(f"{d - len(axes)} parameters with less influence have no slice here.")
     slices = filter(None, (_slice(context, axis, small=True) for axis in axes))
@@ -94,7 +89,8 @@ def _estimated(context: ReportContext, unit: Array) -> Band | None:
 def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart | None:
     """Return the distance along one parameter, through the worst executed task; None if it cannot be estimated."""
     space, worst = context.space, context.worst_first[0]
-    count = _CURVE if context.batched or context.validation is None else _SLOW_CURVE
+    # Number of points of a curve, if each needs the design of a controller that cannot be made in a batch.
+    count = _CURVE if context.batched or context.validation is None else 31
     unit = np.tile(worst.unit_point, (count, 1))
     unit[:, axis] = np.linspace(0, 1, count)
     x, band = space.from_unit(unit)[:, axis], _estimated(context, unit)
@@ -111,7 +107,10 @@ def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart |
     chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
     if space.dimension == 1:
         _add_samples(chart, context, lambda trials: (context.coordinates(trials)[:, axis], _distances(trials)))
-        _add_failed(chart, context, axis)
+        if context.failed:
+            x = context.coordinates(context.failed)[:, axis]
+            y = np.full(len(x), 0.03 * chart.y.ends[1])
+            chart.marks(x, y, "failed", "no distance is known", list(map(_named, context.failed)))
     at = context.coordinates([worst])[:, axis]
     return chart.marks(at, _distances([worst]), "worst", "worst executed task", [_named(worst)])
 
@@ -177,13 +176,6 @@ def _add_samples(chart: Chart, context: ReportContext, place: Place) -> None:
         trials = [trial for trial in context.completed if trial.origin in origins]
         if trials:
             _mark(chart, place, trials, kind, label)
-
-
-def _add_failed(chart: Chart, context: ReportContext, axis: int) -> None:
-    if context.failed:
-        x = context.coordinates(context.failed)[:, axis]
-        y = np.full(len(x), 0.03 * chart.y.ends[1])
-        chart.marks(x, y, "failed", "no distance is known", list(map(_named, context.failed)))
 
 
 def _distances(trials: Sequence[Trial]) -> Array:

@@ -13,7 +13,7 @@ from ctxval._util.representation import call, counted
 from ctxval._util.texts import parted
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, small_charts
-from ctxval.report.context import Recording, ReportContext
+from ctxval.report.context import ReportContext
 from ctxval.report.markup import cell, details, element, heading, joined, paragraph, quantity
 from ctxval.report.recorded_lines import RecordedLines, recorded_lines
 
@@ -24,11 +24,6 @@ _ROWS = 1000
 """Largest number of trials in the table: those with the largest distances, and those without a distance."""
 
 _WORST = 5
-_SIGNALS = 10
-"""Largest number of states and inputs that are drawn for each of the worst trials: those with the largest errors."""
-
-_POINTS = 90
-"""Number of points of a line of the worst trials."""
 
 
 class TrialsSection:
@@ -137,12 +132,13 @@ def _signals(context: ReportContext, number_: int) -> list[Chart]:
     replay = context.replays.get(number_)
     corrected = None if replay is None else replay.corrected
     labels = [label for named in context.signals for label in named]
-    of_model, of_system = _joined(recording, "model"), _joined(recording, "system")
+    of_model, of_system = ([*run.states.T, *run.inputs.T] for run in (recording.model, recording.system))
     n = recording.model.states.shape[-1]
     sizes = [
         float(np.abs(s - m).max(initial=0.0) / max(np.ptp(m), 1e-300)) for m, s in zip(of_model, of_system, strict=True)
     ]
-    chosen = sorted(np.argsort(sizes)[::-1][:_SIGNALS].tolist())
+    # Largest number of states and inputs that are drawn for each of the worst trials: those with the largest errors.
+    chosen = sorted(np.argsort(sizes)[::-1][:10].tolist())
     drawn = []
     for j in chosen:
         lines = {"system": of_system[j], "model": of_model[j]}
@@ -154,24 +150,19 @@ def _signals(context: ReportContext, number_: int) -> list[Chart]:
     return drawn
 
 
-def _joined(recording: Recording, side: str) -> list[Array]:
-    one = getattr(recording, side)
-    return [*one.states.T, *one.inputs.T]
-
-
 def _signal(title: str, label: str, times: Array, lines: dict[str, Array], reference: Array | None) -> Chart:
     every = [*lines.values(), *([] if reference is None else [reference])]
     chart = Chart(title, Axis("time [s]", float(times[0]), float(times[-1])), Axis.over(label, *every), **SMALL)
     if reference is not None:
         _thin(chart, times, reference, "reference", "reference")
     # The corrected model is drawn first, as a wide line, because it often coincides with S.
-    kinds = (("corrected", "corrected model"), ("system", "system S"), ("model", "model M"))
-    for kind, name in kinds:
+    for kind, name in (("corrected", "corrected model"), ("system", "system S"), ("model", "model M")):
         if kind in lines:
             _thin(chart, times, lines[kind], kind, name)
     return chart
 
 
 def _thin(chart: Chart, times: Array, values: Array, kind: Any, name: str) -> None:
-    rows = np.unique(np.linspace(0, len(values) - 1, min(_POINTS, len(values))).astype(int))
+    # Number of points of a line of the worst trials.
+    rows = np.unique(np.linspace(0, len(values) - 1, min(90, len(values))).astype(int))
     chart.line(times[: len(values)][rows], values[rows], kind, name)

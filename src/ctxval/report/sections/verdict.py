@@ -26,9 +26,6 @@ _SHAPES = {"validated": "\u2714", "falsified": "\u2718", "undecided": "?", "no v
 _MORE = 10
 """Number of further executions that are advised if none can be forecast."""
 
-_STORES = 5
-"""Largest number of other stores that are named."""
-
 
 class VerdictSection:
     """The verdict, with the picture that shows it best."""
@@ -148,7 +145,8 @@ def _remarks(context: ReportContext) -> list[Markup]:
     others = [] if context.store.path is None else other_stores(context.store.path)
     if others:
         count = counted(len(others), "other store")
-        names = [other.name for other in others[:_STORES]]
+        # Largest number of other stores that are named.
+        names = [other.name for other in others[:5]]
         sentence = f"The folder contains {count} of this experiment: {', '.join(names)}. The best result of several "
         said.append(paragraph(f"{sentence}campaigns is wrong more often than its confidence states.", class_="note"))
     return said
