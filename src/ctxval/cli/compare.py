@@ -113,7 +113,13 @@ def compare(
         _print(found)
         for one in failures.values():
             print_failures(one)
-    files = [] if out_file is None else _written(found, out_file)
+    files = []
+    if out_file is not None:
+        files.append(str(write_text(out_file, markdown(found))))
+        try:
+            files.append(str(plot.save(found.plot(), out_file.with_suffix(".png"))))
+        except Exception as error:  # it must not hide the decisions, for which executions were paid
+            err.say(f"no picture: {reason_of(error)}")
     paths = {one.name: str(one.campaign.store.path) for one in made}
     return {**found.to_dict(), "stores": paths, "failures": failures, "files": files}
 
@@ -150,18 +156,6 @@ def _settings(target: str, seed: int, options: dict[str, Any]) -> Settings:
         options = {**options, **named_values(rest.split(","))}
         target = case
     return read_settings(target, {"seed": seed, "options": options})
-
-
-def _written(found: Comparison, path: Path) -> list[str]:
-    """Write the tables and the picture; return the names of the files."""
-    write_text(path, markdown(found))
-    try:
-        drawn = [str(plot.save(found.plot(), path.with_suffix(".png")))]
-    except Exception as error:
-        # An error in a figure must not hide the decisions, for which executions were paid.
-        err.say(f"no picture: {reason_of(error)}")
-        drawn = []
-    return [str(path), *drawn]
 
 
 def _print(found: Comparison) -> None:

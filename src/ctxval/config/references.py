@@ -48,18 +48,13 @@ def _searched_first(home: str) -> Iterator[str]:
     before = list(sys.path)
     if home not in before:
         _added.add(home)
-    sys.path[:] = [home, *(entry for entry in before if _is_searched(entry, home))]
+    stated = {os.path.realpath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path}
+    others = {home, os.path.realpath(_here()), *_added} - stated
+    sys.path[:] = [home, *(entry for entry in before if os.path.realpath(entry or _here()) not in others)]
     try:
         yield home
     finally:
         sys.path.extend(entry for entry in before if entry not in sys.path)
-
-
-def _is_searched(entry: str, home: str) -> bool:
-    real, wanted = os.path.realpath(entry or _here()), os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    if real in {os.path.realpath(path) for path in wanted if path}:
-        return True
-    return real not in {home, os.path.realpath(_here()), *_added}
 
 
 def _here() -> str:

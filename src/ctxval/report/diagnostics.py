@@ -21,9 +21,6 @@ from ctxval.report.markup import number, percent, quantity
 _IMPROVED = 0.01
 """Least increase of the largest distance that counts as an improvement, as a share of it."""
 
-_LISTED = 10
-"""Largest number of failed trials that are listed one by one."""
-
 _CALIBRATED, _ROUGH = (0.5, 1.5), 2.5
 """Range of the root mean square of standardised errors that is as expected, and the value above which it is not."""
 
@@ -57,7 +54,8 @@ def _certificate(context: ReportContext) -> Finding | None:
         return Finding("Certificate", "bad", f"Refused: {verdict.reason}")
     if found.doubt is None:
         return None
-    numbers = {"kind": found.kind, "upper_bound": _finite(found.upper_bound), "confidence": found.confidence}
+    bound = float(found.upper_bound) if np.isfinite(found.upper_bound) else None
+    numbers = {"kind": found.kind, "upper_bound": bound, "confidence": found.confidence}
     return Finding("Certificate", "bad", f"Withdrawn: {found.doubt}.", numbers)
 
 
@@ -85,12 +83,7 @@ def _covering(context: ReportContext) -> Finding | None:
 
 
 def share_far_from_trials(points: Array, resolution: float = RESOLUTION) -> float:
-    """Return the share of the tasks that are farther than a resolution from every trial.
-
-    Args:
-        points: points of the unit cube of the trials ``(n, d)``.
-        resolution: the distance in diagonals of the task space.
-    """
+    """Return the share of the tasks farther than a resolution, in diagonals, from all of the points ``(n, d)``."""
     d = points.shape[1]
     gaps, _ = KDTree(points).query(np.random.default_rng(0).random((4096, d)))
     return float(np.mean(gaps / np.sqrt(d) > resolution))
@@ -174,47 +167,33 @@ _QUESTIONS: tuple[tuple[str, Question], ...] = (
 
 def not_tested(context: ReportContext) -> list[str]:
     """Return what was not tested, one sentence each."""
-    said = []
+    sentences = []
     certificate = context.certificate
     if certificate is not None and certificate.volume:
         left_out = at_most(100 * certificate.volume, 3)
-        said.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
+        sentences.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
     if len(context.points):
-        said += _regions(context)
-    for trial in context.failed[:_LISTED]:
+        share = share_far_from_trials(context.points)
+        if share:
+            sentences.append(
+                f"{percent(share)} of the task space is farther than {RESOLUTION:g} diagonals from every trial; there "
+                "the distance is inferred and not executed."
+            )
+        bare, d = len(bare_corners(context.points, RESOLUTION)), context.space.dimension
+        if bare:
+            where = "ends of the range" if d == 1 else "corners of the task space"
+            sentences.append(f"{bare} of the {2**d} {where} have no trial next to them.")
+    for trial in context.failed[:10]:
         where = ", ".join(
             f"{label} = {number(value)}"
             for label, value in zip(context.space.labels, context.coordinates([trial])[0], strict=True)
         )
-        said.append(f"The distance at the task of trial {trial.number} ({where}), because it {_ended(trial)}.")
-    if len(context.failed) > _LISTED:
-        said.append(f"The distances of {len(context.failed) - _LISTED} more trials that failed or were not measured.")
-    said.append(
+        ended = "failed" if trial.state == "failed" else "could not be measured"
+        sentences.append(f"The distance at the task of trial {trial.number} ({where}), because it {ended}.")
+    if len(context.failed) > 10:
+        sentences.append(f"The distances of {len(context.failed) - 10} more trials that failed or were not measured.")
+    sentences.append(
         "Tasks outside the task space, other controllers, and conditions that the recorded state does not hold, such "
         "as wear, temperature or payload."
     )
-    return said
-
-
-def _regions(context: ReportContext) -> list[str]:
-    said = []
-    share = share_far_from_trials(context.points)
-    if share:
-        said.append(
-            f"{percent(share)} of the task space is farther than {RESOLUTION:g} diagonals from every trial; there the "
-            "distance is inferred and not executed."
-        )
-    bare = len(bare_corners(context.points, RESOLUTION))
-    if bare:
-        d = context.space.dimension
-        where = "ends of the range" if d == 1 else "corners of the task space"
-        said.append(f"{bare} of the {2**d} {where} have no trial next to them.")
-    return said
-
-
-def _ended(trial: Trial) -> str:
-    return "failed" if trial.state == "failed" else "could not be measured"
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    return sentences

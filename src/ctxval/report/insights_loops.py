@@ -34,7 +34,9 @@ def components(context: ReportContext) -> Finding | None:
     shares = _shares(context, worst)
     numbers = {"state": label, "peak": float(peaks[j]), "time": when, "shares": shares}
     if shares:
-        text += " Of the error that the distance measures, " + _listed(shares) + "."
+        largest = sorted(shares.items(), key=lambda item: -item[1])[:3]
+        listed = " and ".join(f"{percent(share)} is in {name}" for name, share in largest)
+        text += f" Of the error that the distance measures, {listed}."
     return Finding("What errs, and when", "note", text, numbers)
 
 
@@ -53,11 +55,6 @@ def _shares(context: ReportContext, worst: list[Recording]) -> dict[str, float]:
         return {}
     sizes = np.abs(errors).mean(axis=0)
     return {name: float(size) for name, size in zip(names, sizes / sizes.sum(), strict=True)}
-
-
-def _listed(shares: dict[str, float]) -> str:
-    largest = sorted(shares.items(), key=lambda item: -item[1])[:3]
-    return " and ".join(f"{percent(share)} is in {name}" for name, share in largest)
 
 
 def flips(context: ReportContext) -> Finding | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array
 from ctxval._util.representation import counted
 from ctxval.report.context import ReportContext, distance_of
 from ctxval.report.findings import Finding
@@ -37,33 +37,39 @@ def region_text(context: ReportContext, points: Array) -> str:
     """Return where points of the unit cube ``(m, d)`` lie, by the parameters in which they differ from all tasks."""
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
     width = high - low
-    # A region is described by the parameters in which it is narrower than this share of the range.
-    # Largest number of parameters that describe a region.
+    # At most three parameters describe a region: those in which it is clearly narrower than their ranges.
     narrow = [int(j) for j in np.argsort(width) if width[j] < 0.7][:3]
     if not narrow:
         return "they are spread over the task space"
     ends = context.space.from_unit(np.stack([low, high]))
-    parts = [_interval(context.space.labels[j], number(ends[0, j], 3), number(ends[1, j], 3)) for j in narrow]
+    parts = []
+    for j in narrow:
+        first, last = number(ends[0, j], 3), number(ends[1, j], 3)
+        between = f"at {first}" if first == last else f"from {first} to {last}"
+        parts.append(f"{context.space.labels[j]} {between}")
     return f"most of them have {' and '.join(parts)}"
-
-
-def _interval(label: str, low: str, high: str) -> str:
-    return f"{label} at {low}" if low == high else f"{label} from {low} to {high}"
 
 
 def weak_states(context: ReportContext) -> Finding | None:
     """Which states and inputs the system visits where M is weak, and not elsewhere."""
     if len(context.recordings) < 4:
         return None
-    weak = _weak_rows(context)
-    ranges = np.array([_extent(one.system.states, one.system.inputs) for one in context.recordings.values()])
-    low, high = ranges[:, 0], ranges[:, 1]
+    # Recordings above the threshold are weak, or else the quarter with the largest distances.
+    by_number, tau = {trial.number: distance_of(trial) for trial in context.completed}, context.threshold
+    weak = np.array([by_number[number] for number in context.recordings]) > (np.inf if tau is None else tau)
+    which = "above the threshold"
+    if not weak.any() or weak.all():
+        weak, which = np.arange(len(weak)) < max(1, len(weak) // 4), "with the largest distances"
+    runs = [one.system for one in context.recordings.values()]
+    low, high = (
+        np.array([np.concatenate([end(run.states, axis=0), end(run.inputs, axis=0)]) for run in runs])
+        for end in (np.min, np.max)
+    )
     inside_low, inside_high = low[~weak].min(axis=0), high[~weak].max(axis=0)
     span = np.maximum(high.max(axis=0) - low.min(axis=0), 1e-300)
     beyond = np.maximum(high[weak].max(axis=0) - inside_high, inside_low - low[weak].min(axis=0)) / span
     j = int(beyond.argmax())
     label = [label for labels in context.signals for label in labels][j]
-    which = "above the threshold" if _is_above(context) else "with the largest distances"
     numbers = {"signal": label, "beyond": float(beyond[j])}
     if beyond[j] < 0.05:
         return None
@@ -72,28 +78,6 @@ def weak_states(context: ReportContext) -> Finding | None:
         f"{number(high[weak, j].max())}; all others stay within {number(inside_low[j])} and {number(inside_high[j])}."
     )
     return Finding("States visited there", "note", text, numbers)
-
-
-def _extent(states: Array, inputs: Array) -> Array:
-    """Return the smallest and the largest value of each state and input, shape ``(2, n + m)``."""
-    lows = np.concatenate([states.min(axis=0), inputs.min(axis=0)])
-    return np.stack([lows, np.concatenate([states.max(axis=0), inputs.max(axis=0)])])
-
-
-def _is_above(context: ReportContext) -> bool:
-    return context.threshold is not None and bool(_above(context).any()) and not bool(_above(context).all())
-
-
-def _above(context: ReportContext) -> Mask:
-    by_number = {trial.number: distance_of(trial) for trial in context.completed}
-    return np.array([by_number[number] for number in context.recordings]) > (context.threshold or np.inf)
-
-
-def _weak_rows(context: ReportContext) -> Mask:
-    """Return which recordings are weak: those above the threshold, or else the quarter with the largest distances."""
-    if _is_above(context):
-        return np.asarray(_above(context))
-    return np.arange(len(context.recordings)) < max(1, len(context.recordings) // 4)
 
 
 def bias(context: ReportContext) -> Finding | None:
@@ -110,25 +94,18 @@ def bias(context: ReportContext) -> Finding | None:
            "M errs in few tasks.")
     )  # fmt: skip
     numbers = {"mean_distance": typical, "share_of_largest": share}
-    sided = _side(context)
-    if sided is not None:
-        label, same = sided
+    if len(context.recordings) >= 4:
+        # The state with the largest final error, and the share of trials whose error has the usual sign.
+        ends = np.array([one.system.final_state for one in context.recordings.values()])
+        errors = ends - np.array([one.model.final_state for one in context.recordings.values()])
+        j = int((np.abs(errors) / np.maximum(np.ptp(ends, axis=0), 1e-300)).mean(axis=0).argmax())
+        label, same = context.signals[0][j], float(max((errors[:, j] > 0).mean(), (errors[:, j] < 0).mean()))
         text += (
             f" At the end of the executed tasks S lies on the same side of M in {label} in {percent(same, 3)} of the "
             "trials" + (", so the error is systematic." if same > 0.9 else ".")
         )
         numbers |= {"one_sided_share": same}
     return Finding("Bias across the tasks", "note", text, numbers)
-
-
-def _side(context: ReportContext) -> tuple[str, float] | None:
-    """Return the state with the largest final error, and the share of trials whose error has the usual sign."""
-    if len(context.recordings) < 4:
-        return None
-    errors = np.array([one.system.final_state - one.model.final_state for one in context.recordings.values()])
-    spans = np.maximum(np.ptp([one.system.final_state for one in context.recordings.values()], axis=0), 1e-300)
-    j = int((np.abs(errors) / spans).mean(axis=0).argmax())
-    return context.signals[0][j], float(max((errors[:, j] > 0).mean(), (errors[:, j] < 0).mean()))
 
 
 def explained(context: ReportContext) -> Finding | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.arrays import Array
 from ctxval.report.charts import legend
 from ctxval.report.context import ReportContext
 from ctxval.report.markup import element, number, paragraph
@@ -31,7 +30,11 @@ def parallel_coordinates(context: ReportContext) -> Markup:
     # Least distance between two axes.
     width = max(480, 70 * (len(labels) - 1) + 60)
     at = 30 + (width - 60) * np.arange(len(labels)) / (len(labels) - 1)
-    drawn = [_line(at, share, "weak" if k < limit else "rest") for k, share in reversed(list(enumerate(shares)))]
+    drawn = []
+    for k, share in reversed(list(enumerate(shares))):
+        up = _BOTTOM - np.clip(share, 0, 1) * (_BOTTOM - _TOP)
+        path = "L".join(f"{x:.0f},{y:.0f}" for x, y in zip(at, up, strict=True))
+        drawn.append(element("path", d=f"M{path}", class_=f"line {'weak' if k < limit else 'rest'}"))
     low, high = [*context.space.low, 0.0], [*context.space.high, top]
     axes = [_axis(x, j, label, low[j], high[j]) for j, (x, label) in enumerate(zip(at, labels, strict=True))]
     title = "Parallel coordinates: one line for each executed task, through its parameters and its distance"
@@ -43,12 +46,6 @@ def parallel_coordinates(context: ReportContext) -> Markup:
     swatches = legend({f"the {limit} worst tasks": ("weak", "line"), "the other tasks": ("rest", "line")})
     scroll = element("div", drawing, class_="scroll", tabindex="0", role="region", aria_label="Parallel coordinates")
     return element("figure", scroll, swatches, names, element("figcaption", title), class_="wide")
-
-
-def _line(at: Array, shares: Array, kind: str) -> Markup:
-    up = _BOTTOM - np.clip(shares, 0, 1) * (_BOTTOM - _TOP)
-    path = "L".join(f"{x:.0f},{y:.0f}" for x, y in zip(at, up, strict=True))
-    return element("path", d=f"M{path}", class_=f"line {kind}")
 
 
 def _axis(x: float, j: int, label: str, low: float, high: float) -> Markup:

@@ -16,11 +16,7 @@ GROUP = "ctxval.report_sections"
 
 @runtime_checkable
 class Section(Protocol):
-    """A section of a report.
-
-    Attributes:
-        title: its heading.
-    """
+    """A section of a report."""
 
     title: str
 
@@ -32,28 +28,16 @@ class Section(Protocol):
 
 
 def sections_of(own: Sequence[Section], added: Sequence[Section]) -> list[Section]:
-    """Return the sections of a report: the own ones, those of installed packages, and those that are added.
-
-    Args:
-        own: the sections that every report has.
-        added: the sections that the user adds.
-
-    Raises:
-        InputError: if a section has no title or no method ``render``, or cannot be loaded.
-    """
-    found = [*own, *_installed(), *added]
-    for section in found:
-        if not isinstance(section, Section) or not isinstance(section.title, str):
-            raise InputError(f"a section must have a title and a method render(context), got {section!r}.")
-    return found
-
-
-def _installed() -> list[Section]:
-    found: list[Section] = []
-    for point in sorted(entry_points(group=GROUP), key=lambda one: one.name):
+    """Return the sections of a report: the own ones, those of installed packages, and those that are added."""
+    installed: list[Section] = []
+    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         try:
             loaded = point.load()
-            found.append(loaded() if isinstance(loaded, type) else loaded)
+            installed.append(loaded() if isinstance(loaded, type) else loaded)
         except Exception as error:  # another package's code
             raise InputError(f"the section {point.name!r} cannot be loaded: {reason_of(error)}.") from error
-    return found
+    sections = [*own, *installed, *added]
+    for section in sections:
+        if not isinstance(section, Section) or not isinstance(section.title, str):
+            raise InputError(f"a section must have a title and a method render(context), got {section!r}.")
+    return sections

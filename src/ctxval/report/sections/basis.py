@@ -50,10 +50,9 @@ def _assumptions(certificate: Certificate) -> list[Markup]:
 
 def lights(findings: list[Finding]) -> Markup:
     """Return findings as a list with their lights: a shape, a colour and a word."""
-    return element("ul", *map(_light, findings), class_="lights")
-
-
-def _light(finding: Finding) -> Markup:
-    shape = element("span", _SHAPES[finding.light], class_="shape", aria_hidden="true")
-    word = element("span", shape, " ", WORDS[finding.light], class_=f"light {finding.light}")
-    return element("li", word, " ", element("strong", f"{finding.name}."), " ", finding.text)
+    rows = []
+    for finding in findings:
+        shape = element("span", _SHAPES[finding.light], class_="shape", aria_hidden="true")
+        word = element("span", shape, " ", WORDS[finding.light], class_=f"light {finding.light}")
+        rows.append(element("li", word, " ", element("strong", f"{finding.name}."), " ", finding.text))
+    return element("ul", *rows, class_="lights")

@@ -22,7 +22,15 @@ class ConvergenceSection:
         chart = distances_in_order(context)
         if chart is None:
             return paragraph("No distance is known yet.")
-        return joined([element("div", chart, _times(context), class_="charts"), _spent(context)])
+        seconds = [trial.seconds for trial in context.trials if trial.seconds is not None]
+        attempts, sentences = sum(trial.attempts for trial in context.trials), []
+        if attempts > len(context.trials):
+            sentences.append(f"{attempts} attempts were made in {len(context.trials)} trials.")
+        if seconds:
+            total, median = number(float(np.sum(seconds))), number(float(np.median(seconds)))
+            sentences.append(f"The executions took {total} s, {median} s in the median.")
+        spent = [paragraph(" ".join(sentences))] if sentences else []
+        return joined([element("div", chart, _times(context), class_="charts"), *spent])
 
     __repr__ = call
 
@@ -72,16 +80,3 @@ def _times(context: ReportContext) -> Chart | None:
 
 def _trial_axis(last: float) -> Axis:
     return Axis("trial", -0.02 * max(last, 1.0), 1.02 * max(last, 1.0), whole=True)
-
-
-def _spent(context: ReportContext) -> Markup | None:
-    timed = [trial.seconds for trial in context.trials if trial.seconds is not None]
-    attempts = sum(trial.attempts for trial in context.trials)
-    said = []
-    if attempts > len(context.trials):
-        said.append(f"{attempts} attempts were made in {len(context.trials)} trials.")
-    if timed:
-        said.append(
-            f"The executions took {number(float(np.sum(timed)))} s, {number(float(np.median(timed)))} s in the median."
-        )
-    return paragraph(" ".join(said)) if said else None

@@ -22,8 +22,6 @@ from ctxval.report.markup import code, heading, joined, number, paragraph, table
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH
 from ctxval.version import VERSION
 
-_WORST = 5
-_PACKAGES = ("numpy", "scipy")
 _SAME = (
     "The command makes the same choices again, into a new store, with the same versions of the libraries on the same "
     "kind of processor. The option thinking of the search auto must then be a number, fast or thorough: balanced "
@@ -53,8 +51,11 @@ class RepeatSection:
                 "again as a new trial, and writes its controller to files."
             ),
         ]
-        for trial in context.worst_tasks(_WORST):
-            parts += _snippets(context, trial)
+        for trial in context.worst_tasks():
+            distance = f"{number(distance_of(trial))} {context.labels.units}".rstrip()
+            parts.append(heading(f"Trial {trial.number}, distance {distance}", 4))
+            parts.append(code(python_snippet(context, trial), f"Python for trial {trial.number}"))
+            parts.append(code(command_snippet(context, trial), f"Command for trial {trial.number}"))
         return joined(parts)
 
     __repr__ = call
@@ -76,10 +77,12 @@ def identity(context: ReportContext) -> dict[str, str]:
         "seed": str(described.get("seed", "not known")),
         "version of ctxval": VERSION,
         "version of Python": platform.python_version(),
-        **{f"version of {name}": _version(name) for name in _PACKAGES},
+        **{f"version of {name}": _version(name) for name in ("numpy", "scipy")},
         "processor": platform.machine(),
         **digests,
-        "digest of the trials": digest([_plain(trial) for trial in context.trials]),
+        "digest of the trials": digest(
+            [[trial.number, trial.state, trial.unit_point.tolist(), trial.distance] for trial in context.trials]
+        ),
     }
 
 
@@ -88,10 +91,6 @@ def _version(name: str) -> str:
         return version(name)
     except PackageNotFoundError:  # a package without its metadata, as in a bundle
         return "not known"
-
-
-def _plain(trial: Trial) -> list[Any]:
-    return [trial.number, trial.state, trial.unit_point.tolist(), trial.distance]
 
 
 def digest(value: Any) -> str:
@@ -109,13 +108,7 @@ def repeating_command(context: ReportContext) -> str:
 
 
 def command_of(context: ReportContext, budget: int | None = None, *others: str) -> str:
-    """Return the command that runs the campaign; empty if no command made the store.
-
-    Args:
-        context: what the report is made from.
-        budget: another budget than that of the campaign.
-        others: further words.
-    """
+    """Return the command that runs the campaign, with further words; empty if no command made the store."""
     settings = context.settings
     if not settings:
         return ""
@@ -152,15 +145,6 @@ def _unless(default: object, value: Any) -> Any:
 def _mapping(value: Any) -> Mapping[str, Any]:
     """Return a table of the settings; an empty one for anything else, because a store may hold anything."""
     return value if isinstance(value, Mapping) else {}
-
-
-def _snippets(context: ReportContext, trial: Trial) -> list[Markup]:
-    said = f"Trial {trial.number}, distance {number(distance_of(trial))} {context.labels.units}".rstrip()
-    return [
-        heading(said, 4),
-        code(python_snippet(context, trial), f"Python for trial {trial.number}"),
-        code(command_snippet(context, trial), f"Command for trial {trial.number}"),
-    ]
 
 
 def python_snippet(context: ReportContext, trial: Trial) -> str:
