@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -73,7 +73,8 @@ def serve(
     """
     web = web_server()
     address = web.Address(host, port, token, tuple(allow_host or ()))
-    again = _Reopening(settings_of(Store.existing(store), experiment, trust), store, threshold, budget)
+    settings = settings_of(Store.existing(store), experiment, trust)
+    again = functools.partial(_reopened, settings, store, threshold, budget)
 
     def first() -> ServedCampaign:
         return _served(open_store(Store.existing(store), store, experiment, trust, accept_change), threshold, budget)
@@ -87,22 +88,11 @@ def serve(
     web.serve(first, again, address, say_started)
 
 
-@dataclass(frozen=True)
-class _Reopening:
-    """Opens a store in a child process by settings that the user has allowed to run here.
-
-    The settings in the store are not read again: somebody may have changed them since.
-    """
-
-    settings: Settings
-    path: Path
-    threshold: float | None
-    budget: int | None
-
-    def __call__(self) -> ServedCampaign:
-        made = self.settings.load()
-        campaign = self.settings.campaign(made, Store.existing(self.path))
-        return _served(Opened(self.settings, made, campaign, self.path), self.threshold, self.budget)
+def _reopened(settings: Settings, path: Path, threshold: float | None, budget: int | None) -> ServedCampaign:
+    """Open a store by settings that the user has allowed to run here: those in it may have been changed since."""
+    made = settings.load()
+    campaign = settings.campaign(made, Store.existing(path))
+    return _served(Opened(settings, made, campaign, path), threshold, budget)
 
 
 def _served(opened: Opened, threshold: float | None, budget: int | None) -> ServedCampaign:

@@ -142,7 +142,7 @@ def require_part(registry: Registry[Any], what: str, found: Any) -> Any:
 
 
 def require_function(what: str, found: Any, form: str) -> Any:
-    """Return a function if it takes the number of positional arguments of a form; it is not called here."""
+    """Return a function if it takes the arguments of a form such as ``(x, u) -> x_next``; it is not called here."""
     count = form.partition("->")[0].count(",") + 1
     if not is_function(found):
         raise InputError(f"{what} must be a function {form} written in Python, got {_named(found)}.")

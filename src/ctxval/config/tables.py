@@ -28,8 +28,6 @@ class CertificateTable(BaseModel):
     A kind of certificate from another package has its own options in the table.
 
     Attributes:
-        kind: the kind of the certificate.
-        stochastic: whether two executions of one task may differ.
         volume: the share of the task space that may exceed the threshold.
         resolution: the largest distance between a task and its nearest trial, in diagonals of the task space.
         discard: the number of largest distances to discard, for ``sampling-discarding``.
@@ -100,11 +98,8 @@ class SearchTable(BaseModel):
 class Aspect1Table(BaseModel):
     """The table ``[aspect1]``, which ``ctxval check --aspect1`` reads; a campaign does not use it.
 
-    Attributes:
-        distance: ``module:attr``, or a table with a type and its arguments: how far a trajectory is from completing its
-            task. By default it is derived from the distance of the experiment.
-        threshold: the largest error with which a task counts as completed, in the units of the goal.
-        tasks: number of simulated tasks.
+    The distance is ``module:attr`` or a table: how far a trajectory is from completing its task. By default it is
+    derived from the distance of the experiment. The threshold is in the units of the goal.
     """
 
     model_config = ConfigDict(extra="forbid")

@@ -17,9 +17,8 @@ LEAST_TOKEN = 16
 class Access:
     """Sessions in signed cookies, with a key that lives as long as the server.
 
-    Args:
-        token: the token that a browser must show once; None if every browser on this computer may use the page.
-        port: the port of the server. Browsers share cookies among the ports of one computer.
+    Without a token, every browser on this computer may use the page. Browsers share cookies among the ports of one
+    computer.
     """
 
     def __init__(self, token: str | None, port: int) -> None:

@@ -21,7 +21,6 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response, Stream
 from starlette.routing import Route
 
 from ctxval._util.texts import shortened, visible
-from ctxval.campaign.telling import ToldResult
 from ctxval.errors import CampaignError, CtxvalError, InputError, StoreError
 from ctxval.web import forms
 from ctxval.web.access import Access
@@ -30,8 +29,6 @@ from ctxval.web.page import Page, Problem
 from ctxval.web.security import MOST_UPLOAD, Guard, Hosts
 from ctxval.web.service import CampaignService
 from ctxval.web.state import PageState
-
-_KINDS = ("recording", "distance", "failure")
 
 _TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
@@ -183,23 +180,28 @@ class OperatorPage(PageRoutes):
     async def tell(self, request: Request, session: str) -> Response:
         """Record the result of a trial."""
         number, kind = request.path_params["number"], request.path_params["kind"]
-        if kind not in _KINDS:
+        if kind not in ("recording", "distance", "failure"):
             return HTMLResponse(self.page.message("Not found", "There is no such page."), 404)
         fields: dict[str, str] = {}
         try:
             async with _form(request, max_files=1, max_fields=20, max_part_size=65_536) as form:
                 fields = _texts(form)
-                if not self.access.allows_form(session, fields.get("token", "")):
-                    where = self._where(number, kind, fields)
-                    return self._problem(request, session, Problem(where, _OUT_OF_DATE, fields, 403))
-                await self._tell(number, kind, form)
+                if self.access.allows_form(session, fields.get("token", "")):
+                    await self._tell(number, kind, form)
+                    return RedirectResponse(f"/?told={number}#message", 303)
+            sentence, status = _OUT_OF_DATE, 403
         except HTTPException as error:
-            sentence = f"the form cannot be read: {error.detail}"
-            problem = Problem(self._where(number, kind, fields), sentence, fields, error.status_code)
-            return self._problem(request, session, problem)
+            sentence, status = f"the form cannot be read: {error.detail}", error.status_code
         except CtxvalError as error:
-            return self._problem(request, session, self._not_told(number, kind, error, fields))
-        return RedirectResponse(f"/?told={number}#message", 303)
+            sentence, status = shortened(str(error)), 500 if isinstance(error, StoreError | CampaignError) else 422
+            ended = None if "replace" in fields else self.page.ended(number)
+            if ended is not None:
+                sentence, status = f"a result of this trial is recorded already: {ended}.", 409
+        # The problem is shown in its form, or at the top of the page if the form is not on it any more.
+        snapshot = self.service.snapshot
+        shown = [trial for trial in snapshot.trials if trial.told] if "replace" in fields else snapshot.waiting
+        where = f"{kind}-{number}" if any(trial.number == number for trial in shown) else "trial"
+        return self._problem(request, session, Problem(where, sentence, fields, status))
 
     async def _tell(self, number: int, kind: str, form: FormData) -> None:
         fields, upload = _texts(form), form.get("file")
@@ -209,26 +211,11 @@ class OperatorPage(PageRoutes):
                 path = recording_in(folder, upload.filename)
                 path.write_bytes(await upload.read())
             try:
-                told: ToldResult = forms.result(kind, fields, path)
-                await self.service.tell(number, told, fields.get("submission", ""))
+                result = forms.result(kind, fields, path)
+                await self.service.tell(number, result, fields.get("submission", ""))
             except InputError as error:
                 # The operator knows the name of the file, not the folder in which it is read.
                 raise InputError(str(error).replace(f"{folder}/", "")) from error
-
-    def _not_told(self, number: int, kind: str, error: CtxvalError, fields: dict[str, str]) -> Problem:
-        """Return why a result was not recorded, at the form if that is still on the page."""
-        sentence = shortened(str(error))
-        ended = None if "replace" in fields else self.page.ended(number)
-        if ended is not None:
-            sentence = f"a result of this trial is recorded already: {ended}."
-        status = 409 if ended is not None else 500 if isinstance(error, StoreError | CampaignError) else 422
-        return Problem(self._where(number, kind, fields), sentence, fields, status)
-
-    def _where(self, number: int, kind: str, fields: dict[str, str]) -> str:
-        """Return the form in which a problem is shown; if it is not on the page any more, the top of the page."""
-        snapshot = self.service.snapshot
-        shown = [trial for trial in snapshot.trials if trial.told] if "replace" in fields else snapshot.waiting
-        return f"{kind}-{number}" if any(trial.number == number for trial in shown) else "trial"
 
     def _problem(self, request: Request, session: str, problem: Problem) -> Response:
         return HTMLResponse(self._campaign(request, session, problem), problem.status)

@@ -58,19 +58,21 @@ def data_element(identifier: str, data: Any) -> Markup:
 
 
 def _left_out(context: ReportContext, lines: RecordedLines) -> Markup:
-    said = []
+    sentences = []
     if lines.left_out:
-        said.append(
+        sentences.append(
             f"The page has the trajectories of {len(lines.kept)} of {len(context.trials)} trials. Those of "
             f"{len(lines.left_out)} trials with smaller distances are left out, so that the page stays small."
         )
     if lines.thinned:
-        said.append(f"Each line has about {lines.points} of the recorded points; `ctxval export` writes all of them.")
+        sentences.append(
+            f"Each line has about {lines.points} of the recorded points; `ctxval export` writes all of them."
+        )
     if not context.replays and context.missing:
-        said.append("The corrected model is not drawn, because the experiment is not loaded.")
+        sentences.append("The corrected model is not drawn, because the experiment is not loaded.")
     elif context.replays:
-        said.append("The corrected model in each trial is learned from the other trials.")
-    return paragraph(" ".join(said)) if said else Markup("")
+        sentences.append("The corrected model in each trial is learned from the other trials.")
+    return paragraph(" ".join(sentences)) if sentences else Markup("")
 
 
 def _table(context: ReportContext, lines: RecordedLines) -> Markup:
