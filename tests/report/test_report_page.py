@@ -329,8 +329,8 @@ def test_the_report_of_very_many_trials_stays_small(tmp_path: Path) -> None:
             trial = Trial(number, "iid", "completed", point, named, 1, True, float(point.sum()))
             store._insert(trial)
             if number % 5 == 0:
-                store._write_trajectory(number, "model", model)
-                store._write_trajectory(number, "system", Trajectory(model.times, rng.random((201, 3)), model.inputs))
+                store._trajectories.write(number, "model", model)
+                store._trajectories.write(number, "system", Trajectory(model.times, rng.random((201, 3)), model.inputs))
     path = report.write_page(context_of_store(store, 1.9, certificate=POSTERIOR), tmp_path / "many.html")
     assert path.stat().st_size < 1_500_000
     assert "cannot be shown" not in path.read_text(encoding="utf-8")
