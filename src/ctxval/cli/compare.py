@@ -108,11 +108,11 @@ def compare(
         stochastic=stochastic,
     )
     found = race.run()
-    failures = {one.name: failures_of(one.campaign.failed) for one in made}
+    failures = {candidate.name: failures_of(candidate.campaign.failed) for candidate in made}
     if not as_json:
         _print(found)
-        for one in failures.values():
-            print_failures(one)
+        for value in failures.values():
+            print_failures(value)
     files = []
     if out_file is not None:
         files.append(str(write_text(out_file, markdown(found))))
@@ -120,7 +120,7 @@ def compare(
             files.append(str(plot.save(found.plot(), out_file.with_suffix(".png"))))
         except Exception as error:  # it must not hide the decisions, for which executions were paid
             err.say(f"no picture: {reason_of(error)}")
-    paths = {one.name: str(one.campaign.store.path) for one in made}
+    paths = {candidate.name: str(candidate.campaign.store.path) for candidate in made}
     return {**found.to_dict(), "stores": paths, "failures": failures, "files": files}
 
 

@@ -176,7 +176,7 @@ def check(
         findings += aspect1_findings(found)
         status = FALSIFIED if found.exceeding and found.completes is False else 0
     colours = {"ok": "green", "noted": "yellow", "failed": "bold red", "skipped": "dim"}
-    for one in [] if as_json else findings:
-        out.say((f"{one.state:<8}", colours[one.state]), f"{one.check}: {one.text}")
+    for each in [] if as_json else findings:
+        out.say((f"{each.state:<8}", colours[each.state]), f"{each.check}: {each.text}")
     report = {"case": experiment.name, "ok": not status, "findings": [asdict(finding) for finding in findings]}
     return {**report, **({"aspect1": None if found is None else found.to_json()} if aspect1 else {})}, status

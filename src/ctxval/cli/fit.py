@@ -134,7 +134,9 @@ def fit_models(
     result = {**report.to_json(), "files": written}
     if not report.fitted:
         return result, CANNOT_GO_ON
-    best = next((one for one in report.fitted if one.kind != "given"), report.fitted[0]) if chosen is None else chosen
+    best = (
+        next((each for each in report.fitted if each.kind != "given"), report.fitted[0]) if chosen is None else chosen
+    )
     if best.useless is None:
         return result
     if not as_json:

@@ -58,13 +58,13 @@ class Opened:
 
 def limit_of(experiment: Experiment, settings: Settings, given: float | None = None) -> float | None:
     """Return the threshold of the verdict: the given one, or else that of the settings, or else of the experiment."""
-    known = (one for one in (given, settings.threshold, experiment.threshold) if one is not None)
+    known = (value for value in (given, settings.threshold, experiment.threshold) if value is not None)
     return require("threshold", PositiveFloat | None, next(known, None))  # type: ignore[no-any-return]
 
 
 def budget_of(experiment: Experiment, settings: Settings, given: int | None = None) -> int:
     """Return the budget: the given one, or else that of the settings, or else of the experiment."""
-    known = (one for one in (given, settings.budget, experiment.budget) if one is not None)
+    known = (value for value in (given, settings.budget, experiment.budget) if value is not None)
     return require("budget", PositiveInt, next(known))  # type: ignore[no-any-return]
 
 

@@ -263,8 +263,10 @@ def _distance(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked
 
 
 def _stacked(trajectories: Sequence[Trajectory], shift: float) -> Trajectory:
-    states: Array = np.stack([one.states for one in trajectories])
-    return Trajectory(trajectories[0].times, states + shift, np.stack([one.inputs for one in trajectories]))
+    states: Array = np.stack([trajectory.states for trajectory in trajectories])
+    return Trajectory(
+        trajectories[0].times, states + shift, np.stack([trajectory.inputs for trajectory in trajectories])
+    )
 
 
 def _executions(validation: Validation, plan: Plan, execute: bool) -> Iterator[Checked]:

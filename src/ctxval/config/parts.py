@@ -122,11 +122,11 @@ def recorded(files: Any, folder: Path | None = None) -> Transitions:
         raise InputError(f"data must be a file of recorded trajectories or a list of files, got {files!r}.")
     found = [Path(folder or "", path) for path in paths]
     steps = [None if mapping is not None else _transitions(path) for path in found]
-    parts = [one for one in steps if one is not None]
-    logs = [path for path, one in zip(found, steps, strict=True) if one is None]
+    parts = [step for step in steps if step is not None]
+    logs = [path for path, step in zip(found, steps, strict=True) if step is None]
     kinds = dict.fromkeys("" if mapping is not None else path.suffix for path in logs)
     for suffix in kinds:  # arrays in NPZ files have other names than columns
-        parts.append(read_recordings([one for one in logs if suffix in ("", one.suffix)], mapping).transitions()[0])
+        parts.append(read_recordings([each for each in logs if suffix in ("", each.suffix)], mapping).transitions()[0])
     return Transitions.joined(parts)
 
 

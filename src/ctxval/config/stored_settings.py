@@ -94,9 +94,9 @@ _LONGEST = 200
 _FILE_KEYS = {"refined", "data", "logs"}.union(
     *(
         declared.files
-        for one in REGISTRIES.values()
-        for name in one.built_in
-        if (declared := declaration_of(one.find(name)))
+        for registry in REGISTRIES.values()
+        for name in registry.built_in
+        if (declared := declaration_of(registry.find(name)))
     )
 )
 """The keys of settings whose texts are paths."""

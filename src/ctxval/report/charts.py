@@ -64,7 +64,7 @@ class Axis:
     @classmethod
     def over(cls, label: str, *values: ArrayLike, zero: bool = False, room: float = 0.06) -> Axis:
         """Return an axis that holds all finite values, from 0 if ``zero``, with a share of ``room`` at each end."""
-        flat = np.concatenate([np.ravel(np.asarray(one, dtype=np.float64)) for one in values] or [np.zeros(1)])
+        flat = np.concatenate([np.ravel(np.asarray(value, dtype=np.float64)) for value in values] or [np.zeros(1)])
         finite = flat[np.isfinite(flat) & (np.abs(flat) < 1e300)]
         low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
         low = 0.0 if zero else low - room * (high - low)

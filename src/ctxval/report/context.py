@@ -213,7 +213,7 @@ class ReportContext:
         if learned is None:
             return None
         executed = {trial.number: distance_of(trial) for trial in self.completed}
-        errors = np.array([one.distance - executed[number] for number, one in self.replays.items()])
+        errors = np.array([replay.distance - executed[number] for number, replay in self.replays.items()])
         if model is not None and not (errors**2).mean() <= ((model.left_out.median - model.values) ** 2).mean():
             return None
         try:
@@ -231,7 +231,7 @@ class ReportContext:
         by_number = {trial.number: trial for trial in self.completed}
         # The same, if the synthesizer designs one controller at a time.
         numbers = list(self.recordings)[: MOST_REPLAYS if self.batched else 40]
-        executed = [(by_number[number].unit_point, one.system) for number, one in self.recordings.items()]
+        executed = [(by_number[number].unit_point, recording.system) for number, recording in self.recordings.items()]
         with stage("replaying executed tasks", len(numbers), "tasks"):
             found = replay_executed(self.validation, executed, [by_number[number].unit_point for number in numbers])
         return {number: one for number, one in zip(numbers, found, strict=True) if one is not None}

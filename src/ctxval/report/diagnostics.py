@@ -123,7 +123,7 @@ def stored_predictions(context: ReportContext) -> list[tuple[Trial, ExecutionPre
     """Return the trials whose execution was predicted beforehand, with the predictions."""
     noted = [(trial, (trial.note or {}).get(PREDICTION)) for trial in context.completed]
     read = [(trial, ExecutionPrediction.from_json(note)) for trial, note in noted if isinstance(note, dict)]
-    return [(trial, one) for trial, one in read if one is not None]
+    return [(trial, path) for trial, path in read if path is not None]
 
 
 def _predictions(context: ReportContext) -> Finding | None:

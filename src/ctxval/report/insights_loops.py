@@ -20,12 +20,12 @@ def components(context: ReportContext) -> Finding | None:
     if not context.recordings:
         return None
     worst = list(context.recordings.values())[:_WORST]
-    spans = soundness.ranges([one.system.states for one in context.recordings.values()])
-    errors = [np.abs(one.system.states - one.model.states) / spans for one in worst]
-    peaks = np.mean([one.max(axis=0) for one in errors], axis=0)
+    spans = soundness.ranges([run.system.states for run in context.recordings.values()])
+    errors = [np.abs(run.system.states - run.model.states) / spans for run in worst]
+    peaks = np.mean([each.max(axis=0) for each in errors], axis=0)
     j = int(peaks.argmax())
-    times = [float(one.system.times[error[:, j].argmax()]) for one, error in zip(worst, errors, strict=True)]
-    end = float(np.mean([one.system.times[-1] for one in worst]))
+    times = [float(run.system.times[error[:, j].argmax()]) for run, error in zip(worst, errors, strict=True)]
+    end = float(np.mean([run.system.times[-1] for run in worst]))
     label, when = context.signals[0][j], float(np.median(times))
     text = (
         f"In the {counted(len(worst), 'worst trial')}, S differs from M most in {label}: by {percent(float(peaks[j]))} "
@@ -50,7 +50,7 @@ def _shares(context: ReportContext, worst: list[Recording]) -> dict[str, float]:
     labels = context.signals[0]
     names = labels if compared is None else [labels[i] for i in compared]
     tasks = [context.replays[k].task for k in list(context.recordings)[:_WORST] if k in context.replays]
-    errors = np.array([distance.error(one.model, one.system, task) for one, task in zip(worst, tasks, strict=False)])
+    errors = np.array([distance.error(run.model, run.system, task) for run, task in zip(worst, tasks, strict=False)])
     if errors.ndim != 2 or errors.shape[1] != len(names) or not np.abs(errors).sum() > 0:
         return {}
     sizes = np.abs(errors).mean(axis=0)
@@ -64,7 +64,7 @@ def flips(context: ReportContext) -> Finding | None:
     by_number = {trial.number: trial for trial in context.completed}
     numbers = list(context.recordings)
     points = np.array([by_number[k].unit_point for k in numbers])
-    found = soundness.flips(points, [one.model.inputs for one in context.recordings.values()])
+    found = soundness.flips(points, [run.model.inputs for run in context.recordings.values()])
     if found is None or not found.flipped:
         return None
     i, j = found.example
@@ -82,7 +82,7 @@ def unusual_motion(context: ReportContext) -> Finding | None:
     if len(context.recordings) < 4:
         return None
     sizes = np.array(
-        [np.abs(one.model.states - one.model.states[0]).max(axis=0) for one in context.recordings.values()]
+        [np.abs(run.model.states - run.model.states[0]).max(axis=0) for run in context.recordings.values()]
     )
     usual = np.maximum(np.median(sizes, axis=0), 1e-3 * sizes.max(axis=0) + 1e-300)
     ratios = sizes[:_WORST] / usual
@@ -103,7 +103,7 @@ def unusual_motion(context: ReportContext) -> Finding | None:
 def saturation(context: ReportContext) -> Finding | None:
     """Whether inputs stay at their limits."""
     synthesizer = None if context.validation is None else context.validation.synthesizer
-    found = soundness.saturation([one.system.inputs for one in context.recordings.values()], synthesizer)
+    found = soundness.saturation([run.system.inputs for run in context.recordings.values()], synthesizer)
     if found is None or found.shares.max() < soundness.SATURATED:
         return None
     share, known = found.shares, found.known
@@ -129,7 +129,7 @@ def goals(context: ReportContext) -> Finding | None:
         return Finding("Goals of M", "unknown", "Not known: it needs the experiment, which is not loaded.")
     if not context.replays:
         return None
-    if not any(one.task.has_goal for one in context.replays.values()):
+    if not any(replay.task.has_goal for replay in context.replays.values()):
         return None
     numbers = list(context.replays)
     on_model = [context.recordings[k].model for k in numbers]

@@ -60,7 +60,7 @@ def weak_states(context: ReportContext) -> Finding | None:
     which = "above the threshold"
     if not weak.any() or weak.all():
         weak, which = np.arange(len(weak)) < max(1, len(weak) // 4), "with the largest distances"
-    runs = [one.system for one in context.recordings.values()]
+    runs = [recording.system for recording in context.recordings.values()]
     low, high = (
         np.array([np.concatenate([end(run.states, axis=0), end(run.inputs, axis=0)]) for run in runs])
         for end in (np.min, np.max)
@@ -96,8 +96,8 @@ def bias(context: ReportContext) -> Finding | None:
     numbers = {"mean_distance": typical, "share_of_largest": share}
     if len(context.recordings) >= 4:
         # The state with the largest final error, and the share of trials whose error has the usual sign.
-        ends = np.array([one.system.final_state for one in context.recordings.values()])
-        errors = ends - np.array([one.model.final_state for one in context.recordings.values()])
+        ends = np.array([recording.system.final_state for recording in context.recordings.values()])
+        errors = ends - np.array([recording.model.final_state for recording in context.recordings.values()])
         j = int((np.abs(errors) / np.maximum(np.ptp(ends, axis=0), 1e-300)).mean(axis=0).argmax())
         label, same = context.signals[0][j], float(max((errors[:, j] > 0).mean(), (errors[:, j] < 0).mean()))
         text += (
@@ -113,7 +113,7 @@ def explained(context: ReportContext) -> Finding | None:
     if context.validation is None:
         return Finding("Corrected model", "unknown", "Not known: it needs the experiment, which is not loaded.")
     by_number = {trial.number: distance_of(trial) for trial in context.completed}
-    pairs = [(by_number[k], one.distance) for k, one in context.replays.items() if np.isfinite(one.distance)]
+    pairs = [(by_number[k], replay.distance) for k, replay in context.replays.items() if np.isfinite(replay.distance)]
     if len(pairs) < 2:
         return Finding("Corrected model", "unknown", "Not known: the trials do not teach a correction of M.")
     executed, predicted = np.array(pairs).T

@@ -89,7 +89,7 @@ def table(caption: str, headers: Sequence[str], rows: Iterable[Sequence[object]]
 
 def _row(cells: Sequence[object]) -> Markup:
     first, *others = cells
-    return element("tr", element("th", cell(first), scope="row"), *(element("td", cell(one)) for one in others))
+    return element("tr", element("th", cell(first), scope="row"), *(element("td", cell(other)) for other in others))
 
 
 def cell(value: object) -> Markup:

@@ -44,7 +44,7 @@ def recorded_lines(context: ReportContext, most: int = MOST_CHARACTERS) -> Recor
         found = _fitting(context, points, most)
         if len(found) == len(numbers):
             break
-    longest = max((one.system.horizon + 1 for one in context.recordings.values()), default=0)
+    longest = max((recording.system.horizon + 1 for recording in context.recordings.values()), default=0)
     states, inputs = context.signals
     signals = [
         {"label": shortened(visible(label), 120), "kind": kind}

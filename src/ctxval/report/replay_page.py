@@ -31,7 +31,7 @@ class InsightsOfReplay:
         """Return the sentences; a replay always has some, except of a model without any error."""
         if not context.insights:
             return paragraph("The model predicts these recordings, and nothing is unusual.")
-        return bullets(_sentence(one) for one in context.insights)
+        return bullets(_sentence(finding) for finding in context.insights)
 
 
 class ErrorsOfReplay:
@@ -43,7 +43,7 @@ class ErrorsOfReplay:
         """Return the table of errors, and a chart of the relative error over the number of steps for each state."""
         if not context.errors:
             return paragraph("No recording has a single step.")
-        by_state = {state: [one for one in context.errors if one.state == state] for state in context.data.states}
+        by_state = {state: [each for each in context.errors if each.state == state] for state in context.data.states}
         headers = (
             "State",
             "Steps",
@@ -89,11 +89,16 @@ class RegionsOfReplay:
         """Return a chart for each state and input, and the table behind them."""
         if not context.regions:
             return paragraph("There are too few recorded steps to divide them into regions.")
-        names = list(dict.fromkeys(one.variable for one in context.regions))
+        names = list(dict.fromkeys(region.variable for region in context.regions))
         charts = [_region_chart(context, name) for name in names[:_CHARTED]]
         rows = [
-            (_named(one.variable, one.unit), f"{number(one.low)} to {number(one.high)}", one.count, one.ratio)
-            for one in context.regions
+            (
+                _named(region.variable, region.unit),
+                f"{number(region.low)} to {number(region.high)}",
+                region.count,
+                region.ratio,
+            )
+            for region in context.regions
         ]
         headers = ("State or input", "Between", "Steps", "Error, as a multiple of the average")
         meaning = (
@@ -119,14 +124,14 @@ class ResidualsOfReplay:
         )
         rows = [
             (
-                one.state,
-                quantity(one.rms, one.unit),
-                _bar(one.explained),
-                _bar(one.linear),
-                quantity(one.rest, one.unit),
-                _bar(one.history),
+                residual.state,
+                quantity(residual.rms, residual.unit),
+                _bar(residual.explained),
+                _bar(residual.linear),
+                quantity(residual.rest, residual.unit),
+                _bar(residual.history),
             )
-            for one in context.residuals
+            for residual in context.residuals
         ]
         meaning = (
             "All shares are of the mean square of the one-step residual, measured on held-out recordings. A large "
@@ -159,7 +164,7 @@ class TasksOfReplay:
         )
         numbers = np.arange(1.0, len(tasks.worst) + 1)
         low, median, high = (
-            np.array([getattr(one, name) for one in tasks.worst]) for name in ("low", "median", "high")
+            np.array([getattr(recording, name) for recording in tasks.worst]) for name in ("low", "median", "high")
         )
         label = f"distance [{self.units}]" if self.units else "distance"
         axes = Axis("task in the table below", 0.5, len(numbers) + 0.5), Axis.over(label, high, zero=True)
@@ -177,17 +182,17 @@ class TasksOfReplay:
         )
 
     def _table(self, caption: str, tasks: Sequence[PredictedTask]) -> Markup:
-        resolved = any(one.resolved is not None for one in tasks)
+        resolved = any(task.resolved is not None for task in tasks)
         headers = ("Number", "Task", "Distance", "90 % between", *(("Resolved",) if resolved else ()))
         rows = [
             (
                 str(row),
-                ", ".join(f"{name} = {number(value)}" for name, value in one.parameters.items()),
-                quantity(one.median, self.units),
-                f"{number(one.low)} and {number(one.high)}",
-                *((percent(one.resolved or 0.0),) if resolved else ()),
+                ", ".join(f"{name} = {number(value)}" for name, value in task.parameters.items()),
+                quantity(task.median, self.units),
+                f"{number(task.low)} and {number(task.high)}",
+                *((percent(task.resolved or 0.0),) if resolved else ()),
             )
-            for row, one in enumerate(tasks, 1)
+            for row, task in enumerate(tasks, 1)
         ]
         return table(caption, headers, rows)
 
@@ -211,7 +216,7 @@ class RecordingsOfReplay:
             ("Inputs", ", ".join(inputs) or "none"),
             ("Recordings that the model was learned from", data.seen),
         ]
-        splits = [str(one) for one in data.breaks]
+        splits = [str(split) for split in data.breaks]
         return joined(
             [
                 table("The recordings", ("Quantity", "Value"), rows, class_="facts"),
@@ -263,9 +268,9 @@ def _bar(share: float) -> Markup:
 
 def _error_chart(errors: Sequence[StepError]) -> Chart:
     """Return the root mean square error of one state over the number of steps, with the spread over recordings."""
-    steps = np.array([float(one.steps) for one in errors])
+    steps = np.array([float(error.steps) for error in errors])
     rms, low, high, change = (
-        np.array([getattr(one, k) for one in errors]) for k in ("rms", "lowest", "highest", "change")
+        np.array([getattr(error, k) for error in errors]) for k in ("rms", "lowest", "highest", "change")
     )
     first = errors[0]
     x, y = Axis.over("steps", steps, room=0.03), Axis.over(_named(first.state, first.unit), high, rms, zero=True)
@@ -274,15 +279,15 @@ def _error_chart(errors: Sequence[StepError]) -> Chart:
     # Far above the error, the change would only make the error invisible.
     if (change <= 3 * np.nanmax(np.append(high, rms))).all():
         chart.line(steps, change, "reference", "change: the error of predicting no change")
-    return chart.marks(steps, rms, "mean", "", [f"{one.steps} steps: {number(one.rms)}" for one in errors])
+    return chart.marks(steps, rms, "mean", "", [f"{error.steps} steps: {number(error.rms)}" for error in errors])
 
 
 def _region_chart(context: ReplayReport, name: str) -> Chart:
     """Return the error in the ranges of one state or input, as steps."""
-    own = [one for one in context.regions if one.variable == name]
-    across = np.repeat([own[0].low, *(one.high for one in own)], 2)[1:-1]
-    up = np.repeat([one.ratio for one in own], 2)
-    everywhere = [one.ratio for one in context.regions]
+    own = [region for region in context.regions if region.variable == name]
+    across = np.repeat([own[0].low, *(region.high for region in own)], 2)[1:-1]
+    up = np.repeat([region.ratio for region in own], 2)
+    everywhere = [region.ratio for region in context.regions]
     x = Axis.over(_named(name, own[0].unit), across, room=0.02)
     y = Axis.over("error / average", everywhere, [1.2], zero=True)
     chart = Chart(f"One-step error over {name}", x, y, **SMALL)

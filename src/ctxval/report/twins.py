@@ -33,8 +33,8 @@ def to_json(context: ReportContext) -> dict[str, Any]:
             "failed": [trial.number for trial in context.failed],
             "certificate": None if certificate is None else certificate.to_json(),
             "missing": context.missing or None,
-            "diagnostics": [one.to_json() for one in diagnostics(context)],
-            "insights": [one.to_json() for one in insights(context)],
+            "diagnostics": [finding.to_json() for finding in diagnostics(context)],
+            "insights": [finding.to_json() for finding in insights(context)],
             "not_tested": not_tested(context),
             "worst": [
                 {
@@ -128,7 +128,7 @@ def markdown(context: ReportContext) -> str:
         "",
         "## What was not tested",
         "",
-        *(f"- {markdown_text(one)}" for one in not_tested(context)),
+        *(f"- {markdown_text(sentence)}" for sentence in not_tested(context)),
         "",
         "## Worst tasks",
         "",
@@ -139,8 +139,8 @@ def markdown(context: ReportContext) -> str:
         "## For the file",
         "",
         *(
-            f"- **{markdown_text(one.term)}** ({one.standard}): {markdown_text(one.content, UNCUT)}"
-            for one in appendix(context)
+            f"- **{markdown_text(entry.term)}** ({entry.standard}): {markdown_text(entry.content, UNCUT)}"
+            for entry in appendix(context)
         ),
         "",
         f"<!-- {MADE_BY} -->",
@@ -150,6 +150,7 @@ def markdown(context: ReportContext) -> str:
 
 
 def _items(findings: list[Finding]) -> list[str]:
-    return [f"- {WORDS[one.light]}: **{markdown_text(one.name)}.** {markdown_text(one.text)}" for one in findings] or [
-        "Nothing is unusual."
-    ]
+    return [
+        f"- {WORDS[finding.light]}: **{markdown_text(finding.name)}.** {markdown_text(finding.text)}"
+        for finding in findings
+    ] or ["Nothing is unusual."]

@@ -35,7 +35,7 @@ class AppendixSection:
 
     def render(self, context: ReportContext) -> Markup:
         """Return the entries as a table."""
-        rows = [(one.term, text(one.content, UNCUT), one.standard) for one in appendix(context)]
+        rows = [(entry.term, text(entry.content, UNCUT), entry.standard) for entry in appendix(context)]
         return joined(
             [
                 paragraph(

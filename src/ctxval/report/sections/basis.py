@@ -43,7 +43,7 @@ def _assumptions(certificate: Certificate) -> list[Markup]:
     return [
         heading(f"What the certificate {certificate.kind} assumes"),
         paragraph(certificate.statement if certificate.doubt is None else f"It is withdrawn: {certificate.doubt}."),
-        bullets(text(f"{one[:1].upper()}{one[1:]}.", UNCUT) for one in certificate.assumptions),
+        bullets(text(f"{sentence[:1].upper()}{sentence[1:]}.", UNCUT) for sentence in certificate.assumptions),
         details("Numbers of the certificate", table("Numbers of the certificate", ("Name", "Value"), rows)),
     ]
 

@@ -42,8 +42,8 @@ def distances_in_order(context: ReportContext) -> Chart | None:
     numbers = np.array([trial.number for trial in context.completed], dtype=np.float64)
     so_far = np.maximum.accumulate(context.distances)
     last = float(max(trial.number for trial in context.trials))
-    limits = [one for one in (context.threshold, context.bound) if one is not None]
-    beforehand = [(trial.number, one.median) for trial, one in stored_predictions(context)]
+    limits = [value for value in (context.threshold, context.bound) if value is not None]
+    beforehand = [(trial.number, prediction.median) for trial, prediction in stored_predictions(context)]
     chart = Chart(
         "Distance of each trial, and the largest one so far",
         _trial_axis(last),

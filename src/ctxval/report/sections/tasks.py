@@ -116,10 +116,10 @@ def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart |
 
 
 def _distance_axis(context: ReportContext, band: Band) -> Axis:
-    limits = [one for one in (context.threshold, context.bound) if one is not None]
+    limits = [value for value in (context.threshold, context.bound) if value is not None]
     # A threshold far above all distances would flatten the curve, so it may lie outside.
     top = 3 * max(float(context.distances.max()), float(np.nanmax(band.median)))
-    shown = [one for one in limits if one <= top or top == 0]
+    shown = [value for value in limits if value <= top or top == 0]
     high = np.minimum(band.high, max(top, *shown, 1e-300))
     return Axis.over(context.distance_label, context.distances, high, shown, zero=True)
 
@@ -201,7 +201,7 @@ def _sensitivity(context: ReportContext, model: DistanceModel) -> Markup:
 def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
     """Return predicted against executed distances, each predicted without its own execution."""
     band = model.left_out
-    replayed = {k: one.distance for k, one in context.replays.items() if np.isfinite(one.distance)}
+    replayed = {k: replay.distance for k, replay in context.replays.items() if np.isfinite(replay.distance)}
     by_number = {trial.number: trial.distance or 0.0 for trial in context.completed}
     # A wide interval would hide everything else.
     top = 2 * float(context.distances.max())
@@ -220,5 +220,5 @@ def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
     beforehand = stored_predictions(context)
     if beforehand:
         x = [trial.distance or 0.0 for trial, _ in beforehand]
-        chart.marks(x, [one.median for _, one in beforehand], "covering", "stored before the execution")
+        chart.marks(x, [prediction.median for _, prediction in beforehand], "covering", "stored before the execution")
     return chart

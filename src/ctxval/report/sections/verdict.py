@@ -134,7 +134,7 @@ def _remarks(context: ReportContext) -> list[Markup]:
     """Return what must not be overlooked in what is folded below, and around the store."""
     said = []
     # The sentence of the verdict says why a certificate is refused or withdrawn.
-    found = [one for one in [*diagnostics(context), *insights(context)] if one.name != "Certificate"]
+    found = [finding for finding in [*diagnostics(context), *insights(context)] if finding.name != "Certificate"]
     for light in ("bad", "attention"):
         names = [one.name for one in found if one.light == light]
         if names:
