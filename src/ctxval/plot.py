@@ -2,7 +2,8 @@
 
 A function that draws one plot has the argument ``ax`` and returns the matplotlib axes. By default, these are new axes
 of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show them. A function that draws several panels
-returns a figure. Names and units are those of the validation, unless the arguments state others.
+returns a figure. Names and units are those of the validation, unless the arguments state others. A campaign must have
+at least one distance, and two for a surrogate. If a threshold tau or a bound on d* is given, it is drawn as a line.
 """
 
 from __future__ import annotations
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's colours survive colour blindness; the line styles and the markers survive grey print.
 _BLUE, _ORANGE, _BLACK, _GREY = "#0072B2", "#D55E00", "#000000", "#B0B0B0"
-_RESOLUTION = 401
-_NORMAL_95 = 1.96
 
 
 class Results(Protocol):
@@ -79,13 +78,6 @@ def overview(
     """Draw the most informative single plot of a campaign.
 
     It is the surrogate if there is one task parameter and two distances are known, and :func:`convergence` otherwise.
-
-    Args:
-        campaign: a campaign with at least one distance.
-        units: the units of the distance; by default, those of the validation.
-        threshold: tau, drawn as a line; None if there is none.
-        bound: a bound on d* from a certificate, drawn as a line; None if there is none.
-        ax: the axes to draw into; new ones by default.
     """
     if campaign.validation.space.dimension == 1 and len(campaign.completed) >= 2:
         return surrogate_slice(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
@@ -100,15 +92,7 @@ def convergence(
     bound: float | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the distance of each trial and the largest distance so far, and mark the trials without a distance.
-
-    Args:
-        campaign: a campaign with at least one distance.
-        units: the units of the distance; by default, those of the validation.
-        threshold: tau, drawn as a line; None if there is none.
-        bound: a bound on d* from a certificate, drawn as a line; None if there is none.
-        ax: the axes to draw into; new ones by default.
-    """
+    """Draw the distance of each trial and the largest distance so far, and mark the trials without a distance."""
     from matplotlib.ticker import MaxNLocator
 
     _worst(campaign)
@@ -122,13 +106,10 @@ def convergence(
     if without:
         bottom = axes.get_xaxis_transform()
         axes.plot(without, [0.03] * len(without), "x", color=_ORANGE, transform=bottom, label="no distance is known")
-    _draw_limits(axes, threshold, bound)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlim(-0.3, max(last, 1) + 0.3)
     axes.set_xlabel("trial")
-    axes.set_ylabel(_distance_label(campaign, units))
-    axes.legend(loc="best", fontsize=8, framealpha=0.9)
-    return axes
+    return _finished(axes, campaign, units, threshold, bound)
 
 
 def surrogate_slice(
@@ -144,13 +125,8 @@ def surrogate_slice(
     """Draw the Gaussian process along one task parameter, through the worst executed task, with its 95 % band.
 
     Args:
-        campaign: a campaign with at least two distances.
         axis: index of the scalar task parameter, from 0.
         truth: the true distance, which is drawn if the task space has one dimension.
-        units: the units of the distance; by default, those of the validation.
-        threshold: tau, drawn as a line; None if there is none.
-        bound: a bound on d* from a certificate, drawn as a line; None if there is none.
-        ax: the axes to draw into; new ones by default.
     """
     space = campaign.validation.space
     if not 0 <= axis < space.dimension:
@@ -158,10 +134,7 @@ def surrogate_slice(
     fitted, worst = campaign.surrogate(), _worst(campaign)
     axes = _axes(ax)
     _draw_slice(axes, campaign, fitted, worst, axis, truth)
-    _draw_limits(axes, threshold, bound)
-    axes.set_ylabel(_distance_label(campaign, units))
-    axes.legend(loc="best", fontsize=8, framealpha=0.9)
-    return axes
+    return _finished(axes, campaign, units, threshold, bound)
 
 
 def surrogate(
@@ -174,15 +147,9 @@ def surrogate(
 ) -> Figure:
     """Draw the Gaussian process over the task space with its 95 % band, the samples and the maximum.
 
-    For one task parameter, the figure shows the complete function. For several, it shows a slice along each axis
-    through the worst task. This is the converged Gaussian process in the paper's figures.
-
-    Args:
-        campaign: a campaign with at least two distances.
-        truth: the true distance, which is drawn if the task space has one dimension.
-        units: the units of the distance; by default, those of the validation.
-        threshold: tau, drawn as a line; None if there is none.
-        bound: a bound on d* from a certificate, drawn as a line; None if there is none.
+    For one task parameter, the figure shows the complete function and the true distance, if that is given. For several,
+    it shows a slice along each axis through the worst task. This is the converged Gaussian process in the paper's
+    figures.
     """
     fitted = campaign.surrogate()
     worst = _worst(campaign)
@@ -200,14 +167,21 @@ def surrogate(
     return figure
 
 
+def _finished(axes: Axes, campaign: Results, units: str, threshold: float | None, bound: float | None) -> Axes:
+    _draw_limits(axes, threshold, bound)
+    axes.set_ylabel(_distance_label(campaign, units))
+    axes.legend(loc="best", fontsize=8, framealpha=0.9)
+    return axes
+
+
 def _draw_slice(axes: Axes, campaign: Results, fitted: Surrogate, worst: Trial, axis: int, truth: Curve | None) -> None:
     space = campaign.validation.space
-    unit = np.tile(worst.unit_point, (_RESOLUTION, 1))
-    unit[:, axis] = np.linspace(0, 1, _RESOLUTION)
+    unit = np.tile(worst.unit_point, (401, 1))
+    unit[:, axis] = np.linspace(0, 1, len(unit))
     x = space.from_unit(unit)[:, axis]
     mean, deviation = fitted.predict(unit)
     # A distance is never below 0, but the Gaussian process does not know it.
-    low, high = (np.maximum(mean + sign * _NORMAL_95 * deviation, 0.0) for sign in (-1, 1))
+    low, high = (np.maximum(mean + sign * 1.96 * deviation, 0.0) for sign in (-1, 1))
     axes.fill_between(x, low, high, color=_GREY, alpha=0.6, linewidth=0, label="95 % band of the GP")
     axes.plot(x, np.maximum(mean, 0.0), color=_BLUE, linewidth=1.8, label="GP mean")
     if space.dimension == 1:
@@ -244,12 +218,7 @@ def _draw_samples(axes: Axes, campaign: Results, place: Callable[[Trial], float]
 
 
 def worst_trajectories(campaign: Results, *, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Figure:
-    """Draw the trajectories of M and of S for the worst executed task.
-
-    Args:
-        campaign: a campaign with at least one distance.
-        states, inputs: axis labels, with units; by default, those of the validation.
-    """
+    """Draw the trajectories of M and of S for the worst executed task, with these axis labels."""
     worst = _worst(campaign)
     model, system = campaign.trajectories(worst)
     if model is None or system is None:
@@ -259,8 +228,13 @@ def worst_trajectories(campaign: Results, *, states: Sequence[str] = (), inputs:
     named = campaign.validation.names(model.states.shape[-1], model.inputs.shape[-1])
     own_states, own_inputs = map(labels_of, named)
     figure = trajectories(model, system, reference=reference, states=states or own_states, inputs=inputs or own_inputs)
-    task = ", ".join(f"{name} = {_compact(value)}" for name, value in worst.parameters.items())
     distance = f"{_known(worst):.4g} {campaign.validation.labels.units}".rstrip()
+    task = ", ".join(
+        f"{name} = [{', '.join(f'{item:.3g}' for item in value)}]"
+        if isinstance(value, list)
+        else f"{name} = {value:.4g}"
+        for name, value in worst.parameters.items()
+    )
     figure.suptitle(f"worst task executed: {task} (distance {distance})", fontsize=10)
     return figure
 
@@ -273,12 +247,9 @@ def trajectories(
     states: Sequence[str] = (),
     inputs: Sequence[str] = (),
 ) -> Figure:
-    """Draw two trajectories over time, one panel for each state and input.
+    """Draw two trajectories of one task over time, one panel for each state and input.
 
-    Args:
-        model, system: the two trajectories of one task.
-        reference: the reference of the states, ``(H + 1, n)``; it is drawn for a state if it is not zero everywhere.
-        states, inputs: axis labels, with units.
+    The reference of the states, ``(H + 1, n)``, is drawn for a state if it is not zero everywhere.
     """
     n, m = model.states.shape[-1], model.inputs.shape[-1]
     names = [
@@ -306,14 +277,12 @@ def signal(
     reference: Array | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw one state or input of two trajectories over time.
+    """Draw one state or input of two trajectories of one task over time.
 
     Args:
-        model, system: the two trajectories of one task.
         component: index of the state from 0; the inputs follow the n states.
         label: label of the vertical axis, with the unit.
         reference: the reference of the states, ``(H + 1, n)``; it is drawn for a state if it is not zero everywhere.
-        ax: the axes to draw into; new ones by default.
     """
     n, m = model.states.shape[-1], model.inputs.shape[-1]
     if not 0 <= component < n + m:
@@ -321,12 +290,12 @@ def signal(
     axes = _axes(ax)
     if reference is not None and component < n and reference[:, component].any():
         axes.plot(model.times, reference[:, component], color=_BLACK, linestyle=":", linewidth=1.2, label="reference")
-    for one, style in (
-        (system, {"color": _ORANGE, "linewidth": 1.8, "label": "system S"}),
-        (model, {"color": _BLUE, "linestyle": "--", "linewidth": 1.6, "label": "model M"}),
+    for run, color, style, width, name in (
+        (system, _ORANGE, "-", 1.8, "system S"),
+        (model, _BLUE, "--", 1.6, "model M"),
     ):
-        values = one.states[:, component] if component < n else one.inputs[:, component - n]
-        axes.plot(one.times[: len(values)], values, **style)  # type: ignore[arg-type]
+        values = run.states[:, component] if component < n else run.inputs[:, component - n]
+        axes.plot(run.times[: len(values)], values, style, color=color, linewidth=width, label=name)
     axes.set_xlabel("time [s]")
     axes.set_ylabel(label)
     axes.grid(alpha=0.25)
@@ -372,7 +341,3 @@ def _worst(campaign: Results) -> Trial:
 
 def _known(trial: Trial) -> float:
     return float("nan") if trial.distance is None else trial.distance
-
-
-def _compact(value: float | list[float]) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else "[" + ", ".join(f"{item:.3g}" for item in value) + "]"

@@ -25,9 +25,6 @@ from ctxval.searches import Search
 
 _TOLERANCE = 1e-10
 
-_MAGNIFIED = 2e5
-"""Factor by which the central differences of ``linearize``, with steps of about 6e-6, magnify rounding errors."""
-
 
 def check_model(
     model: Model, *, states: int, inputs: int, seed: int = 0, scale: float = 1.0, tolerance: float = _TOLERANCE
@@ -35,9 +32,7 @@ def check_model(
     """Check that a model gives the same steps for a batch as one by one, and that its Jacobian is its derivative.
 
     Args:
-        model: the model; it has ``step`` and optionally ``jacobian``.
         states, inputs: the numbers of states n and of inputs m.
-        seed: seed of the random states and inputs.
         scale: standard deviation of the random states and inputs.
         tolerance: largest relative difference between a batch and single steps; use 1e-6 for single precision.
     """
@@ -51,7 +46,8 @@ def check_model(
     if hasattr(model, "jacobian"):
         A, B = linearize(model, x, u)
         A_numeric, B_numeric = linearize(_WithoutJacobian(model), x, u)
-        allowed = max(1e-5, _MAGNIFIED * tolerance)
+        # Central differences with steps of about 6e-6 magnify rounding errors by this factor.
+        allowed = max(1e-5, 2e5 * tolerance)
         for name, own, numeric in (("A", A, A_numeric), ("B", B, B_numeric)):
             _require_close(f"{name} of jacobian", np.broadcast_to(own, numeric.shape), "differences", numeric, allowed)
 
@@ -79,39 +75,25 @@ def check_system(system: System, controller: Controller, task: Task, *, toleranc
         _require(start <= tolerance, f"the execution starts {start:g} away from the task's initial state")
     _require_close("the first execution", first.states, "the second", second.states, tolerance)
     if getattr(system, "batched", False):
-        _check_batched_system(system, controller, task, first, tolerance)
-
-
-def _check_batched_system(
-    system: System, controller: Controller, task: Task, single: Trajectory, tolerance: float
-) -> None:
-    twice = Task(
-        np.stack([task.initial_state] * 2), horizon=task.horizon, dt=task.dt, reference=np.stack([task.reference] * 2)
-    )
-    batch = system.execute(controller, twice)
-    _require_close("an execution in a batch", batch.states[1], "the same alone", single.states, tolerance)
+        starts, references = np.stack([task.initial_state] * 2), np.stack([task.reference] * 2)
+        batch = system.execute(controller, Task(starts, horizon=task.horizon, dt=task.dt, reference=references))
+        _require_close("an execution in a batch", batch.states[1], "the same alone", first.states, tolerance)
 
 
 def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> None:
-    """Check that a synthesizer designs the same controller in a batch as task by task.
+    """Check that a synthesizer designs the same controller for a batch of tasks ``(N,)`` as task by task.
 
     If the controllers have the attribute ``converged``, it must be a boolean of each task, the same in a batch.
-
-    Args:
-        synthesizer: the synthesizer; it has ``design``.
-        task: a batch of tasks ``(N,)``.
-        model: the model that the controllers are designed on.
     """
     singles, converged = [], []
     for index in range(task.batch_shape[0]):
-        one = task[index]
-        controller = synthesizer.design(one, model)
+        controller = synthesizer.design(task[index], model)
         converged.append(_converged(controller, ()))
-        singles.append(rollout(model.step, controller, one))
+        singles.append(rollout(model.step, controller, task[index]))
         _require(bool(singles[-1].finite), f"the closed loop on the model is not finite for task {index}")
     if getattr(synthesizer, "batched", False):
         controller = synthesizer.design(task, model)
-        together, alone = _converged(controller, task.batch_shape), [one for one in converged if one is not None]
+        together, alone = _converged(controller, task.batch_shape), [each for each in converged if each is not None]
         same = not alone if together is None else np.array_equal(together, alone)
         _require(same, f"converged of a batch is {together}, and one by one it is {converged}")
         batch = rollout(model.step, controller, task)
@@ -129,9 +111,7 @@ def _converged(controller: Controller, batch_shape: tuple[int, ...]) -> Mask | N
 def check_distance(distance: Distance, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> None:
     """Check that a distance is finite and not negative, and the same for a batch as one by one.
 
-    Args:
-        distance: ``(model_trajectory, system_trajectory, task) -> d``.
-        model_trajectory, system_trajectory, task: a batch of trajectories and tasks ``(N,)`` to compare.
+    The trajectories and tasks to compare are batches ``(N,)``.
     """
     d = np.asarray(distance(model_trajectory, system_trajectory, task), dtype=np.float64)
     _require(d.shape == task.batch_shape, f"the distance of a batch {task.batch_shape} has shape {d.shape}")
@@ -145,23 +125,20 @@ def check_search(search: Search, *, dimension: int = 2, seed: int = 3, budget: i
     """Check that a search stays in the unit cube, resumes from its history, and never repeats a failed point.
 
     Args:
-        search: the search; it has ``reset``, ``ask`` and ``tell``.
         dimension: dimension of the unit cube in the test run.
-        seed: seed of the test run.
         budget: number of points in the test run; every fourth evaluation fails.
     """
     history = _trial_run(search, dimension, seed, budget)
     again = _trial_run(search, dimension, seed, budget)
     _require(np.array_equal(history[0], again[0]), "the same seed and values must give the same points")
-    for told in range(1, budget):
+    for count in range(1, budget):
         search.reset(dimension, seed)
-        search.tell(history[0][:told], history[1][:told])
-        resumed = search.ask(1)[0]
-        _require(
-            np.array_equal(resumed, history[0][told]),
-            f"after tell of the first {told} trials, ask must return the same next point, {history[0][told]}, "
-            f"got {resumed}",
+        search.tell(history[0][:count], history[1][:count])
+        resumed, point = search.ask(1)[0], history[0][count]
+        sentence = (
+            f"after tell of the first {count} trials, ask must return the same next point, {point}, got {resumed}"
         )
+        _require(np.array_equal(resumed, point), sentence)
 
 
 def _trial_run(search: Search, dimension: int, seed: int, budget: int) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from ctxval._util.cores import can_fork, on_all_cores
-from ctxval._util.progress import Progress, advance, expect, is_heard, listening, stage
+from ctxval._util.progress import Progress, advance, also_listening, expect, is_heard, listening, stage
 
 
 def work(parts: int = 3) -> None:
@@ -19,6 +19,17 @@ def test_nobody_listens_and_nothing_happens() -> None:
     advance()
     expect(3)
     assert not is_heard()
+
+
+def test_one_more_listener_hears_the_same() -> None:
+    first: list[Progress] = []
+    second: list[Progress] = []
+    with listening(first.append), also_listening(second.append):
+        work(1)
+    with also_listening(second.append):
+        work(1)
+    assert first
+    assert second == [*first, *first]
 
 
 def test_a_listener_hears_the_stages_and_their_ends() -> None:

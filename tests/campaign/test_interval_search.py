@@ -13,7 +13,7 @@ import pytest
 from conftest import interrupt_at_once, make_validation, make_validation_without_inputs
 from ctxval import Campaign, cases, searches
 from ctxval.campaign.dynamics import AUDIT, NEAR, PREDICTION
-from ctxval.campaign.interval_search import next_task
+from ctxval.campaign.interval_search import IntervalSearch, next_task
 from ctxval.certificates import (
     AnytimeAudit,
     Audit,
@@ -52,6 +52,10 @@ def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true(
     assert verdict.certificate is not None
     assert verdict.certificate.upper_bound >= largest * (1 - 1e-6)
     assert campaign.executions <= 8
+    low, high = IntervalSearch(campaign.recorder, CertificateOptions(), 12, 1.1 * largest).interval
+    assert campaign.worst is not None
+    assert low == campaign.worst.distance
+    assert high == verdict.certificate.upper_bound  # the store keeps the evidence of the end
 
 
 @pytest.mark.slow

@@ -231,9 +231,9 @@ def trials(folder: Path, only: Path | None = None) -> list[Any]:
             "better.npz is neither a case, an experiment file (.toml), a store (.sqlite, .sqlite3, .db) nor",
         ),
         (["refined_plant.py"], "nor a reference module:attr (here refined_plant:NAME)"),
-        (["cart.toml", "--trust"], "--experiment and --trust are for a store"),
+        (["cart.toml", "--trust"], "--experiment and --trust need a store"),
         (["cart.toml", "--threshold", "-1"], "threshold must be a positive number"),
-        (["cart.sqlite", "--seed", "1"], "--seed and --option are for an experiment"),
+        (["cart.sqlite", "--seed", "1"], "is a store and keeps its own settings"),
     ],
 )
 def test_what_cannot_be_used_is_said_in_one_sentence(invoke: Invoke, arguments: list[str], sentence: str) -> None:

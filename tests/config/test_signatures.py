@@ -23,7 +23,7 @@ from ctxval.cli import app
 from ctxval.config import signatures as trust
 from ctxval.config.settings import read_settings
 from ctxval.config.signatures import SIGNATURES, code_named, key_path, signed, verifies
-from ctxval.config.stored_settings import stored_settings, trusted_settings
+from ctxval.config.stored_settings import planned_settings, trusted_settings
 from ctxval.errors import InputError
 from rig_packages import install
 
@@ -655,7 +655,7 @@ def test_what_is_nested_too_deeply_is_code() -> None:
 
 def test_stored_settings_are_read_without_their_signatures(folder: Path) -> None:
     rig_store(folder)
-    assert stored_settings(Store("a.sqlite")).experiment == "my_rig:experiment"
+    assert planned_settings(Store("a.sqlite")).experiment == "my_rig:experiment"
 
 
 # The Subprocess of a file is trusted as what it is: named by the user

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from browser import accessibility_findings
 from ctxval.core.trial import Trial
 from ctxval.storage.store import Store
+from rig_cli import SMALL
 from rig_page import ctxval, new_store, record, serving
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
@@ -313,3 +315,22 @@ def test_the_entrance_is_accessible_and_the_token_leaves_the_address(browser: An
         two = Operator(browser, folder, f"{bare}?token={token}")
         two.opened()
         assert two.page.url == bare
+
+
+def test_a_run_is_shown_as_it_goes_and_takes_nothing(browser: Any, tmp_path: Path) -> None:
+    command = [*SMALL, "run", "pendulum", "--threshold", "0.5", "--live"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert process.stdout is not None
+    address = next(found[0] for line in process.stdout if (found := re.search(r"http://127\.0\.0\.1:\d+/", line)))
+    one = Operator(browser, tmp_path, address, viewport={"width": 400, "height": 800})
+    one.page.locator("#trials tbody tr").first.wait_for(timeout=WAIT)
+    assert one.page.locator("form, button, input").count() == 0
+    refused = one.page.request.post(f"{address}choose", headers={"Origin": address.rstrip("/")})
+    assert refused.status == 404
+    one.page.locator("#next .done").wait_for(timeout=WAIT)
+    assert ".report.html" in one.page.locator("#next").inner_text()
+    assert one.page.locator(".answer").inner_text() == "validated against 0.5 rad"
+    assert one.page.evaluate("document.documentElement.scrollWidth") <= 400
+    assert accessibility_findings(one.page) == []
+    output, _ = process.communicate(timeout=120)
+    assert (process.returncode, "VALIDATED" in output) == (0, True), output

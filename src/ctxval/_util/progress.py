@@ -70,6 +70,19 @@ def listening(listener: Listener | None) -> Iterator[None]:
         _innermost.reset(tokens[1])
 
 
+@contextmanager
+def also_listening(listener: Listener) -> Iterator[None]:
+    """Send all reports within this context to one more listener."""
+    outer = _listener.get() or ignore
+
+    def both(progress: Progress) -> None:
+        outer(progress)
+        listener(progress)
+
+    with listening(both):
+        yield
+
+
 def ignore(_: Progress) -> None:
     """Listen, and do nothing: nobody else is told."""
 

@@ -95,6 +95,12 @@ class IntervalSearch:
             return self.recorder.search.uses_prediction
         return isinstance(kind, Dynamics)
 
+    @property
+    def interval(self) -> tuple[float, float | None]:
+        """The largest executed distance, and the bound that a few posterior samples give; None if they give none."""
+        best, evidence = largest_distance(self.recorder.trials), self._evidence(self.recorder.trials)
+        return best, None if evidence is None else bound_of(evidence, best, self.options.confidence)
+
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides."""
         trials = self.recorder.trials

@@ -30,12 +30,9 @@ def _completion(report: Aspect1Report) -> Checked:
         return Checked("tasks on the model", "failed", f"{many}: {ends}")
     bound = None if report.verdict is None else report.verdict.bound
     held = f"; the error over all tasks is at most {_number(report, bound)}" if bound is not None else ""
-    share = f"; with confidence 0.95 it does not complete at most {100 * (report.share or 0):.3g} % {_of_all(report)}"
+    tasks = "of all tasks" if report.distribution is None else of_tasks(report.distribution)
+    share = f"; with confidence 0.95 it does not complete at most {100 * (report.share or 0):.3g} % {tasks}"
     return Checked("tasks on the model", "ok", f"M completes all of them: {ends}{share}{held}")
-
-
-def _of_all(report: Aspect1Report) -> str:
-    return "of all tasks" if report.distribution is None else of_tasks(report.distribution)
 
 
 def _number(report: Aspect1Report, value: float | None) -> str:

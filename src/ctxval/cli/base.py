@@ -8,7 +8,7 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from json import dumps  # code of users may replace what is in a module
 from typing import Any
@@ -52,9 +52,16 @@ def command(function: Callable[..., Any]) -> Callable[..., Any]:
         as_json = bool(kwargs.get("as_json"))
         try:
             with _stdout_to_stderr() if as_json else nullcontext() as stdout, progress_shown(not as_json, err):
-                return _finish(function(*args, **kwargs), stdout)
+                result = function(*args, **kwargs)
+                report, status = result if isinstance(result, tuple) else (result, 0)
+                if stdout is not None:
+                    print(dumps(describe(report), allow_nan=False), file=stdout, flush=True)
+                if status:
+                    raise typer.Exit(status)
+                return
         except CtxvalError as error:
-            _say_failure(str(error), as_json)
+            say_error(str(error))
+            _print_failure(str(error), as_json)
             raise typer.Exit(BAD_INPUT if isinstance(error, _BAD) else CANNOT_GO_ON) from None
         except (typer.Exit, typer.Abort):
             raise
@@ -66,16 +73,11 @@ def command(function: Callable[..., Any]) -> Callable[..., Any]:
             if isinstance(error.__context__, BrokenPipeError):
                 raise typer.Exit(CUT_OFF) from None  # the reader of the output has ended, as in `| head`
             # Python's own exit status here would be 1, which means that a model is falsified.
-            _say_failure(reason_of(error), as_json)
+            say_error(reason_of(error))
+            _print_failure(reason_of(error), as_json)
             raise typer.Exit(CANNOT_GO_ON) from None
 
     return wrapped
-
-
-def _say_failure(sentence: str, as_json: bool) -> None:
-    """Print an error message, and its JSON object on the standard output if the result would be one."""
-    say_error(sentence)
-    _print_failure(sentence, as_json)
 
 
 def _print_failure(sentence: str, as_json: bool) -> None:
@@ -92,15 +94,6 @@ def _print_failure(sentence: str, as_json: bool) -> None:
 
 
 _STOPPED = "stopped. All executions are stored; run the same command to resume."
-
-
-def _finish(result: Any, stdout: Any) -> None:
-    """Print the JSON of a command if there is a stream for it, and leave with the command's exit status."""
-    report, status = result if isinstance(result, tuple) else (result, 0)
-    if stdout is not None:
-        print(dumps(describe(report), allow_nan=False), file=stdout, flush=True)
-    if status:
-        raise typer.Exit(status)
 
 
 @contextmanager
@@ -176,18 +169,15 @@ def failures_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
 
 def print_failures(failures: list[dict[str, Any]]) -> None:
     """Print the most frequent reasons of failures."""
-    for failure in failures[:_REASONS]:
+    for failure in failures[:3]:
         count = len(failure["trials"])
         which = f"trial {failure['trials'][0]}" if count == 1 else f"{count} trials"
         err.say((f"{which} failed", "yellow"), f": {failure['reason']}")
-    if len(failures) > _REASONS:
-        err.say(f"and {len(failures) - _REASONS} other reasons; `ctxval export` lists them.")
+    if len(failures) > 3:
+        err.say(f"and {len(failures) - 3} other reasons; `ctxval export` lists them.")
 
 
 _COLOURS = {"validated": "green", "falsified": "red", "undecided": "yellow"}
-
-_REASONS = 3
-"""Largest number of reasons that are printed."""
 
 
 def print_table(rows: dict[str, Any], units: str = "") -> None:
@@ -195,6 +185,21 @@ def print_table(rows: dict[str, Any], units: str = "") -> None:
     table = Table(show_header=False, box=None, pad_edge=False)
     for key, value in rows.items():
         table.add_row(line(key.replace("_", " ")), line(_text(value, units)))
+    out.print(table)
+
+
+def print_columns(
+    left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None
+) -> None:
+    """Print a table with columns that are aligned on the left, then those on the right, below a title."""
+    if title is not None:
+        out.say("")
+        out.say((title, "bold"))
+    table = Table(*map(line, left), box=None, pad_edge=False)
+    for name in right:
+        table.add_column(line(name), justify="right")
+    for row in rows:
+        table.add_row(*map(line, row))
     out.print(table)
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.progress import stage
-from ctxval.certificates import KINDS, Assessment, Provenance, assess
+from ctxval.certificates import KINDS, Provenance, assess
 from ctxval.cli.base import FALSIFIED, command, out, print_other_stores, print_verdict
 from ctxval.cli.commands import app
 from ctxval.cli.options import (
@@ -121,28 +120,19 @@ def certify_store(
         found = assess(trials, options, limit, known if campaign is None else campaign.provenance)
     others = [str(other) for other in other_stores(store)]
     if not as_json:
-        _print_assessment(found)
-        if asked is None and kind == "posterior":
-            _print_auto(store)
+        if found.verdict is not None:
+            print_verdict(found.verdict)
+        if found.certificate is None:
+            out.say(f"no certificate: {found.refusal}", wrap=True)
+        for row in [] if found.certificate is None else str(found.certificate).split("\n"):
+            head, colon, rest = row.partition(":")
+            out.say((head, "bold red" if head == "withdrawn" else ""), f"{colon}{rest}", wrap=True)
+        if asked is None and kind == "posterior":  # the verdict of the campaign may differ
+            out.say(
+                "the campaign was run with the kind auto, which may decide earlier. It loads the experiment, so it "
+                f"must be asked for: `ctxval certify {shlex.quote(str(store))} --kind auto`.",
+                wrap=True,
+            )
         print_other_stores(others)
     report = {**found.to_json(), "store": str(store), "other_stores": others}
     return report, FALSIFIED if found.verdict is not None and found.verdict.answer == "falsified" else 0
-
-
-def _print_auto(store: Path) -> None:
-    """Say how to get the verdict of the campaign, which may differ from that of the posterior bound."""
-    out.say(
-        "the campaign was run with the kind auto, which may decide earlier. It loads the experiment, so it must be "
-        f"asked for: `ctxval certify {shlex.quote(str(store))} --kind auto`.",
-        wrap=True,
-    )
-
-
-def _print_assessment(found: Assessment) -> None:
-    if found.verdict is not None:
-        print_verdict(found.verdict)
-    if found.certificate is None:
-        out.say(f"no certificate: {found.refusal}", wrap=True)
-    for line in [] if found.certificate is None else str(found.certificate).split("\n"):
-        head, colon, rest = line.partition(":")
-        out.say((head, "bold red" if head == "withdrawn" else ""), f"{colon}{rest}", wrap=True)

@@ -9,17 +9,12 @@ import typer
 
 from ctxval.cli.base import CANNOT_GO_ON, command, err, out
 from ctxval.cli.commands import app
-from ctxval.cli.options import TARGET, AsJson, PartOptions, named_values, parsed
+from ctxval.cli.options import AsJson, PartOptions, Target, named_values, parsed
 from ctxval.config.settings import read_settings
-from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
-from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ExecutionError, InputError
 from ctxval.fitting.excitation import Excitation, SignalKind
 
-Target = Annotated[
-    str, typer.Argument(metavar=TARGET, help="Experiment whose system is executed: a case, a file, or module:attr.")
-]
 Folder = Annotated[Path, typer.Option("--out", help="Folder of the recordings, one CSV file for each execution.")]
 Runs = Annotated[int, typer.Option(min=1, help="Number of executions, including those that are in the folder already.")]
 Kind = Annotated[str, typer.Option("--kind", help=f"Kind of the signal: {', '.join(get_args(SignalKind))}.")]
@@ -58,7 +53,10 @@ def collect(
     settings = read_settings(target, {"options": named_values(option), "seed": seed})
     experiment = settings.load()
     allowed = None if limits is None else parsed(limits)
-    made = Excitation(experiment.validation, kind, _number(amplitude), allowed, seed)  # type: ignore[arg-type]
+    size = parsed(amplitude)
+    if not isinstance(size, int | float | list):
+        raise InputError(f"--amplitude must be a number or a list such as [1.0, 0.5], got {amplitude!r}.")
+    made = Excitation(experiment.validation, kind, size, allowed, seed)  # type: ignore[arg-type]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -70,7 +68,9 @@ def collect(
             known += 1
             continue
         try:
-            _write(path, made.run(number), experiment)
+            run = made.run(number)
+            states, inputs = experiment.names(run.states.shape[-1], run.inputs.shape[-1])
+            run.to_csv(path, states=labels_of(states), inputs=labels_of(inputs))
             recorded.append(str(path))
         except ExecutionError as error:
             failed.append({"run": number, "reason": str(error)})
@@ -79,16 +79,3 @@ def collect(
         out.say(f"{len(recorded)} executions recorded in {folder}, {known} were there before, {len(failed)} failed.")
     report = {"recorded": recorded, "known": known, "failed": failed, "folder": str(folder)}
     return (report, CANNOT_GO_ON) if failed and not recorded and not known else report
-
-
-def _number(text: str) -> Any:
-    value = parsed(text)
-    if not isinstance(value, int | float | list):
-        raise InputError(f"--amplitude must be a number or a list such as [1.0, 0.5], got {text!r}.")
-    return value
-
-
-def _write(path: Path, run: Trajectory, experiment: Experiment) -> None:
-    """Write a recording, either completely or not at all."""
-    states, inputs = experiment.names(run.states.shape[-1], run.inputs.shape[-1])
-    run.to_csv(path, states=labels_of(states), inputs=labels_of(inputs))

@@ -8,17 +8,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from ctxval import plot
 from ctxval._util.files import write_text
 from ctxval._util.texts import reason_of
 from ctxval.certificates.options import CONFIDENCE
-from ctxval.cli.base import command, err, failures_of, out, print_failures
+from ctxval.cli.base import command, err, failures_of, out, print_columns, print_failures
 from ctxval.cli.commands import app
 from ctxval.cli.options import AsJson, Confidence, PartOptions, named_values
 from ctxval.cli.outputs import Force, require_outputs
-from ctxval.cli.screen import line
 from ctxval.comparison.candidates import Candidate, require_comparable
 from ctxval.comparison.compare import BUDGET, store_name
 from ctxval.comparison.race import Race
@@ -111,13 +109,19 @@ def compare(
         stochastic=stochastic,
     )
     found = race.run()
-    failures = {one.name: failures_of(one.campaign.failed) for one in made}
+    failures = {candidate.name: failures_of(candidate.campaign.failed) for candidate in made}
     if not as_json:
         _print(found)
-        for one in failures.values():
-            print_failures(one)
-    files = [] if out_file is None else _written(found, out_file)
-    paths = {one.name: str(one.campaign.store.path) for one in made}
+        for value in failures.values():
+            print_failures(value)
+    files = []
+    if out_file is not None:
+        files.append(str(write_text(out_file, markdown(found))))
+        try:
+            files.append(str(plot.save(found.plot(), out_file.with_suffix(".png"))))
+        except Exception as error:  # it must not hide the decisions, for which executions were paid
+            err.say(f"no picture: {reason_of(error)}")
+    paths = {candidate.name: str(candidate.campaign.store.path) for candidate in made}
     return {**found.to_dict(), "stores": paths, "failures": failures, "files": files}
 
 
@@ -155,27 +159,12 @@ def _settings(target: str, seed: int, options: dict[str, Any]) -> Settings:
     return read_settings(target, {"seed": seed, "options": options})
 
 
-def _written(found: Comparison, path: Path) -> list[str]:
-    """Write the tables and the picture; return the names of the files."""
-    write_text(path, markdown(found))
-    try:
-        drawn = [str(plot.save(found.plot(), path.with_suffix(".png")))]
-    except Exception as error:
-        # An error in a figure must not hide the decisions, for which executions were paid.
-        err.say(f"no picture: {reason_of(error)}")
-        drawn = []
-    return [str(path), *drawn]
-
-
 def _print(found: Comparison) -> None:
     for question in found.questions:
         out.say((f"{WORDS[question]}: ", "bold"), found.ranking_text(question), wrap=True)
     for headers, rows in ((CANDIDATES, candidate_rows(found)), (PAIRS, pair_rows(found))):
-        table = Table(*headers, box=None, pad_edge=False)
-        for row in rows:
-            table.add_row(*map(line, row))
         out.say("")
-        out.print(table)
+        print_columns(headers, (), rows)
     out.say("")
     for pair in found.pairs:
         out.say(f"{pair.first}, {pair.second}: {pair.reason}.", wrap=True)

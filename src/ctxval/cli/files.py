@@ -15,7 +15,7 @@ from ctxval.aspect1 import TASKS
 from ctxval.cli.aspect1_findings import aspect1_findings
 from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, out
 from ctxval.cli.commands import app
-from ctxval.cli.options import TARGET, AsJson, PartOptions, named_values
+from ctxval.cli.options import AsJson, PartOptions, Target, named_values
 from ctxval.config.check import check_experiment
 from ctxval.config.settings import read_settings
 from ctxval.core.experiment import UnitsWarning
@@ -134,13 +134,7 @@ def init(
 @app.command()
 @command
 def check(
-    target: Annotated[
-        str,
-        typer.Argument(
-            metavar=TARGET,
-            help="Experiment to check: a case, an experiment file, or a reference to an object in Python.",
-        ),
-    ],
+    target: Target,
     execute: Annotated[
         bool, typer.Option("--execute", help="Also execute one task twice and compare the two executions.")
     ] = False,
@@ -182,7 +176,7 @@ def check(
         findings += aspect1_findings(found)
         status = FALSIFIED if found.exceeding and found.completes is False else 0
     colours = {"ok": "green", "noted": "yellow", "failed": "bold red", "skipped": "dim"}
-    for one in [] if as_json else findings:
-        out.say((f"{one.state:<8}", colours[one.state]), f"{one.check}: {one.text}")
+    for each in [] if as_json else findings:
+        out.say((f"{each.state:<8}", colours[each.state]), f"{each.check}: {each.text}")
     report = {"case": experiment.name, "ok": not status, "findings": [asdict(finding) for finding in findings]}
     return {**report, **({"aspect1": None if found is None else found.to_json()} if aspect1 else {})}, status

@@ -6,20 +6,37 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from ctxval._util.texts import shortened
-from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, out
+from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, out, print_columns
 from ctxval.cli.commands import app
-from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingFile, States, TimeField, print_breaks
-from ctxval.cli.model_options import Vectorized, print_parameters, require_model_file, step_function
+from ctxval.cli.log_options import (
+    Delay,
+    Dt,
+    Inputs,
+    LogOptions,
+    Logs,
+    MappingFile,
+    RandomSeed,
+    States,
+    Steps,
+    TimeField,
+    numbers,
+    print_breaks,
+)
+from ctxval.cli.model_options import (
+    Parameters,
+    StepFunction,
+    Vectorized,
+    print_parameters,
+    require_model_file,
+    step_function,
+)
 from ctxval.cli.options import AsJson, named_values
 from ctxval.cli.outputs import Force
-from ctxval.cli.replay import numbers, print_titled
-from ctxval.cli.screen import line
 from ctxval.config.named_model import named_model
 from ctxval.errors import InputError
-from ctxval.fitting import FitReport, FittedModel, fit
+from ctxval.fitting import FitReport, fit
 from ctxval.fitting.fit import HOLD_OUT, KINDS, STEPS
 from ctxval.fitting.model_file import SUFFIXES, write_model_file
 
@@ -29,20 +46,6 @@ Kinds = Annotated[
         "--kind",
         help=f"Kinds of models with commas between them: {', '.join(KINDS)} (default: the first three, or parameters "
         "if --step is given).",
-    ),
-]
-StepFunction = Annotated[
-    str | None,
-    typer.Option(
-        "--step", metavar="MODULE:ATTR", help="Your function (x, u, theta) -> x_next, whose parameters are estimated."
-    ),
-]
-Parameters = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--parameter",
-        metavar="NAME=[LOW, HIGH]",
-        help="Bounds of a parameter of --step, such as mass=[0.5, 2.0]. Repeat --parameter in the order of theta.",
     ),
 ]
 HoldOut = Annotated[
@@ -57,10 +60,6 @@ Given = Annotated[
         "a result of mujoco.sysid, or any model that `ctxval replay --model` takes.",
     ),
 ]
-Steps = Annotated[
-    str | None,
-    typer.Option(help=f"Numbers of steps after which errors are computed (default: {','.join(map(str, STEPS))})."),
-]
 Out = Annotated[
     Path | None,
     typer.Option(
@@ -70,7 +69,6 @@ Out = Annotated[
         "the table model of an experiment file.",
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
 
 @app.command("fit")
@@ -92,7 +90,7 @@ def fit_models(
     steps: Steps = None,
     out_file: Out = None,
     force: Force = False,
-    seed: Seed = 0,
+    seed: RandomSeed = 0,
     as_json: AsJson = False,
 ) -> Any:
     """Learn models from recordings, and compare their errors on recordings that were held out.
@@ -123,28 +121,27 @@ def fit_models(
         _print(report)
     written, chosen = list[str](), None
     if report.fitted and out_file is not None:
-        chosen = _most_accurate(report, out_file)
+        suffix, kinds_learned = out_file.suffix, ", ".join(model.kind for model in report.fitted)
+        holds = (m for m in report.fitted if m.kind != "given" and isinstance(m.model, SUFFIXES[suffix]))
+        chosen = next(holds, None)
+        if chosen is None:
+            raise InputError(
+                f"no model that was learned ({kinds_learned}) can be written to a file that ends in {suffix}."
+            )
         written = write_model_file(out_file, chosen.model, step)
         if not as_json:
             out.say(f"the {chosen.kind} model is in {' and '.join(written)}")
     result = {**report.to_json(), "files": written}
     if not report.fitted:
         return result, CANNOT_GO_ON
-    best = next((one for one in report.fitted if one.kind != "given"), report.fitted[0]) if chosen is None else chosen
+    best = (
+        next((each for each in report.fitted if each.kind != "given"), report.fitted[0]) if chosen is None else chosen
+    )
     if best.useless is None:
         return result
     if not as_json:
         err.say(("not good: ", "bold red"), f"{best.useless}.", wrap=True)
     return result, FALSIFIED
-
-
-def _most_accurate(report: FitReport, path: Path) -> FittedModel:
-    """Return the most accurate of the models that a file can hold."""
-    for one in report.fitted:
-        if one.kind != "given" and isinstance(one.model, SUFFIXES[path.suffix]):
-            return one
-    kinds = ", ".join(one.kind for one in report.fitted)
-    raise InputError(f"no model that was learned ({kinds}) can be written to a file that ends in {path.suffix}.")
 
 
 def _print(report: FitReport) -> None:
@@ -153,20 +150,22 @@ def _print(report: FitReport) -> None:
         f"learned from {own.steps} steps of {len(own.runs)} recordings; errors on {held.steps} steps of "
         f"{len(held.runs)} others"
     )
-    table = Table(box=None, pad_edge=False)
-    for name in ("model", "state"):
-        table.add_column(name)
-    for name in ("steps", "rms error", "of the change"):
-        table.add_column(name, justify="right")
-    for one in report.fitted:
-        for error in sorted(one.errors, key=lambda error: list(held.states).index(error.state)):
-            rms = f"{error.rms:.3g} {error.unit}".rstrip()
-            cells = (one.kind, error.state, str(error.steps), rms, f"{100 * error.relative:.3g} %")
-            table.add_row(*map(line, cells))
-    print_titled("error on held-out recordings", table)
-    for one in report.fitted:
-        print_parameters(one.parameters)
-        for note in one.notes:
-            out.say((f"{one.kind}: ", "bold"), note, wrap=True)
+    rows = [
+        (
+            model.kind,
+            error.state,
+            str(error.steps),
+            f"{error.rms:.3g} {error.unit}".rstrip(),
+            f"{100 * error.relative:.3g} %",
+        )
+        for model in report.fitted
+        for error in sorted(model.errors, key=lambda error: list(held.states).index(error.state))
+    ]
+    columns = ("steps", "rms error", "of the change")
+    print_columns(("model", "state"), columns, rows, "error on held-out recordings")
+    for model in report.fitted:
+        print_parameters(model.parameters)
+        for note in model.notes:
+            out.say((f"{model.kind}: ", "bold"), note, wrap=True)
     for failure in report.failed:
         err.say((f"{failure.kind}: ", "yellow"), shortened(failure.reason))

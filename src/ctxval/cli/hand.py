@@ -11,24 +11,20 @@ import typer
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import enumerated
-from ctxval.campaign.by_hand import TRIAL_FILES, KnownRun, parameters_from, read_runs, write_files
+from ctxval.campaign.by_hand import TRIAL_FILES, parameters_from, read_runs, write_files
 from ctxval.campaign.campaign import OpenTrial
 from ctxval.campaign.known import KnownExecution
 from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
 from ctxval.cli.base import FALSIFIED, command, out, print_verdict
 from ctxval.cli.commands import app
-from ctxval.cli.options import SEARCH_METHODS, TARGET, AsJson, PartOptions, StoreArgument, Threshold, named_values
+from ctxval.cli.options import TARGET, AsJson, PartOptions, SearchName, StoreArgument, Threshold, named_values
 from ctxval.cli.outputs import Force, require_folder
-from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, budget_of, limit_of, open_store, require_target
-from ctxval.config.settings import read_settings
+from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, budget_of, limit_of, open_store, open_target
 from ctxval.core.exchange import TASK_FORMAT
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import InputError
 from ctxval.storage.other_stores import STORE_SUFFIXES
 from ctxval.storage.store import Store
-
-_LISTED = 10
-"""Largest number of imported runs that are printed."""
 
 _WAIT = 60.0
 """Seconds to wait for other terminals: each of them locks the store while it chooses a task."""
@@ -80,9 +76,6 @@ Budget = Annotated[
     ),
 ]
 Reopened = Annotated[int | None, typer.Option(help="Write the files of this open trial again.")]
-SearchName = Annotated[
-    str | None, typer.Option(help=f"Search method of a new store: {SEARCH_METHODS} (default: auto).")
-]
 Seed = Annotated[int | None, typer.Option(help="Seed of the random numbers of a new store (default: 0).")]
 Resample = Annotated[bool, typer.Option("--resample", help="Interpolate a recording to the time steps of the task.")]
 StartTolerance = Annotated[
@@ -131,43 +124,40 @@ def ask(
         raise InputError("--because needs --again TRIAL: it states why the task is executed again.")
     if out_folder is not None:
         require_folder(out_folder, TRIAL_FILES, TASK_FORMAT, force=force)
-    overrides = {"store": store, "search": search, "seed": seed, "options": named_values(option) or None}
-    opened = _opened(target, overrides, experiment, trust, accept_change)
+    if Path(target).suffix in STORE_SUFFIXES and not Path(target).exists():
+        raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` creates one.")
+    overrides = {"store": store, "search": search, "seed": seed, "option": named_values(option) or None}
+    opened = open_target(target, overrides, experiment, trust, accept_change)
     limit = limit_of(opened.experiment, opened.settings, threshold)
     if trial is not None:
-        found = opened.campaign.reopen(trial)
+        waiting = opened.campaign.reopen(trial)
     elif limit is not None and not stated and (threshold is not None or not opened.settings.explores):
         total = budget_of(opened.experiment, opened.settings, budget)
         options = opened.settings.certificate_options
         asked = opened.campaign.ask_for_verdict(limit, total, certificate=options, wait=_WAIT)
         if asked is None:
             return _decided(opened, limit, as_json)
-        found = asked
+        waiting = asked
     else:
         chosen = None if again is None else parameters_of_trial(opened.campaign, again)
         if parameters:
             chosen = parameters_from(parameters, opened.experiment.validation.space)
-        found = opened.campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
-    report = _asked(opened, found, out_folder, force)
-    if not as_json:
-        _print_asked(report, found)
-    return report
-
-
-def _asked(opened: Opened, found: OpenTrial, out_folder: Path | None, force: bool) -> dict[str, Any]:
-    """Write the files of a trial, and return what is said of it."""
-    folder = opened.path.with_suffix(".trials") / str(found.number) if out_folder is None else out_folder
+        waiting = opened.campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
+    folder = opened.path.with_suffix(".trials") / str(waiting.number) if out_folder is None else out_folder
     if out_folder is None:
         require_folder(folder, TRIAL_FILES, TASK_FORMAT, force=force)
-    return {
-        "trial": found.number,
-        "task": found.trial.parameters,
-        "origin": found.trial.origin,
+    report = {
+        "trial": waiting.number,
+        "task": waiting.trial.parameters,
+        "origin": waiting.trial.origin,
         "store": str(opened.path),
         "folder": str(folder),
-        "files": write_files(folder, opened.experiment, found),
-        "open": [t.number for t in opened.campaign.trials if t.state == "open" and t.number != found.number],
+        "files": write_files(folder, opened.experiment, waiting),
+        "open": [t.number for t in opened.campaign.trials if t.state == "open" and t.number != waiting.number],
     }
+    if not as_json:
+        _print_asked(report, waiting)
+    return report
 
 
 @app.command()
@@ -213,9 +203,9 @@ def tell(
         raise InputError("--resample and --start-tolerance need a recording: give --trajectory or --npz.")
     require("--start-tolerance", NonNegativeFloat | None, start_tolerance)
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
-    mapping = opened.settings.log_mapping
-    told = ToldResult(trajectory or npz, distance, failed, npz is not None, resample, start_tolerance, mapping, replace)
-    ended = tell_result(opened.campaign, opened.experiment, trial, told)
+    file, mapping = trajectory or npz, opened.settings.log_mapping
+    result = ToldResult(file, distance, failed, npz is not None, resample, start_tolerance, mapping, replace)
+    ended = tell_result(opened.campaign, opened.experiment, trial, result)
     report = _ended(ended, opened, opened.campaign.executions)
     if not as_json:
         out.say(result_sentence(ended, opened.experiment.units, opened.campaign.start_offset(ended)))
@@ -252,8 +242,12 @@ def import_runs(
     runs = read_runs(files, parameters_from(parameters, space) if parameters else None, space)
     checked = list[KnownExecution]()
     with stage("checking", len(runs), "runs"):
+        validation, mapping = opened.campaign.validation, opened.settings.log_mapping
         for run in runs:  # all of them before any is stored
-            checked.append(_checked(run, opened, resample, start_tolerance))
+            try:
+                checked.append(run.checked(validation, opened.experiment, resample, start_tolerance, mapping))
+            except InputError as error:
+                raise InputError(f"{run.where}: {error}") from error
             advance(1)
     ended = opened.campaign.add_known(checked, _WAIT)
     new = [trial for trial in ended if trial is not None]
@@ -264,42 +258,12 @@ def import_runs(
         "store": str(store),
     }
     if not as_json:
-        for trial in new[:_LISTED]:
+        for trial in new[:10]:
             out.say(result_sentence(trial, opened.experiment.units, opened.campaign.start_offset(trial)))
-        if len(new) > _LISTED:
-            out.say(f"... and {len(new) - _LISTED} other trials; --json lists them.")
+        if len(new) > 10:
+            out.say(f"... and {len(new) - 10} other trials; --json lists them.")
         out.say(f"{len(new)} runs imported, {len(ended) - len(new)} already in the store.")
     return report
-
-
-def _checked(run: KnownRun, opened: Opened, resample: bool, start_tolerance: float | None) -> KnownExecution:
-    """Return an earlier run after all checks; an error names the file and the line."""
-    try:
-        mapping = opened.settings.log_mapping
-        return run.checked(opened.campaign.validation, opened.experiment, resample, start_tolerance, mapping)
-    except InputError as error:
-        raise InputError(f"{run.where}: {error}") from error
-
-
-def _opened(
-    target: str, overrides: dict[str, Any], experiment: str | None, trust: bool, accept_change: str | None
-) -> Opened:
-    path = Path(target)
-    if path.suffix != ".toml" and path.is_file():
-        if any(value is not None for value in overrides.values()):
-            raise InputError(
-                f"{target} is a store and keeps its own settings: remove --store, --search, --seed and --option."
-            )
-        return open_store(Store.existing(path), path, experiment, trust, accept_change)
-    if path.suffix in STORE_SUFFIXES:
-        raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` creates one.")
-    require_target(target)
-    if experiment is not None or trust:
-        raise InputError(f"--experiment and --trust need a store as the first argument, and {target} is an experiment.")
-    settings = read_settings(target, overrides)
-    made = settings.load()
-    where = settings.store_path(made.name)
-    return Opened(settings, made, settings.campaign(made, where, accept_change=accept_change), where)
 
 
 def _decided(opened: Opened, limit: float, as_json: bool) -> tuple[dict[str, Any], int]:

@@ -15,6 +15,8 @@ from ctxval.core.experiment import Experiment
 from ctxval.core.labels import names_of
 from ctxval.data import Field, LogMapping, Recordings, read_recordings
 from ctxval.errors import InputError
+from ctxval.fitting.fit import STEPS as FITTED
+from ctxval.replay.report import STEPS as REPLAYED
 
 Logs = Annotated[
     list[Path],
@@ -63,16 +65,19 @@ Delay = Annotated[
 ]
 
 
+Steps = Annotated[
+    str | None,
+    typer.Option(
+        help="Numbers of steps after which errors are computed, with commas between them (default: "
+        f"{','.join(map(str, REPLAYED))} for a replay, {','.join(map(str, FITTED))} for a fit)."
+    ),
+]
+RandomSeed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
+
+
 @dataclass(frozen=True)
 class LogOptions:
-    """What the command line states of the logs.
-
-    Attributes:
-        mapping: the file of a mapping.
-        states, inputs: texts ``NAME=FIELD``.
-        time: the column of the times.
-        dt, delay: seconds.
-    """
+    """What the command line states of the logs; states and inputs are texts ``NAME=FIELD``."""
 
     mapping: Path | None
     states: Sequence[str] | None
@@ -127,15 +132,22 @@ def _fields(given: Sequence[str]) -> dict[str, Field]:
     return found
 
 
+def numbers(text: str) -> list[int]:
+    """Return the numbers of steps in a text with commas between them."""
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() and int(part) > 0 for part in parts):
+        raise InputError(f"--steps must be positive integers with commas between them, such as 1,10,50, got {text!r}.")
+    return [int(part) for part in parts]
+
+
+# What is printed
+
+
 def print_breaks(found: Recordings) -> None:
     """Print how logs were read, and where they were split."""
     for note in found.notes:
         out.say((note, "dim"))
-    for one in found.breaks[:_BREAKS]:
-        err.say(("split:", "yellow"), f" {one}")
-    if len(found.breaks) > _BREAKS:
-        err.say(f"and {len(found.breaks) - _BREAKS} other places; --json lists them.")
-
-
-_BREAKS = 5
-"""Largest number of splits that are printed."""
+    for split in found.breaks[:5]:
+        err.say(("split:", "yellow"), f" {split}")
+    if len(found.breaks) > 5:
+        err.say(f"and {len(found.breaks) - 5} other places; --json lists them.")

@@ -14,6 +14,20 @@ from ctxval.config.references import reference, require_function
 from ctxval.fitting import FittedParameter
 from ctxval.fitting.model_file import BESIDE, require_suffix
 
+StepFunction = Annotated[
+    str | None,
+    typer.Option(
+        "--step", metavar="MODULE:ATTR", help="Your function (x, u, theta) -> x_next, whose parameters are estimated."
+    ),
+]
+Parameters = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--parameter",
+        metavar="NAME=[LOW, HIGH]",
+        help="Bounds of a parameter of --step, such as mass=[0.5, 2.0]. Repeat --parameter in the order of theta.",
+    ),
+]
 Vectorized = Annotated[bool, typer.Option("--vectorized", help="State that --step takes whole batches of x and u.")]
 
 
@@ -33,7 +47,7 @@ def require_model_file(path: Path | None, inputs: Iterable[object], *, force: bo
 
 def print_parameters(parameters: Sequence[FittedParameter]) -> None:
     """Print parameters with their intervals."""
-    for one in parameters:
-        note = f"; {one.note}" if one.note else ""
-        between = f"between {one.low:.6g} and {one.high:.6g} with confidence 0.95{note}"
-        out.say((one.name, "bold"), f" = {one.value:.6g}, {between}")
+    for found in parameters:
+        note = f"; {found.note}" if found.note else ""
+        between = f"between {found.low:.6g} and {found.high:.6g} with confidence 0.95{note}"
+        out.say((found.name, "bold"), f" = {found.value:.6g}, {between}")

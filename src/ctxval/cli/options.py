@@ -17,6 +17,13 @@ TARGET = "CASE|FILE.toml|module:attr"
 
 SEARCH_METHODS = ", ".join(sorted(SEARCHES.built_in))
 
+Target = Annotated[
+    str,
+    typer.Argument(
+        metavar=TARGET, help="Experiment: a case, an experiment file, or a reference to an object in Python."
+    ),
+]
+SearchName = Annotated[str | None, typer.Option(help=f"Search method: {SEARCH_METHODS} (default: auto).")]
 StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="Store of a campaign (a .sqlite file).")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
 Threshold = Annotated[

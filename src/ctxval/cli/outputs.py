@@ -19,7 +19,7 @@ Force = Annotated[
 
 def require_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[object], *, force: bool) -> None:
     """Check the files that a command will write, before it does anything else."""
-    read = [Path(str(one)) for one in inputs if one is not None and "\0" not in str(one)]
+    read = [Path(str(each)) for each in inputs if each is not None and "\0" not in str(each)]
     named: dict[Path, str] = {}
     for option, path in outputs.items():
         if path is None:
@@ -31,7 +31,7 @@ def require_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[object]
         make_folder_of(path)
         try:
             place, there = path.resolve(), path.exists()
-            is_input = there and any(one.exists() and one.samefile(path) for one in read)
+            is_input = there and any(each.exists() and each.samefile(path) for each in read)
         except (OSError, RuntimeError, ValueError) as error:
             raise InputError(f"{path} cannot be written: {error}.") from error
         if place in named:

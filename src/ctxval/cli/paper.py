@@ -33,7 +33,11 @@ def cases(
     listed = list(known_cases.REGISTRY) if name is None else [name]
     found = {each: _described(each, skip_broken=name is None) for each in listed}
     if not as_json:
-        print_table({each: "; ".join([text, *_options_text(options)]) for each, (text, options) in found.items()})
+        rows = {}
+        for each, (text, options) in found.items():
+            texts = [key if default is None else f"{key}={default}" for key, default in options.items()]
+            rows[each] = f"{text}; options: {', '.join(texts)}" if texts else text
+        print_table(rows)
     if name is None:
         return {each: text for each, (text, _) in found.items()}
     text, options = found[name]
@@ -48,11 +52,6 @@ def _described(name: str, *, skip_broken: bool) -> tuple[str, dict[str, Any]]:
         if not skip_broken:
             raise
         return str(error), {}
-
-
-def _options_text(options: dict[str, Any]) -> list[str]:
-    texts = [name if default is None else f"{name}={default}" for name, default in options.items()]
-    return [f"options: {', '.join(texts)}"] if texts else []
 
 
 @app.command()

@@ -7,13 +7,19 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions
-from ctxval.cli.base import FALSIFIED, command, out
+from ctxval.cli.base import FALSIFIED, command, out, print_columns
 from ctxval.cli.commands import app
-from ctxval.cli.model_options import Vectorized, print_parameters, require_model_file, step_function
+from ctxval.cli.model_options import (
+    Parameters,
+    StepFunction,
+    Vectorized,
+    print_parameters,
+    require_model_file,
+    step_function,
+)
 from ctxval.cli.options import (
     TARGET,
     AsJson,
@@ -26,18 +32,15 @@ from ctxval.cli.options import (
     named_values,
 )
 from ctxval.cli.outputs import Force
-from ctxval.cli.screen import line
-from ctxval.cli.trust import Named, Trust, budget_of, open_store, require_limit, require_target
+from ctxval.cli.trust import Named, Trust, budget_of, limit_of, open_target
 from ctxval.config.references import reference, require_function
-from ctxval.config.settings import Settings, read_settings
+from ctxval.config.settings import Settings
 from ctxval.core.experiment import Experiment
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.refinement import Method, ParameterFit, Refinement, refine
 from ctxval.refinement.files import require_file_of, write_refined
 from ctxval.refinement.methods import NAMES, UserFit, method_of
-from ctxval.storage.other_stores import STORE_SUFFIXES
-from ctxval.storage.store import Store
 
 Target = Annotated[
     str,
@@ -70,19 +73,6 @@ Fit = Annotated[
         help="Your function fit(data) -> model, for the method fit. It must return the same model for the same data.",
     ),
 ]
-StepFunction = Annotated[
-    str | None,
-    typer.Option("--step", metavar="MODULE:ATTR", help="Your function (x, u, theta) -> x_next, for parameters."),
-]
-Bounds = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--parameter",
-        metavar="NAME=[LOW, HIGH]",
-        help="Bounds of a parameter, such as mass=[0.5, 2.0], for the method parameters. Repeat --parameter in the "
-        "order of theta.",
-    ),
-]
 Out = Annotated[
     Path | None,
     typer.Option(
@@ -94,22 +84,6 @@ Out = Annotated[
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of an experiment that is run first (default: 0).")]
 
 
-@dataclass(frozen=True, eq=False)
-class _Opened:
-    """The experiment of the first model, its campaign, and the settings of both."""
-
-    settings: Settings
-    experiment: Experiment
-    campaign: Campaign
-
-    def certified_as(self, confidence: float | None, stochastic: bool | None) -> _Opened:
-        """Return the same with other settings of the certificate, if they are given."""
-        settings = self.settings.certified_as({"stochastic": stochastic})
-        return replace(
-            self, settings=settings if confidence is None else settings.model_copy(update={"confidence": confidence})
-        )
-
-
 @app.command("refine")
 @command
 def refine_model(
@@ -119,7 +93,7 @@ def refine_model(
     method: MethodName = "residual",
     fit: Fit = None,
     step: StepFunction = None,
-    parameter: Bounds = None,
+    parameter: Parameters = None,
     vectorized: Vectorized = False,
     out_file: Out = None,
     force: Force = False,
@@ -141,18 +115,22 @@ def refine_model(
     """
     chosen = _method(method, fit, step, parameter, vectorized)
     require_model_file(out_file, [target, experiment], force=force)
-    opened = _opened(target, seed, option, experiment, trust).certified_as(confidence, stochastic)
-    settings = opened.settings
-    limit = require_limit(opened.experiment, settings, threshold, "a refinement")
+    opened = open_target(target, {"seed": seed, "option": named_values(option) or None}, experiment, trust)
+    settings = opened.settings.certified_as({"stochastic": stochastic})
+    if confidence is not None:
+        settings = settings.model_copy(update={"confidence": confidence})
+    limit = limit_of(opened.experiment, settings, threshold)
+    if limit is None:
+        raise InputError("a refinement needs a threshold: give --threshold.")
     if out_file is not None:
         require_file_of(out_file, chosen, opened.campaign.validation.model, step)
     found = refine(
         opened.campaign,
         limit,
-        _budget(budget, opened),
+        opened.campaign.executions + budget_of(opened.experiment, settings) if budget is None else budget,
         method=chosen,
         certificate=settings.certificate_options,
-        open_round=_Rounds(opened),
+        open_round=_Rounds(settings, opened.experiment),
         workers=workers,
         timeout=timeout,
     )
@@ -178,54 +156,31 @@ def _method(name: str, fit: str | None, step: str | None, parameter: list[str] |
     return ParameterFit(named_values(parameter, "--parameter"), step_function(step), vectorized)
 
 
-def _opened(target: str, seed: int | None, option: list[str] | None, experiment: str | None, trust: bool) -> _Opened:
-    if Path(target).suffix in STORE_SUFFIXES:
-        if seed is not None or option:
-            raise InputError("--seed and --option are for an experiment; a store has its own.")
-        found = open_store(Store.existing(target), Path(target), experiment, trust)
-        return _Opened(found.settings, found.experiment, found.campaign)
-    if experiment is not None or trust:
-        raise InputError("--experiment and --trust are for a store.")
-    require_target(target)
-    settings = read_settings(target, {"seed": seed, "options": named_values(option)})
-    made = settings.load()
-    return _Opened(settings, made, settings.campaign(made, settings.store_path(made.name)))
-
-
-def _budget(given: int | None, opened: _Opened) -> int:
-    if given is not None:
-        return given
-    return opened.campaign.executions + budget_of(opened.experiment, opened.settings)
-
-
 @dataclass(frozen=True, eq=False)
 class _Rounds:
     """Makes the campaigns of rounds, whose stores name the experiment and the file of the model."""
 
-    first: _Opened
+    settings: Settings
+    experiment: Experiment
 
     def __call__(
         self, validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
     ) -> Campaign:
-        settings, name = self.first.settings, self.first.experiment.name
+        settings, name = self.settings, self.experiment.name
         if model_file is None or store is None:  # the model cannot be read again, so other commands cannot load it
             search = settings.search.build(settings.folder)
             return Campaign(validation, search=search, store=store, seed=settings.seed, name=name)
         known = {"refined": model_file.resolve(), "confidence": certificate.confidence}
-        experiment = replace(self.first.experiment, validation=validation, truth=None)
+        experiment = replace(self.experiment, validation=validation, truth=None)
         return settings.model_copy(update=known).campaign(experiment, store)
 
 
 def _print(found: Refinement) -> None:
-    table = Table(box=None, pad_edge=False)
-    for name in (*found.head, "store"):
-        table.add_column(line(name))
-    for one in found.rounds:
-        table.add_row(*map(line, (*one.cells, one.store.name if one.store else "-")))
-    out.print(table)
-    for one in found.rounds:
-        for note in one.notes:
-            out.say((f"round {one.number}: ", "bold"), note, wrap=True)
+    rows = [(*each.cells, each.store.name if each.store else "-") for each in found.rounds]
+    print_columns((*found.head, "store"), (), rows)
+    for each in found.rounds:
+        for note in each.notes:
+            out.say((f"round {each.number}: ", "bold"), note, wrap=True)
     out.say((found.answer, "bold"), f" against {found.threshold:g}: {found.ended}.", wrap=True)
     out.say(found.last.verdict.reason, wrap=True)
     out.say(found.statement, wrap=True)

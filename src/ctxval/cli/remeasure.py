@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ctxval.cli.base import command, out, worst_of
+from ctxval.cli.base import command, out, print_table, worst_of
 from ctxval.cli.commands import app
 from ctxval.cli.options import AsJson, StoreArgument
 from ctxval.cli.trust import AcceptChange, Named, Trust, open_store
@@ -30,7 +30,7 @@ def remeasure(
     opened = open_store(known, store, experiment, trust, accept_change, remeasure=True)
     trials = opened.campaign.trials
     changed = [trial.number for trial in trials if trial.distance != before.get(trial.number)]
-    report = {
+    report: dict[str, Any] = {
         "measured": sum(trial.state == "completed" for trial in trials),
         "changed": changed,
         "unmeasured": [trial.number for trial in opened.campaign.unmeasured],
@@ -38,19 +38,14 @@ def remeasure(
         "store": str(store),
     }
     if not as_json:
-        _print(report)
+        if changed:
+            count = f"{len(changed)} of {report['measured']}"
+            out.say(f"{count} distances have changed. The history of the store keeps the earlier values.")
+        else:
+            file = "If an experiment file defines the distance, name the file with --experiment."
+            out.say(f"no distance has changed. {file}")
+        if report["unmeasured"]:
+            out.say(f"trials without a distance: {', '.join(map(str, report['unmeasured']))}.")
+        if report["worst"] is not None:
+            print_table({"largest distance": report["worst"]})
     return report
-
-
-def _print(report: dict[str, Any]) -> None:
-    changed, waiting = len(report["changed"]), report["unmeasured"]
-    if changed:
-        count = f"{changed} of {report['measured']}"
-        out.say(f"{count} distances have changed. The history of the store keeps the earlier values.")
-    else:
-        out.say("no distance has changed. If an experiment file defines the distance, name the file with --experiment.")
-    if waiting:
-        out.say(f"trials without a distance: {', '.join(map(str, waiting))}.")
-    if report["worst"] is not None:
-        task = ", ".join(f"{name} = {value}" for name, value in report["worst"]["task"].items())
-        out.say(f"the largest distance is {report['worst']['distance']:.4g} at {task}.")

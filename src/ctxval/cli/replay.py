@@ -7,14 +7,25 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
-from ctxval.cli.base import command, out
+from ctxval.cli.base import command, out, print_columns
 from ctxval.cli.commands import app
-from ctxval.cli.log_options import Delay, Dt, Inputs, LogOptions, Logs, MappingFile, States, TimeField, print_breaks
+from ctxval.cli.log_options import (
+    Delay,
+    Dt,
+    Inputs,
+    LogOptions,
+    Logs,
+    MappingFile,
+    RandomSeed,
+    States,
+    Steps,
+    TimeField,
+    numbers,
+    print_breaks,
+)
 from ctxval.cli.options import AsJson, named_values
 from ctxval.cli.outputs import Force, require_outputs
-from ctxval.cli.screen import line
 from ctxval.config.named_model import named_model
 from ctxval.config.settings import read_settings
 from ctxval.core.experiment import Experiment
@@ -48,16 +59,11 @@ Target = Annotated[
         "recordings is the mapping of the logs, unless another one is given. Its system is never executed.",
     ),
 ]
-Steps = Annotated[
-    str | None,
-    typer.Option(help=f"Numbers of steps after which errors are computed (default: {','.join(map(str, STEPS))})."),
-]
 Executions = Annotated[int, typer.Option(min=1, help="Number of executions that are proposed with --experiment.")]
 Html = Annotated[
     Path | None,
     typer.Option("--html", help="Also write everything as one HTML page, which opens no connection, to this file."),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
 
 @app.command()
@@ -75,7 +81,7 @@ def replay(
     delay: Delay = None,
     steps: Steps = None,
     executions: Executions = 10,
-    seed: Seed = 0,
+    seed: RandomSeed = 0,
     html: Html = None,
     force: Force = False,
     as_json: AsJson = False,
@@ -123,17 +129,6 @@ def _name(model: str | None, experiment: Experiment | None) -> str:
     return "" if experiment is None else experiment.name
 
 
-def numbers(text: str) -> list[int]:
-    """Return the numbers of steps in a text with commas between them."""
-    parts = [part.strip() for part in text.split(",")]
-    if not all(part.isdecimal() and int(part) > 0 for part in parts):
-        raise InputError(f"--steps must be positive integers with commas between them, such as 1,10,50, got {text!r}.")
-    return [int(part) for part in parts]
-
-
-# What is printed
-
-
 def _print(report: ReplayReport, found: Recordings, units: str) -> None:
     data = report.data
     seconds = data.steps * data.dt
@@ -154,52 +149,53 @@ def _print(report: ReplayReport, found: Recordings, units: str) -> None:
 
 
 def _print_errors(report: ReplayReport) -> None:
-    table = Table(box=None, pad_edge=False)
-    table.add_column("state")
-    for name in ("steps", "rms error", "of recordings", "95 % below", "of the change"):
-        table.add_column(name, justify="right")
-    for one in sorted(report.errors, key=lambda one: list(report.data.states).index(one.state)):
-        spread = f"{one.lowest:.3g} to {one.highest:.3g}"
-        unit = f" {one.unit}" if one.unit else ""
-        cells = (f"{one.rms:.3g}{unit}", spread, f"{one.upper:.3g}", f"{100 * one.relative:.3g} %")
-        table.add_row(line(one.state), str(one.steps), *map(line, cells))
-    print_titled("error of the prediction", table)
+    rows = [
+        (
+            error.state,
+            str(error.steps),
+            f"{error.rms:.3g} {error.unit}".rstrip(),
+            f"{error.lowest:.3g} to {error.highest:.3g}",
+            f"{error.upper:.3g}",
+            f"{100 * error.relative:.3g} %",
+        )
+        for error in sorted(report.errors, key=lambda error: list(report.data.states).index(error.state))
+    ]
+    columns = ("steps", "rms error", "of recordings", "95 % below", "of the change")
+    print_columns(("state",), columns, rows, "error of the prediction")
 
 
 def _print_residuals(report: ReplayReport) -> None:
-    if not report.residuals:
-        return
-    table = Table(box=None, pad_edge=False)
-    table.add_column("state")
-    for name in ("rms", "explained by (x, u)", "affine part", "rest", "explained by the step before"):
-        table.add_column(name, justify="right")
-    for one in report.residuals:
-        shares = [f"{100 * share:.0f} %" for share in (one.explained, one.linear, one.history)]
-        unit = f" {one.unit}" if one.unit else ""
-        cells = (f"{one.rms:.3g}{unit}", shares[0], shares[1], f"{one.rest:.3g}{unit}", shares[2])
-        table.add_row(line(one.state), *map(line, cells))
-    print_titled("one-step residual on held-out recordings", table)
+    rows = [
+        (
+            residual.state,
+            f"{residual.rms:.3g} {residual.unit}".rstrip(),
+            f"{100 * residual.explained:.0f} %",
+            f"{100 * residual.linear:.0f} %",
+            f"{residual.rest:.3g} {residual.unit}".rstrip(),
+            f"{100 * residual.history:.0f} %",
+        )
+        for residual in report.residuals
+    ]
+    columns = ("rms", "explained by (x, u)", "affine part", "rest", "explained by the step before")
+    if rows:
+        print_columns(("state",), columns, rows, "one-step residual on held-out recordings")
 
 
 def _print_tasks(title: str, tasks: Sequence[PredictedTask], units: str) -> None:
-    table = Table(box=None, pad_edge=False)
-    resolved = any(one.resolved is not None for one in tasks)
-    for name in ("task", f"distance {f'[{units}]' if units else ''}".strip(), "90 % between"):
-        table.add_column(name, justify="left" if name == "task" else "right")
-    if resolved:
-        table.add_column("resolved", justify="right")
-    for one in tasks:
-        at = ", ".join(f"{name} = {_short(value)}" for name, value in one.parameters.items())
-        cells = [at, f"{one.median:.4g}", f"{one.low:.4g} and {one.high:.4g}"]
-        table.add_row(*map(line, [*cells, f"{100 * (one.resolved or 0):.0f} %"] if resolved else cells))
-    print_titled(title, table)
-
-
-def print_titled(title: str, table: Table) -> None:
-    """Print a table with a title above it."""
-    out.say("")
-    out.say((title, "bold"))
-    out.print(table)
+    columns = [f"distance [{units}]" if units else "distance", "90 % between"]
+    rows = [
+        [
+            ", ".join(f"{name} = {_short(value)}" for name, value in task.parameters.items()),
+            f"{task.median:.4g}",
+            f"{task.low:.4g} and {task.high:.4g}",
+        ]
+        for task in tasks
+    ]
+    if any(task.resolved is not None for task in tasks):
+        columns.append("resolved")
+        for row, task in zip(rows, tasks, strict=True):
+            row.append(f"{100 * (task.resolved or 0):.0f} %")
+    print_columns(("task",), columns, rows, title)
 
 
 def _short(value: Any) -> str:

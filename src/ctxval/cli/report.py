@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,12 +17,12 @@ from ctxval.cli.certify import KindOptions, Volume
 from ctxval.cli.commands import app
 from ctxval.cli.options import AsJson, Confidence, StoreArgument, Threshold, named_values
 from ctxval.cli.outputs import Force, require_outputs
-from ctxval.cli.trust import Named, Trust, budget_of, open_store
+from ctxval.cli.trust import Named, Trust, budget_of, limit_of, open_store
 from ctxval.config.settings import Settings
 from ctxval.config.stored_settings import planned_settings
 from ctxval.core.labels import Labels, labels_of
 from ctxval.errors import CtxvalError
-from ctxval.report.context import ReportContext, context_of_campaign, context_of_store
+from ctxval.report.context import context_of_campaign, context_of_store
 from ctxval.storage.store import Store
 
 Page = Annotated[
@@ -46,26 +46,6 @@ Kind = Annotated[
         "kind that the campaign was run with). With region, the report has a map of where the threshold is kept."
     ),
 ]
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """What the command line asks of the verdict; None for what the campaign was run with."""
-
-    threshold: float | None
-    confidence: float | None
-    kind: str | None
-    stated: dict[str, Any]
-
-    def limit(self, *planned: float | None) -> float | None:
-        """Return the threshold of the command line, or else the first one that is planned; None if there is none."""
-        given = next((one for one in (self.threshold, *planned) if one is not None), None)
-        return require("threshold", PositiveFloat | None, given)  # type: ignore[no-any-return]
-
-    def options(self, settings: Settings) -> CertificateOptions:
-        """Return the certificate, with the settings of the campaign for what is not asked."""
-        confidence = settings.confidence if self.confidence is None else self.confidence
-        return settings.certificate.options(confidence, kind=self.kind, stated=self.stated)
 
 
 @app.command("report")
@@ -97,8 +77,32 @@ def write_report(
     require_outputs(
         {"--out .html": target, "--junit .xml": junit, "--markdown .md": markdown}, [store, experiment], force=force
     )
-    asked = _Asked(threshold, confidence, kind, named_values(option, volume=volume))
-    context = _context(opened, store, asked, experiment, trust)
+    require("threshold", PositiveFloat | None, threshold)
+    stated = named_values(option, volume=volume)
+
+    def certificate(settings: Settings) -> CertificateOptions:
+        planned = settings.confidence if confidence is None else confidence
+        return settings.certificate.options(planned, kind=kind, stated=stated)
+
+    try:
+        loaded = open_store(opened, store, experiment, trust)
+    except CtxvalError as error:
+        if experiment is not None or trust:
+            raise
+        # The experiment may not be loaded, and no code is imported or run.
+        settings = planned_settings(opened, kind)
+        labels = Labels(labels_of(settings.states), labels_of(settings.inputs), settings.units or "")
+        limit = settings.threshold if threshold is None else threshold
+        context = context_of_store(opened, limit, certificate=certificate(settings), missing=str(error), labels=labels)
+        context = replace(context, budget=settings.budget)
+    else:
+        settings, made = loaded.settings, loaded.experiment
+        context = context_of_campaign(
+            loaded.campaign,
+            threshold=limit_of(made, settings, threshold),
+            certificate=certificate(settings),
+            budget=budget_of(made, settings),
+        )
     written = {"report": str(reports.write_page(context, target))}
     if junit is not None:
         written["junit"] = str(write_text(junit, reports.junit(context)))
@@ -116,25 +120,3 @@ def write_report(
 def page_path(store: Path) -> Path:
     """Return the path of the report of a store."""
     return store.with_suffix(".report.html")
-
-
-def _context(store: Store, path: Path, asked: _Asked, experiment: str | None, trust: bool) -> ReportContext:
-    """Return what the report is made from: with the experiment if it may be loaded, otherwise without."""
-    try:
-        opened = open_store(store, path, experiment, trust)
-    except CtxvalError as error:
-        if experiment is not None or trust:
-            raise
-        return _of_data(store, asked, str(error))
-    limit = asked.limit(opened.settings.threshold, opened.experiment.threshold)
-    budget, options = budget_of(opened.experiment, opened.settings), asked.options(opened.settings)
-    return context_of_campaign(opened.campaign, threshold=limit, certificate=options, budget=budget)
-
-
-def _of_data(store: Store, asked: _Asked, missing: str) -> ReportContext:
-    """Return the context of a store whose experiment is not loaded; no code is imported or run."""
-    settings = planned_settings(store, asked.kind)
-    labels = Labels(labels_of(settings.states), labels_of(settings.inputs), settings.units or "")
-    limit, options = asked.limit(settings.threshold), asked.options(settings)
-    context = context_of_store(store, limit, certificate=options, missing=missing, labels=labels)
-    return replace(context, budget=settings.budget)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import suppress
+import os
+import sys
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ctxval._util.progress import also_listening
 from ctxval._util.texts import reason_of, shortened
 from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.certificates.base import Certificate
 from ctxval.certificates.verdict import Verdict, usable_bound
 from ctxval.cli.base import (
@@ -32,14 +37,14 @@ from ctxval.cli.base import (
 )
 from ctxval.cli.commands import app
 from ctxval.cli.options import (
-    SEARCH_METHODS,
-    TARGET,
     AsJson,
     Confidence,
     Dask,
     PartOptions,
     Resolution,
+    SearchName,
     Stochastic,
+    Target,
     Threshold,
     Timeout,
     Workers,
@@ -55,13 +60,11 @@ from ctxval.errors import CertificateError, InputError
 from ctxval.report.context import context_of_campaign
 from ctxval.report.page import write_page
 from ctxval.storage.other_stores import other_stores
+from ctxval.web.served import ServedCampaign
 
-Target = Annotated[
-    str,
-    typer.Argument(
-        metavar=TARGET, help="Experiment to run: a case, an experiment file, or a reference to an object in Python."
-    ),
-]
+if TYPE_CHECKING:
+    from ctxval.web.live import LiveCampaign
+
 Budget = Annotated[
     int | None,
     typer.Option(
@@ -69,7 +72,6 @@ Budget = Annotated[
         "the experiment)."
     ),
 ]
-SearchName = Annotated[str | None, typer.Option(help=f"Search method: {SEARCH_METHODS} (default: auto).")]
 Explore = Annotated[
     bool | None,
     typer.Option(
@@ -112,6 +114,14 @@ WithReport = Annotated[
         help="Write a report next to the store: one HTML page with the verdict, insights and charts.",
     ),
 ]
+Live = Annotated[
+    bool,
+    typer.Option(
+        "--live",
+        help="Show the campaign in a browser as it goes: serve a page on this computer until the command ends, and "
+        "print its address. The page needs the extra web.",
+    ),
+]
 Variant = Annotated[str | None, typer.Option(help="Variant of a case; the same as --option variant=VALUE.")]
 ModelName = Annotated[str | None, typer.Option(help="Learned model of a case; the same as --option model=VALUE.")]
 Dimension = Annotated[int | None, typer.Option(help="Number of states of a case; the same as --option dim=VALUE.")]
@@ -138,6 +148,7 @@ def run(
     timeout: Timeout = None,
     accept_change: AcceptChange = None,
     with_report: WithReport = True,
+    live: Live = False,
     as_json: AsJson = False,
     option: PartOptions = None,
     variant: Variant = None,
@@ -159,8 +170,11 @@ def run(
     if settings.audited and settings.explores:
         raise InputError("--audited tests the bound that ends a campaign; an exploration ends with its budget.")
     certificate = settings.certificate_options
-    if truth:
-        _require_truth(experiment)  # before executions are paid for
+    if truth and experiment.truth is None:
+        raise InputError(
+            f"the true maximum of {experiment.name!r} is not known. Only experiments with a `truth` function have it, "
+            "such as the cases of the paper."
+        )
     limit = limit_of(experiment, settings)
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
@@ -168,60 +182,79 @@ def run(
     if limit is not None:
         certificate.kind.require_usable(certificate.confidence, total)  # before executions are paid for
     if not as_json:
-        _print_parts(experiment, limit)
-    with worker_options(workers, dask, timeout) as execution:
-        campaign.run(
-            total,
-            limit,
-            explore=settings.explores,
-            within=settings.within,
-            certificate=certificate,
-            audited=settings.audited,
-            **execution,
-        )
-    known = experiment.truth() if truth and experiment.truth is not None else None
-    digest = campaign.store.digest()
-    verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
-    bound = None if verdict is None else verdict.certificate
-    if verdict is None and not settings.explores:
-        with suppress(CertificateError):
-            bound = campaign.certify(certificate=certificate)
-    report = _report(campaign, experiment, settings, total, path, verdict, bound, known)
-    said = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
-    page = page_path(path) if with_report else None
-    if page is not None:
-        report["report"] = (
-            str(page) if _is_current(page, campaign, said) else _write_report(page, campaign, verdict, total)
-        )
-    campaign.store.keep_computed(RUN, {**said, "report": report.get("report")}, digest)
+        parts = experiment.validation
+        sentence = f": S {type(parts.system).__name__}, M {shortened(repr(parts.model), 60)}, "
+        sentence += f"controllers {type(parts.synthesizer).__name__}"
+        if limit is not None:
+            sentence += f", threshold {limit:g} {experiment.units}".rstrip()
+        out.say((experiment.name, "bold"), sentence, wrap=True)
+    with _live_page(live, ServedCampaign(experiment, campaign, limit, certificate, total), settings) as shown:
+        with worker_options(workers, dask, timeout) as execution:
+            campaign.run(
+                total,
+                limit,
+                None if shown is None else shown.take,
+                explore=settings.explores,
+                within=settings.within,
+                certificate=certificate,
+                audited=settings.audited,
+                **execution,
+            )
+        known = experiment.truth() if truth and experiment.truth is not None else None
+        digest = campaign.store.digest()
+        verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
+        bound = None if verdict is None else verdict.certificate
+        if verdict is None and not settings.explores:
+            with suppress(CertificateError):
+                bound = campaign.certify(certificate=certificate)
+        report = _report(campaign, experiment, settings, total, path, verdict, bound, known)
+        result = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
+        if with_report:
+            page = page_path(path)
+            # An earlier run may have written the same report.
+            current = page.is_file() and campaign.store.computed(RUN) == {**result, "report": str(page)}
+            try:
+                context = None if current else context_of_campaign(campaign, verdict, budget=total)
+                report["report"] = str(page if context is None else write_page(context, page))
+            except Exception as error:  # it must not hide the verdict, for which executions were paid
+                err.say(f"no report: {reason_of(error)}")
+                report["report"] = None
+        campaign.store.keep_computed(RUN, {**result, "report": report.get("report")}, digest)
+        if shown is not None:
+            shown.end(verdict, bound, report.get("report"))
     if not as_json:
         _print_report(report, verdict, bound)
-    return report, _status(campaign, verdict)
-
-
-def _print_parts(experiment: Experiment, limit: float | None) -> None:
-    """Print what is compared, before anything is executed."""
-    parts, units = experiment.validation, experiment.units
-    texts = [f"S {type(parts.system).__name__}", f"M {shortened(repr(parts.model), 60)}"]
-    texts.append(f"controllers {type(parts.synthesizer).__name__}")
-    wanted = [] if limit is None else [f"threshold {limit:g} {units}".rstrip()]
-    out.say((experiment.name, "bold"), f": {', '.join([*texts, *wanted])}", wrap=True)
-
-
-def _status(campaign: Campaign, verdict: Verdict | None) -> int:
-    """Return the exit status of a run; if all executions failed, print an error."""
     if campaign.failed and not campaign.completed:
         say_error(f"all {len(campaign.failed)} executions failed, so there is no distance.")
-        return CANNOT_GO_ON
-    return FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
+        return report, CANNOT_GO_ON
+    return report, FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
 
-def _require_truth(experiment: Experiment) -> None:
-    if experiment.truth is None:
-        raise InputError(
-            f"the true maximum of {experiment.name!r} is not known. Only experiments with a `truth` function have it, "
-            "such as the cases of the paper."
+@contextmanager
+def _live_page(wanted: bool, served: ServedCampaign, settings: Settings) -> Iterator[LiveCampaign | None]:
+    """Serve the page of the campaign while the command runs, if it is wanted."""
+    if not wanted:
+        yield None
+        return
+    from ctxval.cli.serve import web_server  # it needs an extra
+
+    web, search = web_server(), None
+    if not settings.explores:
+        search = IntervalSearch(
+            served.campaign.recorder,
+            served.certificate,
+            served.budget,
+            served.threshold,
+            settings.within,
+            settings.audited,
         )
+    page = web.LiveCampaign(served, search)
+    with web.showing(page) as address, also_listening(page.hear):
+        out.say(f"the page is at {address}")
+        screen = sys.platform in ("win32", "darwin") or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
+        if sys.stdout.isatty() and screen:
+            webbrowser.open(address)
+        yield page
 
 
 def _report(
@@ -260,21 +293,6 @@ def _report(
         estimate = campaign.estimate
         report["error_percent"] = None if estimate is None else 100 * (truth.distance - estimate) / truth.distance
     return report
-
-
-def _is_current(page: Path, campaign: Campaign, said: Mapping[str, Any]) -> bool:
-    """Return whether an earlier run has written the same report."""
-    return page.is_file() and campaign.store.computed(RUN) == {**said, "report": str(page)}
-
-
-def _write_report(page: Path, campaign: Campaign, verdict: Verdict | None, budget: int) -> str | None:
-    """Write the report and return its path; None if it cannot be written."""
-    try:
-        return str(write_page(context_of_campaign(campaign, verdict, budget=budget), page))
-    except Exception as error:
-        # An error in the report must not hide the verdict, for which executions were paid.
-        err.say(f"no report: {reason_of(error)}")
-        return None
 
 
 def _print_report(report: dict[str, Any], verdict: Verdict | None, bound: Certificate | None) -> None:

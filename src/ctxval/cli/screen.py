@@ -31,12 +31,7 @@ class Screen(Console):
             yield segment if segment.control else Segment(visible(segment.text), segment.style)
 
     def say(self, *parts: str | tuple[str, str], wrap: bool = False) -> None:
-        """Print one sentence.
-
-        Args:
-            parts: texts, or texts with a style, such as ``("error:", "bold red")``.
-            wrap: break the sentence between words, at the width of the screen.
-        """
+        """Print one sentence of texts, some with a style; ``wrap`` breaks it between words."""
         texts = [(part, "") if isinstance(part, str) else part for part in parts]
         self.print(Text.assemble(*((line(text), style) for text, style in texts)), soft_wrap=not wrap)
 

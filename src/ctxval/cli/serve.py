@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -71,32 +71,28 @@ def serve(
     The page shows the next task and its files. It takes recordings and failures, and shows the verdict. Ctrl-C stops
     the server.
     """
-    web = _web()
+    web = web_server()
     address = web.Address(host, port, token, tuple(allow_host or ()))
-    again = _Reopening(settings_of(Store.existing(store), experiment, trust), store, threshold, budget)
+    settings = settings_of(Store.existing(store), experiment, trust)
+    again = functools.partial(_reopened, settings, store, threshold, budget)
 
     def first() -> ServedCampaign:
         return _served(open_store(Store.existing(store), store, experiment, trust, accept_change), threshold, budget)
 
-    web.serve(first, again, address, _say_started)
+    def say_started(place: str, secret: str | None) -> None:
+        out.say(f"the page is at {place}" + ("" if secret is None else f"?token={secret}"))
+        if secret is not None:
+            out.say("everybody who has this address can record results. It is sent without encryption.")
+        out.say("Ctrl-C stops the server; all results are stored.")
+
+    web.serve(first, again, address, say_started)
 
 
-@dataclass(frozen=True)
-class _Reopening:
-    """Opens a store in a child process by settings that the user has allowed to run here.
-
-    The settings in the store are not read again: somebody may have changed them since.
-    """
-
-    settings: Settings
-    path: Path
-    threshold: float | None
-    budget: int | None
-
-    def __call__(self) -> ServedCampaign:
-        made = self.settings.load()
-        campaign = self.settings.campaign(made, Store.existing(self.path))
-        return _served(Opened(self.settings, made, campaign, self.path), self.threshold, self.budget)
+def _reopened(settings: Settings, path: Path, threshold: float | None, budget: int | None) -> ServedCampaign:
+    """Open a store by settings that the user has allowed to run here: those in it may have been changed since."""
+    made = settings.load()
+    campaign = settings.campaign(made, Store.existing(path))
+    return _served(Opened(settings, made, campaign, path), threshold, budget)
 
 
 def _served(opened: Opened, threshold: float | None, budget: int | None) -> ServedCampaign:
@@ -105,18 +101,9 @@ def _served(opened: Opened, threshold: float | None, budget: int | None) -> Serv
     return ServedCampaign(opened.experiment, opened.campaign, limit, opened.settings.certificate_options, total)
 
 
-def _web() -> Any:
+def web_server() -> Any:
     """Return the module of the server, which needs the extra ``web``."""
     try:
         return importlib.import_module("ctxval.web.server")
     except ImportError as error:
         raise InputError(f"the page needs {error.name}: pip install 'ctxval[web]'.") from error
-
-
-def _say_started(address: str, token: str | None) -> None:
-    if token is None:
-        out.say(f"the page is at {address}")
-    else:
-        out.say(f"the page is at {address}?token={token}")
-        out.say("everybody who has this address can record results. It is sent without encryption.")
-    out.say("Ctrl-C stops the server; all results are stored.")

@@ -17,9 +17,6 @@ from ctxval.errors import StoreAccessError
 from ctxval.storage.recovery import export, recover
 from ctxval.storage.store import Store
 
-_SENTENCES = 20
-"""Largest number of sentences about damage that are printed."""
-
 
 @app.command()
 @command
@@ -29,6 +26,10 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
     with opened.snapshot():
         description, trials, changes = opened.description(), opened.trials(), opened.history()
         kept = opened.computed(RUN)
+    verdict = None
+    match kept:
+        case {"verdict": {"verdict": str(answer), "threshold": float(threshold), "reason": str(reason)}}:
+            verdict = f"{answer} against {threshold:g}: {reason}"
     search = description.get("search")
     report: dict[str, Any] = {
         "case": description.get("name"),
@@ -42,7 +43,7 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
         "worst": worst_of(
             max((t for t in trials if t.distance is not None), key=lambda t: t.distance or 0, default=None)
         ),
-        "verdict": _verdict_of(kept),
+        "verdict": verdict,
         "changes": [asdict(change) for change in changes],
         "store": str(store),
     }
@@ -52,14 +53,6 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
             out.say(f"{change['at'][:19]} {change['what']}: {change['why']}")
         print_failures(report["failures"])
     return report
-
-
-def _verdict_of(kept: Any) -> str | None:
-    """Return the verdict of the last run on these trials as a sentence; None if there is none."""
-    match kept:
-        case {"verdict": {"verdict": str(answer), "threshold": float(threshold), "reason": str(reason)}}:
-            return f"{answer} against {threshold:g}: {reason}"
-    return None
 
 
 @app.command("export")
@@ -91,9 +84,9 @@ def export_store(
         "folder": str(target),
     }
     if not as_json:
-        for sentence in found.damaged[:_SENTENCES]:
+        for sentence in found.damaged[:20]:
             out.say(("cannot be read", "yellow"), f": {sentence}")
-        if len(found.damaged) > _SENTENCES:
-            out.say(f"and {len(found.damaged) - _SENTENCES} others; trials.json lists them.")
+        if len(found.damaged) > 20:
+            out.say(f"and {len(found.damaged) - 20} others; trials.json lists them.")
         out.say(f"{len(found.trials)} trials and {len(found.trajectories)} trajectories in {target}")
     return report

@@ -23,34 +23,12 @@ from ctxval.core.validation import Validation
 from ctxval.errors import ConformanceError, CtxvalError
 from ctxval.testing import check_distance, check_model, check_synthesizer
 
-_TASKS = 8
-"""Number of random tasks that are planned, besides the lowest, the middle and the highest one."""
-
-_EXECUTED = 3
-"""Number of executions after which the cost of a suggestion is estimated."""
-
-_LONG = 30.0
-"""Seconds for a suggestion that the user should know of."""
-
-_ROUNDING = 1e-12
-"""Largest difference of a task in a batch, relative to the largest value of the task alone."""
-
-_SAME_START = 1e-6
-"""Largest error of the initial state of an execution, in each state."""
-
 FindingState = Literal["ok", "noted", "failed", "skipped"]
 
 
 @dataclass(frozen=True)
 class Checked:
-    """The result of one check.
-
-    Attributes:
-        check: the name of the check.
-        state: ``ok``; ``failed`` if there is an error; ``noted`` if the user should read the text; ``skipped`` if the
-            check was not made.
-        text: one sentence that explains the result.
-    """
+    """The result of one check: a sentence, and whether it is ok, failed, not made, or to be read by the user."""
 
     check: str
     state: FindingState
@@ -80,15 +58,12 @@ def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int
 
 
 def _guarded(name: str, check: Callable[[], Iterator[Checked]]) -> list[Checked]:
-    found: list[Checked] = []
+    findings: list[Checked] = []
     try:
-        found.extend(check())
-    except CtxvalError as error:
-        found.append(Checked(name, "failed", str(error)))
-    except Exception as error:
-        # A user's own part may raise anything.
-        found.append(Checked(name, "failed", reason_of(error)))
-    return found
+        findings.extend(check())
+    except Exception as error:  # a user's own part may raise anything
+        findings.append(Checked(name, "failed", str(error) if isinstance(error, CtxvalError) else reason_of(error)))
+    return findings
 
 
 def _space(validation: Validation) -> Checked:
@@ -103,10 +78,12 @@ def _space(validation: Validation) -> Checked:
 def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Checked]:
     """Plan the lowest, the middle, the highest and random tasks, and check the paper's Aspect 1 on them."""
     space = validation.space
+    middle = 0.5 * (space.low + space.high)
     points = np.concatenate(
         [
-            np.stack([space.low, 0.5 * (space.low + space.high), space.high]),
-            space.iid(_TASKS, np.random.default_rng(seed)),
+            np.stack([space.low, middle, space.high]),
+            # Number of random tasks that are planned, besides the lowest, the middle and the highest one.
+            space.iid(8, np.random.default_rng(seed)),
         ]
     )
     made = [validation.plan(point) for point in points]
@@ -119,10 +96,10 @@ def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Iterator[Che
         f"{len(made)} tasks planned: {n} states, {m} inputs, {task.horizon} steps of {task.dt:g} s",
     )
     yield from _goals(validation, made)
-    told = [(plan, converged) for plan in made if (converged := converged_of(plan.controller)) is not None]
-    if told:
-        failed = [space.describe_point(plan.parameters.points) for plan, converged in told if not converged]
-        yield convergence(failed, len(told))
+    known = [(plan, converged) for plan in made if (converged := converged_of(plan.controller)) is not None]
+    if known:
+        failed = [space.describe_point(plan.parameters.points) for plan, converged in known if not converged]
+        yield convergence(failed, len(known))
 
 
 def convergence(failed: Sequence[dict[str, Any]], designs: int) -> Checked:
@@ -165,7 +142,8 @@ def task_text(parameters: dict[str, Any]) -> str:
 def _cost(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked]:
     """State what designs, closed loops on M and a suggestion of ``auto`` cost in CPU time."""
     with stage("measuring what a suggestion costs"):
-        thinking = ThinkingCosts.measured(validation, [plan.parameters.points for plan in plans[:_EXECUTED]])
+        # Number of executions after which the cost of a suggestion is estimated.
+        thinking = ThinkingCosts.measured(validation, [plan.parameters.points for plan in plans[:3]])
     text = f"a design takes {thinking.design:.2g} s of CPU, a closed loop on the model {thinking.closed_loop:.2g} s"
     if thinking.choice is not None:
         text += f"; the choice of a task takes about {thinking.choice:.2g} s, and the verdict {thinking.verdict:.2g} s"
@@ -174,7 +152,8 @@ def _cost(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked]:
             f"; with --explore, a suggestion takes about {thinking.suggestion:.2g} s if it thinks thoroughly "
             f"({thinking.designs} designs) and {thinking.fast:.2g} s if it thinks fast"
         )
-    yield Checked("cost", "noted" if max(thinking.choice or 0.0, thinking.suggestion or 0.0) >= _LONG else "ok", text)
+    # Seconds for a suggestion that the user should know of.
+    yield Checked("cost", "noted" if max(thinking.choice or 0.0, thinking.suggestion or 0.0) >= 30.0 else "ok", text)
 
 
 def _short(value: Any) -> str:
@@ -243,19 +222,21 @@ def _batches(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked]
                 f"task {index} of a batch differs from the same task alone: check the task function",
             )
             return
-    check_synthesizer(validation.synthesizer, _first(batch, 4), validation.model)
+    starts, references = batch.initial_state[:4], batch.reference[:4]
+    few = Task(starts, horizon=batch.horizon, dt=batch.dt, reference=references)
+    check_synthesizer(validation.synthesizer, few, validation.model)
     yield Checked("batches", "ok", "task function and synthesizer give the same results in a batch as alone")
 
 
 def _differ(one: Array, other: Array) -> bool:
     """Return whether two arrays differ by more than rounding: algebra of a batch sums in another order."""
     return one.shape != other.shape or not np.allclose(
-        one, other, rtol=0, atol=_ROUNDING * np.abs(other).max(initial=0)
+        # Largest difference of a task in a batch, relative to the largest value of the task alone.
+        one,
+        other,
+        rtol=0,
+        atol=1e-12 * np.abs(other).max(initial=0),
     )
-
-
-def _first(batch: Task, count: int) -> Task:
-    return Task(batch.initial_state[:count], horizon=batch.horizon, dt=batch.dt, reference=batch.reference[:count])
 
 
 def _distance(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked]:
@@ -282,8 +263,10 @@ def _distance(validation: Validation, plans: Sequence[Plan]) -> Iterator[Checked
 
 
 def _stacked(trajectories: Sequence[Trajectory], shift: float) -> Trajectory:
-    states: Array = np.stack([one.states for one in trajectories])
-    return Trajectory(trajectories[0].times, states + shift, np.stack([one.inputs for one in trajectories]))
+    states: Array = np.stack([trajectory.states for trajectory in trajectories])
+    return Trajectory(
+        trajectories[0].times, states + shift, np.stack([trajectory.inputs for trajectory in trajectories])
+    )
 
 
 def _executions(validation: Validation, plan: Plan, execute: bool) -> Iterator[Checked]:
@@ -297,7 +280,8 @@ def _executions(validation: Validation, plan: Plan, execute: bool) -> Iterator[C
     first, second = validation.execute(plan), validation.execute(plan)
     for trajectory in (first, second):
         gap = float(np.abs(trajectory.states[0] - plan.task.initial_state).max())
-        if gap > _SAME_START:
+        # Largest error of the initial state of an execution, in each state.
+        if gap > 1e-6:
             yield Checked(
                 "execution", "failed", f"the execution starts {gap:.3g} away from the initial state of the task"
             )

@@ -19,7 +19,7 @@ from ctxval import controllers, distances, models, systems
 from ctxval._util.files import read_bytes
 from ctxval._util.npz import Archive
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
-from ctxval.config.references import accepts, is_function, reference, require_function, require_part
+from ctxval.config.references import accepts, reference, require_function, require_part
 from ctxval.core.model import Model
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.task import Task
@@ -65,18 +65,15 @@ def _referenced(registry: Registry[Any], what: str, found: Any, arguments: dict[
     if isinstance(found, type):
         build = require_part(registry, what, found)
         return require_part(registry, what, _built(kind, what, build, arguments, folder))
-    if inspect.isfunction(found) and (arguments or not _is_part(kind, found)):
+    # A model or a distance may be a function itself, rather than a function that makes one.
+    count = {"model": 2, "distance": 3}.get(kind)
+    if inspect.isfunction(found) and (arguments or count is None or not accepts(found, count)):
         if not arguments and not accepts(found, 0):
             require_part(registry, what, found)  # raises an error with the reason
         return require_part(registry, what, _built(kind, what, found, arguments, folder))
     if arguments:
         raise InputError(f"{what} is an object already, so it takes no arguments, got {', '.join(arguments)}.")
     return require_part(registry, what, found)
-
-
-def _is_part(kind: str, found: Any) -> bool:
-    """Return whether a function is itself a part, rather than a function that makes one."""
-    return kind in ("model", "distance") and is_function(found) and accepts(found, 2 if kind == "model" else 3)
 
 
 def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
@@ -104,16 +101,14 @@ def argument(value: Any, folder: Path | None = None) -> Any:
     """Return an argument unchanged, or the object that ``{ref = "module:attr"}`` names."""
     if isinstance(value, Mapping):
         if set(value) == {"ref"}:
-            return _referred(str(value["ref"]), folder)
+            found = reference(str(value["ref"]), folder)
+            if inspect.ismodule(found) or (inspect.isroutine(found) and not inspect.isfunction(found)):
+                raise InputError(
+                    f"{value['ref']} must be an object, a class or a function written in Python, got {found!r}."
+                )
+            return found
         return {key: argument(item, folder) for key, item in value.items()}
     return value
-
-
-def _referred(text: str, folder: Path | None) -> Any:
-    found = reference(text, folder)
-    if inspect.ismodule(found) or (inspect.isroutine(found) and not inspect.isfunction(found)):
-        raise InputError(f"{text} must be an object, a class or a function written in Python, got {found!r}.")
-    return found
 
 
 def recorded(files: Any, folder: Path | None = None) -> Transitions:
@@ -127,11 +122,11 @@ def recorded(files: Any, folder: Path | None = None) -> Transitions:
         raise InputError(f"data must be a file of recorded trajectories or a list of files, got {files!r}.")
     found = [Path(folder or "", path) for path in paths]
     steps = [None if mapping is not None else _transitions(path) for path in found]
-    parts = [one for one in steps if one is not None]
-    logs = [path for path, one in zip(found, steps, strict=True) if one is None]
+    parts = [step for step in steps if step is not None]
+    logs = [path for path, step in zip(found, steps, strict=True) if step is None]
     kinds = dict.fromkeys("" if mapping is not None else path.suffix for path in logs)
     for suffix in kinds:  # arrays in NPZ files have other names than columns
-        parts.append(read_recordings([one for one in logs if suffix in ("", one.suffix)], mapping).transitions()[0])
+        parts.append(read_recordings([each for each in logs if suffix in ("", each.suffix)], mapping).transitions()[0])
     return Transitions.joined(parts)
 
 
@@ -152,14 +147,7 @@ def _transitions(path: Path) -> Transitions | None:
 
 @dataclass(frozen=True)
 class TaskTable:
-    """A task function without code: every component is a number, or a task parameter by name.
-
-    Attributes:
-        initial_state: one component for each state: ``1.5``, ``"name"``, ``"-name"`` or ``"name[2]"``.
-        goal: components in the same form; None for the origin.
-        horizon: number of steps.
-        dt: time step in seconds.
-    """
+    """A task function without code: every component is a number, or a task parameter by name."""
 
     initial_state: tuple[float | str, ...]
     goal: tuple[float | str, ...] | None
@@ -261,12 +249,9 @@ def with_distribution(
 ) -> TaskSpace:
     """Return a task space with the distribution of tasks of an experiment file.
 
-    Args:
-        space: the task space.
-        tables: for each parameter, ``{type = "normal", mean = ..., deviation = ...}``, ``{type = "uniform"}`` or
-            ``{ref = "module:attr"}`` of a frozen distribution of scipy.stats; or only ``sampler``, the reference of a
-            function ``(rng, n) -> tasks (n, d)``.
-        folder: the folder of the modules; the current folder by default.
+    The tables are, for each parameter, ``{type = "normal", mean = ..., deviation = ...}``, ``{type = "uniform"}`` or
+    ``{ref = "module:attr"}`` of a frozen distribution of scipy.stats; or only ``sampler``, the reference of a function
+    ``(rng, n) -> tasks (n, d)``.
     """
     if set(tables) == {"sampler"} and set(tables["sampler"]) == {"ref"} and "sampler" not in space.names:
         return space.sampled(argument(tables["sampler"], folder))

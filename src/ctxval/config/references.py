@@ -48,18 +48,13 @@ def _searched_first(home: str) -> Iterator[str]:
     before = list(sys.path)
     if home not in before:
         _added.add(home)
-    sys.path[:] = [home, *(entry for entry in before if _is_searched(entry, home))]
+    stated = {os.path.realpath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path}
+    others = {home, os.path.realpath(_here()), *_added} - stated
+    sys.path[:] = [home, *(entry for entry in before if os.path.realpath(entry or _here()) not in others)]
     try:
         yield home
     finally:
         sys.path.extend(entry for entry in before if entry not in sys.path)
-
-
-def _is_searched(entry: str, home: str) -> bool:
-    real, wanted = os.path.realpath(entry or _here()), os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    if real in {os.path.realpath(path) for path in wanted if path}:
-        return True
-    return real not in {home, os.path.realpath(_here()), *_added}
 
 
 def _here() -> str:
@@ -147,13 +142,7 @@ def require_part(registry: Registry[Any], what: str, found: Any) -> Any:
 
 
 def require_function(what: str, found: Any, form: str) -> Any:
-    """Return a function if it takes the number of positional arguments of a form; it is not called here.
-
-    Args:
-        what: the name of the function in the message.
-        found: the function.
-        form: the arguments and the result, such as ``(x, u) -> x_next`` or ``p -> Task``.
-    """
+    """Return a function if it takes the arguments of a form such as ``(x, u) -> x_next``; it is not called here."""
     count = form.partition("->")[0].count(",") + 1
     if not is_function(found):
         raise InputError(f"{what} must be a function {form} written in Python, got {_named(found)}.")

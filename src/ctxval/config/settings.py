@@ -17,11 +17,10 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.interval_search import is_decisive
 from ctxval.certificates import CertificateOptions
 from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, WITHIN
-from ctxval.config.aspect1_table import Aspect1Table
-from ctxval.config.certificate_table import CertificateTable
 from ctxval.config.experiments import named_experiment
-from ctxval.config.parts import argument, part, require_types, space_of, task_function, with_distribution
+from ctxval.config.parts import part, space_of, task_function, with_distribution
 from ctxval.config.signatures import code_named, signed
+from ctxval.config.tables import Aspect1Table, CertificateTable, SearchTable
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.validation import Validation
@@ -29,30 +28,7 @@ from ctxval.data import LogMapping
 from ctxval.errors import InputError, UnknownNameError
 from ctxval.models import Refined, read_refined
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH
-from ctxval.searches import REGISTRY as SEARCHES
-from ctxval.searches import Search, by_name
 from ctxval.storage.store import Store
-
-
-class SearchTable(BaseModel):
-    """The table ``[search]``: the name of a search, and its options.
-
-    Attributes:
-        name: the name in the registry of searches.
-        repeats: the number of executions of each task; more than 1 if the system is noisy.
-    """
-
-    model_config = ConfigDict(extra="allow")
-
-    name: str = DEFAULT_SEARCH
-    repeats: int = Field(default=1, ge=1)
-
-    def build(self, folder: Path | None = None) -> Search:
-        """Return the search."""
-        options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
-        options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
-        return by_name(self.name, repeats=self.repeats, **options)
-
 
 Part = str | dict[str, Any]
 """``module:attr``, or a table with a type and its arguments."""
@@ -68,29 +44,18 @@ class Settings(BaseModel):
     Attributes:
         experiment: a case, or ``module:attr`` of an experiment or of a function of a seed that makes one.
         options: the options of the case or of the function.
-        name: the name of the experiment.
         space: ``name = [low, high, "unit"]`` for each task parameter.
         distribution: the distribution of a task parameter by its name, such as ``{type = "normal", mean = 0.0,
             deviation = 0.3}`` or ``{ref = "module:attr"}``; all others are uniform. Or ``sampler``, the reference of a
             function that draws whole tasks. A named experiment may have one too.
         task: ``module:attr`` of a function, or a table with an initial state, a goal, a horizon and a time step.
-        system, model, synthesizer, distance: ``module:attr``, or a table with a type and its arguments.
         states, inputs: the unit of each state and of each input, by name.
-        units: the units of the distance.
-        budget, threshold, store: the budget, the threshold and the store of the campaign; None for those of the
-            experiment.
-        longest: the largest horizon that is planned; None for that of the experiment.
+        budget, threshold, longest, store: None for the value of the experiment; ``longest`` is the largest horizon.
         seed: the seed of the data, the model and the search.
         explore, within, audited: as the options of ``ctxval run``, so that a store knows the command that made it.
-        confidence: the confidence level of the certificate.
-        certificate: the certificate for the verdict.
-        search: the search, and its options.
-        aspect1: when the model itself counts as completing a task.
-        refined: the file of a model that `ctxval refine` has learned from executions; it replaces the model of the
-            experiment.
+        refined: the file of a model that `ctxval refine` has learned from executions; it replaces the given model.
         recordings: the mapping of logs to states and inputs, as :class:`ctxval.data.LogMapping` takes it.
-        folder: the folder of modules and files, which is the folder of the experiment file. None means the current
-            folder.
+        folder: the folder of modules and files, which is that of the experiment file; None for the current folder.
     """
 
     model_config = ConfigDict(extra="forbid")

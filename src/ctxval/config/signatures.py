@@ -27,9 +27,6 @@ SIGNATURES = "signatures"
 """The key of the signatures in the settings of a store."""
 
 _BYTES = 32
-_USERS = 16
-"""Largest number of signatures that settings keep, one for each user and computer."""
-
 _SHOWN = 160
 """Largest number of characters of a setting that are shown."""
 
@@ -55,7 +52,8 @@ def signed(settings: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, 
         own = None
     if own is not None and own not in others:
         others = [own, *others]
-    return {**plain, **({SIGNATURES: others[:_USERS]} if others else {})}
+    # Largest number of signatures that settings keep, one for each user and computer.
+    return {**plain, **({SIGNATURES: others[:16]} if others else {})}
 
 
 def verifies(settings: Mapping[str, Any]) -> bool:

@@ -18,20 +18,15 @@ from ctxval.errors import InputError
 from ctxval.storage.store import Store
 
 
-def stored_settings(store: Store) -> Settings:
-    """Return the settings in a store, whoever wrote them.
+def planned_settings(store: Store, kind: str | None = None) -> Settings:
+    """Return the settings in a store, whoever wrote them; the defaults if no command made the store.
 
     Do not build anything from them: :func:`trusted_settings` returns those that may be used.
     """
-    return _of_store(store.settings())
-
-
-def planned_settings(store: Store, kind: str | None = None) -> Settings:
-    """Return the settings in a store, as :func:`stored_settings` does; the defaults if no command made the store."""
     kept = store.settings()
     if not kept:
         return Settings()
-    settings = stored_settings(store)
+    settings = _of_store(kept)
     planned = settings.certificate.kind
     if kind is None and not KINDS.is_data(planned) and not verifies(kept):
         raise InputError(
@@ -57,7 +52,15 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
     """Return the settings from which a store's experiment may be built."""
     kept = store.settings()
     if experiment is not None:
-        return _named_again(kept, experiment)
+        named = read_settings(experiment, {})
+        try:
+            stored = _of_store(kept)
+        except InputError:
+            return named
+        same: dict[str, Any] = {"seed": stored.seed}
+        if not code_named({"search": kept.get("search", {})}):
+            same["search"] = stored.search
+        return named.model_copy(update=same)
     settings, code = _of_store(kept), code_named(kept)
     folder = settings.folder or Path().resolve()
     outside = [] if store.path is None else _files_outside(kept, folder, store.path.resolve().parent)
@@ -91,9 +94,9 @@ _LONGEST = 200
 _FILE_KEYS = {"refined", "data", "logs"}.union(
     *(
         declared.files
-        for one in REGISTRIES.values()
-        for name in one.built_in
-        if (declared := declaration_of(one.find(name)))
+        for registry in REGISTRIES.values()
+        for name in registry.built_in
+        if (declared := declaration_of(registry.find(name)))
     )
 )
 """The keys of settings whose texts are paths."""
@@ -121,15 +124,3 @@ def _texts(value: Any, path: bool) -> Iterator[str]:
 
 
 _IN_XML = re.compile(r"""(?:file|dir)\s*=\s*["']([^"']+)""")
-
-
-def _named_again(kept: dict[str, Any], experiment: str) -> Settings:
-    settings = read_settings(experiment, {})
-    try:
-        stored = _of_store(kept)
-    except InputError:
-        return settings
-    same: dict[str, Any] = {"seed": stored.seed}
-    if not code_named({"search": kept.get("search", {})}):
-        same["search"] = stored.search
-    return settings.model_copy(update=same)

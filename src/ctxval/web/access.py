@@ -17,12 +17,8 @@ LEAST_TOKEN = 16
 class Access:
     """Sessions in signed cookies, with a key that lives as long as the server.
 
-    Args:
-        token: the token that a browser must show once; None if every browser on this computer may use the page.
-        port: the port of the server. Browsers share cookies among the ports of one computer.
-
-    Raises:
-        InputError: if the token is too short, or has other characters than visible ones of ASCII.
+    Without a token, every browser on this computer may use the page. Browsers share cookies among the ports of one
+    computer.
     """
 
     def __init__(self, token: str | None, port: int) -> None:
@@ -39,8 +35,8 @@ class Access:
 
     def admits(self, token: str) -> bool:
         """Return whether this is the token of the server. The comparison takes the same time for every text."""
-        known = (self._token or "").encode()
-        return self._token is not None and hmac.compare_digest(known, token.encode("utf-8", "backslashreplace"))
+        known, given = (self._token or "").encode(), token.encode("utf-8", "backslashreplace")
+        return self._token is not None and hmac.compare_digest(known, given)
 
     def new_session(self) -> str:
         """Return the cookie of a new session."""

@@ -21,19 +21,14 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response, Stream
 from starlette.routing import Route
 
 from ctxval._util.texts import shortened, visible
-from ctxval.campaign.telling import ToldResult
 from ctxval.errors import CampaignError, CtxvalError, InputError, StoreError
 from ctxval.web import forms
 from ctxval.web.access import Access
 from ctxval.web.desk import recording_in
 from ctxval.web.page import Page, Problem
 from ctxval.web.security import MOST_UPLOAD, Guard, Hosts
-from ctxval.web.service import CampaignService, Work
-
-_LISTENERS = 64
-"""Largest number of browsers that are kept up to date at a time."""
-
-_KINDS = ("recording", "distance", "failure")
+from ctxval.web.service import CampaignService
+from ctxval.web.state import PageState
 
 _TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
@@ -44,32 +39,21 @@ _OUT_OF_DATE = (
 Handler = Callable[[Request, str], Awaitable[Response]]
 
 
-class OperatorPage:
-    """The routes of the page.
+class PageRoutes:
+    """The routes of a page that shows a campaign, and takes nothing."""
 
-    Args:
-        service: the campaign.
-        access: who may use the page.
-    """
-
-    def __init__(self, service: CampaignService, access: Access) -> None:
-        self.service, self.access = service, access
-        self.page = Page(service)
-        self._listeners = 0
+    def __init__(self, state: PageState, access: Access) -> None:
+        self.state, self.access = state, access
+        self.page = Page(state)
 
     def routes(self) -> list[Route]:
         """Return all routes; every one but the static files and the entrance needs a session."""
-        inside = self._inside
         return [
             Route("/", self.start, methods=["GET"]),
             Route("/enter", self.enter, methods=["POST"]),
             Route("/static/{name}", static, methods=["GET"]),
-            Route("/choose", inside(self.choose), methods=["POST"]),
-            Route("/trials/{number:int}/{kind}", inside(self.tell), methods=["POST"]),
-            Route("/trials/{number:int}/files.zip", inside(self.archive), methods=["GET"]),
-            Route("/trials/{number:int}/files/{name}", inside(self.file), methods=["GET"]),
-            Route("/pictures/{name}.svg", inside(self.picture), methods=["GET"]),
-            Route("/events", inside(self.events), methods=["GET"]),
+            Route("/pictures/{name}.svg", self._inside(self.picture), methods=["GET"]),
+            Route("/events", self._inside(self.events), methods=["GET"]),
         ]
 
     # Entrance
@@ -131,6 +115,51 @@ class OperatorPage:
         assert session is not None
         return session, cookie
 
+    def _campaign(self, request: Request, session: str, problem: Problem | None = None) -> str:
+        replaces = problem is not None and "replace" in problem.fields
+        return self.page.campaign(
+            self.access.form_token(session),
+            problem=problem,
+            told=_number(request.query_params.get("told", "")),
+            replaced=request.path_params["number"] if replaces else _number(request.query_params.get("replace", "")),
+            all_="all" in request.query_params,
+        )
+
+    async def picture(self, request: Request, session: str) -> Response:
+        """Return a picture of the campaign."""
+        found = self.state.pictures.get(request.path_params["name"])
+        if not isinstance(found, bytes):
+            return HTMLResponse(self.page.message("No picture", "There is no such picture yet."), 404)
+        # A picture has styles of its own, and must not run anything if it is opened alone.
+        policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
+        return Response(found, media_type=_TYPES[".svg"], headers=policy)
+
+    async def events(self, request: Request, session: str) -> Response:
+        """Send an event for each change of the page."""
+        if self.state.listeners >= 64:
+            return Response("too many pages are open", 503, media_type="text/plain")
+        events = (_event(kind, content) async for kind, content in self.state.events())
+        return StreamingResponse(events, media_type="text/event-stream")
+
+
+class OperatorPage(PageRoutes):
+    """The routes of a page that also takes what operators do."""
+
+    def __init__(self, service: CampaignService, access: Access) -> None:
+        super().__init__(service, access)
+        self.service = service
+
+    def routes(self) -> list[Route]:
+        """Return the further routes, too."""
+        inside = self._inside
+        return [
+            *super().routes(),
+            Route("/choose", inside(self.choose), methods=["POST"]),
+            Route("/trials/{number:int}/{kind}", inside(self.tell), methods=["POST"]),
+            Route("/trials/{number:int}/files.zip", inside(self.file), methods=["GET"]),
+            Route("/trials/{number:int}/files/{name}", inside(self.file), methods=["GET"]),
+        ]
+
     # Forms
 
     async def choose(self, request: Request, session: str) -> Response:
@@ -151,23 +180,28 @@ class OperatorPage:
     async def tell(self, request: Request, session: str) -> Response:
         """Record the result of a trial."""
         number, kind = request.path_params["number"], request.path_params["kind"]
-        if kind not in _KINDS:
+        if kind not in ("recording", "distance", "failure"):
             return HTMLResponse(self.page.message("Not found", "There is no such page."), 404)
         fields: dict[str, str] = {}
         try:
             async with _form(request, max_files=1, max_fields=20, max_part_size=65_536) as form:
                 fields = _texts(form)
-                if not self.access.allows_form(session, fields.get("token", "")):
-                    where = self._where(number, kind, fields)
-                    return self._problem(request, session, Problem(where, _OUT_OF_DATE, fields, 403))
-                await self._tell(number, kind, form)
+                if self.access.allows_form(session, fields.get("token", "")):
+                    await self._tell(number, kind, form)
+                    return RedirectResponse(f"/?told={number}#message", 303)
+            sentence, status = _OUT_OF_DATE, 403
         except HTTPException as error:
-            sentence = f"the form cannot be read: {error.detail}"
-            problem = Problem(self._where(number, kind, fields), sentence, fields, error.status_code)
-            return self._problem(request, session, problem)
+            sentence, status = f"the form cannot be read: {error.detail}", error.status_code
         except CtxvalError as error:
-            return self._problem(request, session, self._not_told(number, kind, error, fields))
-        return RedirectResponse(f"/?told={number}#message", 303)
+            sentence, status = shortened(str(error)), 500 if isinstance(error, StoreError | CampaignError) else 422
+            ended = None if "replace" in fields else self.page.ended(number)
+            if ended is not None:
+                sentence, status = f"a result of this trial is recorded already: {ended}.", 409
+        # The problem is shown in its form, or at the top of the page if the form is not on it any more.
+        snapshot = self.service.snapshot
+        shown = [trial for trial in snapshot.trials if trial.told] if "replace" in fields else snapshot.waiting
+        where = f"{kind}-{number}" if any(trial.number == number for trial in shown) else "trial"
+        return self._problem(request, session, Problem(where, sentence, fields, status))
 
     async def _tell(self, number: int, kind: str, form: FormData) -> None:
         fields, upload = _texts(form), form.get("file")
@@ -177,91 +211,34 @@ class OperatorPage:
                 path = recording_in(folder, upload.filename)
                 path.write_bytes(await upload.read())
             try:
-                told: ToldResult = forms.result(kind, fields, path)
-                await self.service.tell(number, told, fields.get("submission", ""))
+                result = forms.result(kind, fields, path)
+                await self.service.tell(number, result, fields.get("submission", ""))
             except InputError as error:
                 # The operator knows the name of the file, not the folder in which it is read.
                 raise InputError(str(error).replace(f"{folder}/", "")) from error
 
-    def _not_told(self, number: int, kind: str, error: CtxvalError, fields: dict[str, str]) -> Problem:
-        """Return why a result was not recorded, at the form if that is still on the page."""
-        sentence = shortened(str(error))
-        ended = None if "replace" in fields else self.page.ended(number)
-        if ended is not None:
-            sentence = f"a result of this trial is recorded already: {ended}."
-        status = 409 if ended is not None else 500 if isinstance(error, StoreError | CampaignError) else 422
-        return Problem(self._where(number, kind, fields), sentence, fields, status)
-
-    def _where(self, number: int, kind: str, fields: dict[str, str]) -> str:
-        """Return the form in which a problem is shown; if it is not on the page any more, the top of the page."""
-        snapshot = self.service.snapshot
-        shown = [trial for trial in snapshot.trials if trial.told] if "replace" in fields else snapshot.waiting
-        return f"{kind}-{number}" if any(trial.number == number for trial in shown) else "trial"
-
-    def _campaign(self, request: Request, session: str, problem: Problem | None = None) -> str:
-        replaces = problem is not None and "replace" in problem.fields
-        return self.page.campaign(
-            self.access.form_token(session),
-            problem=problem,
-            told=_number(request.query_params.get("told", "")),
-            replaced=request.path_params["number"] if replaces else _number(request.query_params.get("replace", "")),
-            all_="all" in request.query_params,
-        )
-
     def _problem(self, request: Request, session: str, problem: Problem) -> Response:
         return HTMLResponse(self._campaign(request, session, problem), problem.status)
 
-    # Files and pictures
+    # Files
 
     async def file(self, request: Request, session: str) -> Response:
-        """Return one file of an open trial."""
-        number, name = request.path_params["number"], request.path_params["name"]
+        """Return one file of an open trial, or all of them in one archive."""
+        number, name = request.path_params["number"], request.path_params.get("name")
         try:
-            found = await self.service.files(number)
+            files = await self.service.files_of(number)
         except CtxvalError as error:
             return HTMLResponse(self.page.message("No file", str(error)), 404)
-        if name not in found:
-            sentence = f"There is no file {visible(name)[:80]} of trial {number}; there are {', '.join(found)}."
+        if name is None:
+            content = io.BytesIO()
+            with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+                for each, data in files.items():
+                    archive.writestr(f"trial-{number}/{each}", data)
+            return _download(content.getvalue(), f"trial-{number}.zip")
+        if name not in files:
+            sentence = f"There is no file {visible(name)[:80]} of trial {number}; there are {', '.join(files)}."
             return HTMLResponse(self.page.message("No file", sentence), 404)
-        return _download(found[name], f"trial-{number}-{name}")
-
-    async def archive(self, request: Request, session: str) -> Response:
-        """Return all files of an open trial in one archive."""
-        number = request.path_params["number"]
-        try:
-            found = await self.service.files(number)
-        except CtxvalError as error:
-            return HTMLResponse(self.page.message("No file", str(error)), 404)
-        content = io.BytesIO()
-        with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, data in found.items():
-                archive.writestr(f"trial-{number}/{name}", data)
-        return _download(content.getvalue(), f"trial-{number}.zip")
-
-    async def picture(self, request: Request, session: str) -> Response:
-        """Return a picture of the campaign."""
-        found = self.service.background.pictures.images.get(request.path_params["name"])
-        if found is None:
-            return HTMLResponse(self.page.message("No picture", "There is no such picture yet."), 404)
-        # A picture has styles of its own, and must not run anything if it is opened alone.
-        policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
-        return Response(found, media_type=_TYPES[".svg"], headers=policy)
-
-    # Live
-
-    async def events(self, request: Request, session: str) -> Response:
-        """Send an event for each change of the page."""
-        if self._listeners >= _LISTENERS:
-            return Response("too many pages are open", 503, media_type="text/plain")
-        return StreamingResponse(self._events(), media_type="text/event-stream")
-
-    async def _events(self) -> AsyncIterator[str]:
-        self._listeners += 1
-        try:
-            async for kind, content in self.service.events():
-                yield _event(kind, content)
-        finally:
-            self._listeners -= 1
+        return _download(files[name], f"trial-{number}-{name}")
 
 
 def _number(text: str) -> int | None:
@@ -272,12 +249,11 @@ def _event(kind: str, content: Any) -> str:
     if kind == "heartbeat":
         return ": the server is there\n\n"
     if kind == "work":
-        content = {name: _plain(work) for name, work in content.items()}
+        content = {
+            name: {"text": work.text, "done": work.stage.done, "expected": work.stage.expected, "seconds": work.seconds}
+            for name, work in content.items()
+        }
     return f"event: {kind}\ndata: {json.dumps(content)}\n\n"
-
-
-def _plain(work: Work) -> dict[str, Any]:
-    return {"text": work.text, "done": work.stage.done, "expected": work.stage.expected, "seconds": work.seconds}
 
 
 @contextlib.asynccontextmanager
@@ -311,15 +287,16 @@ async def static(request: Request) -> Response:
     return Response(_STATIC[name], media_type=_TYPES[name[name.rindex(".") :]], headers=headers)
 
 
-def application(service: CampaignService, access: Access, hosts: Hosts, most: int = MOST_UPLOAD) -> Guard:
+def application(state: PageState, access: Access, hosts: Hosts, most: int = MOST_UPLOAD) -> Guard:
     """Return the ASGI application of a campaign."""
 
     @contextlib.asynccontextmanager
     async def running(app: Starlette) -> AsyncIterator[None]:
-        await service.start()
+        await state.start()
         try:
             yield
         finally:
-            await service.stop()
+            await state.stop()
 
-    return Guard(Starlette(routes=OperatorPage(service, access).routes(), lifespan=running), hosts, access, most)
+    page = OperatorPage(state, access) if isinstance(state, CampaignService) else PageRoutes(state, access)
+    return Guard(Starlette(routes=page.routes(), lifespan=running), hosts, access, most)

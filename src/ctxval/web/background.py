@@ -23,14 +23,7 @@ from ctxval.web.served import OpenCampaign, ServedCampaign
 
 @dataclass(frozen=True)
 class Stage:
-    """What a background process does at present.
-
-    Attributes:
-        text: the work, as the beginning of a sentence.
-        done: how much of it is done.
-        expected: how much there will be in all; None if it is not known.
-        unit: what is counted, such as "designs".
-    """
+    """What is done at present: the beginning of a sentence, and how much of it; expected is None if not known."""
 
     text: str
     done: float = 0.0
@@ -63,10 +56,7 @@ class BackgroundProcess:
         self._closed = False
 
     def submit(self, job: Job, *arguments: Any) -> cf.Future[Any]:
-        """Do a job after the earlier ones; return its future result.
-
-        The future raises a CampaignError if the job fails or the process ends.
-        """
+        """Do a job after the earlier ones; its future raises a CampaignError if the job fails or the process ends."""
         return self._thread.submit(self._do, job, arguments)
 
     def close(self) -> None:
@@ -139,7 +129,7 @@ def _serve(pipe: Connection, open_campaign: OpenCampaign) -> None:
                 if served is None:
                     pipe.send(("stage", Stage("loading the experiment")))
                     served = open_campaign()
-                tell = _Teller(pipe)
+                tell = StageSender(lambda stage: pipe.send(("stage", stage)))
                 with listening(tell.hear):
                     reply = "done", job(served, tell, *arguments)
             except CtxvalError as error:
@@ -149,23 +139,27 @@ def _serve(pipe: Connection, open_campaign: OpenCampaign) -> None:
             pipe.send(reply)
 
 
-_INTERVAL = 0.2
-"""Least number of seconds between two messages that only count."""
+class StageSender:
+    """Sends stages to somebody, and not too many of them."""
 
-
-class _Teller:
-    """Sends stages through a pipe, and not too many of them."""
-
-    def __init__(self, pipe: Connection) -> None:
-        self._pipe, self._text, self._at = pipe, "", 0.0
+    def __init__(self, send: TellStage) -> None:
+        self._send, self._text, self._at = send, "", 0.0
+        self._running: dict[int, Progress] = {}
 
     def __call__(self, stage: Stage) -> None:
+        """Send a stage, unless it only counts and was sent a moment ago."""
         now = time.monotonic()
-        if stage.text != self._text or now - self._at >= _INTERVAL:
+        # Least number of seconds between two messages that only count.
+        if stage.text != self._text or now - self._at >= 0.2:
             self._text, self._at = stage.text, now
-            self._pipe.send(("stage", stage))
+            self._send(stage)
 
     def hear(self, progress: Progress) -> None:
-        """Send a report of long work as a stage."""
-        if not progress.ended:
-            self(Stage(progress.stage, progress.done, progress.expected, progress.unit))
+        """Send the innermost stage of long work."""
+        if progress.ended:
+            self._running.pop(progress.depth, None)
+        else:
+            self._running[progress.depth] = progress
+        if self._running:
+            innermost = self._running[max(self._running)]
+            self(Stage(innermost.stage, innermost.done, innermost.expected, innermost.unit))

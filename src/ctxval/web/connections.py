@@ -30,8 +30,8 @@ class Waiting:
         self.remove(connection)
         self._ends[connection] = connection.loop.call_later(SECONDS, connection.transport.abort)
         if len(self._ends) > MOST:
-            ((busiest, _),) = Counter(one.address for one in self._ends).most_common(1)
-            oldest = next(one for one in self._ends if one.address == busiest)
+            ((busiest, _),) = Counter(waiting.address for waiting in self._ends).most_common(1)
+            oldest = next(waiting for waiting in self._ends if waiting.address == busiest)
             self.remove(oldest)
             oldest.transport.abort()
 

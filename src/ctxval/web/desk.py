@@ -5,111 +5,33 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures as cf
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from ctxval._util.texts import reason_of
-from ctxval.campaign.interval_search import require_decisive
 from ctxval.campaign.telling import ToldResult, tell_result
 from ctxval.core.labels import labels_of
-from ctxval.core.space import TaskSpace
-from ctxval.core.task import Task
 from ctxval.core.trial import Trial
-from ctxval.errors import CampaignError, CtxvalError, DistanceError, InputError
-from ctxval.web.served import OpenCampaign, ServedCampaign
+from ctxval.errors import CampaignError, CtxvalError, DistanceError
+from ctxval.web.served import OpenCampaign, OpenTask, Snapshot
 
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True, eq=False)
-class Description:
-    """What does not change while a campaign is served.
-
-    Attributes:
-        name: the name of the experiment.
-        store: the name of the file of the store.
-        space: the task space.
-        units: the units of the distance.
-        threshold: tau; None if there is none.
-        budget: the number of executions that are planned.
-        decides: whether executions can be chosen that decide the verdict.
-    """
-
-    name: str
-    store: str
-    space: TaskSpace
-    units: str
-    threshold: float | None
-    budget: int
-    decides: bool
-
-
-@dataclass(frozen=True, eq=False)
-class OpenTask:
-    """What an operator must know of an open trial before its execution.
-
-    Attributes:
-        start: the initial state, with names and units.
-        horizon: the number of steps.
-        dt: the length of a step, seconds.
-    """
-
-    start: tuple[tuple[str, float], ...]
-    horizon: int
-    dt: float
-
-
-@dataclass(frozen=True, eq=False)
-class Snapshot:
-    """The trials of the store at one moment.
-
-    Attributes:
-        signature: identifies the state of the store.
-        trials: all trials in the order of asking.
-        tasks: the tasks of the open trials, by the number of the trial.
-        executions: the number of executions that have ended.
-        worst: the trial with the largest distance; None if no distance is known.
-    """
-
-    signature: tuple[int, int, int]
-    trials: tuple[Trial, ...]
-    tasks: dict[int, OpenTask]
-    executions: int
-    worst: Trial | None
-
-    @property
-    def ended(self) -> tuple[int, int]:
-        """Identifies the trials that have ended, which are those that a verdict is about."""
-        total, waiting, changes = self.signature
-        return total - waiting, changes
-
-    @property
-    def waiting(self) -> list[Trial]:
-        """The open trials, which people execute, or which a program is executing."""
-        return [trial for trial in self.trials if trial.state == "open"]
 
 
 class Desk:
     """The only user of the server's own campaign: everything runs in its thread, one thing at a time.
 
     Nothing here takes long. Choosing, judging and drawing are jobs of background processes.
-
-    Args:
-        open_campaign: opens the campaign; it is called in the thread.
-
-    Raises:
-        CtxvalError: if the campaign cannot be opened.
     """
 
     def __init__(self, open_campaign: OpenCampaign) -> None:
         self._thread = cf.ThreadPoolExecutor(1, "campaign")
         self._closed = False
         try:
-            self._served: ServedCampaign = self._thread.submit(open_campaign).result()
-            self.description = self._thread.submit(self._describe).result()
+            self._served = self._thread.submit(open_campaign).result()
+            self.description = self._thread.submit(self._served.description).result()
             self.first = self._thread.submit(self._snapshot).result()
         except BaseException:
             self._thread.shutdown()
@@ -123,9 +45,9 @@ class Desk:
         """Return what identifies the present state of the store."""
         return await self._in_thread(lambda: self._served.campaign.store.signature())
 
-    async def tell(self, number: int, told: ToldResult) -> Trial:
+    async def tell(self, number: int, result: ToldResult) -> Trial:
         """Check and store the result of an open trial; return the trial, which may be unmeasured."""
-        return await self._in_thread(lambda: self._tell(number, told))
+        return await self._in_thread(lambda: self._tell(number, result))
 
     def close(self) -> None:
         """Close the store after the present work; a second call does nothing."""
@@ -135,71 +57,43 @@ class Desk:
             self._thread.shutdown()
 
     async def _in_thread(self, function: Callable[[], Result]) -> Result:
-        return await asyncio.get_running_loop().run_in_executor(self._thread, _guarded(function))
+        """Call a function in the thread; errors of users' code become errors of ctxval."""
+
+        def guarded() -> Result:
+            try:
+                return function()
+            except CtxvalError:
+                raise
+            except Exception as error:
+                raise CampaignError(f"{reason_of(error)}.") from error
+
+        return await asyncio.get_running_loop().run_in_executor(self._thread, guarded)
 
     # In the thread of the campaign
-
-    def _describe(self) -> Description:
-        campaign, experiment = self._served.campaign, self._served.experiment
-        path = campaign.store.path
-        return Description(
-            experiment.name,
-            "a store in memory" if path is None else path.name,
-            campaign.validation.space,
-            experiment.units,
-            self._served.threshold,
-            self._served.budget,
-            self._decides(),
-        )
-
-    def _decides(self) -> bool:
-        if self._served.threshold is None:
-            return False
-        try:
-            require_decisive(self._served.certificate)
-        except InputError:
-            return False
-        return True
 
     def _snapshot(self) -> Snapshot:
         campaign = self._served.campaign
         campaign.refresh()
-        trials = campaign.trials
-        # The trials were read after this process's last change, so the counts below are those of the trials.
-        signature = (len(trials), sum(trial.state == "open" for trial in trials), campaign.store.signature()[2])
-        tasks = {trial.number: self._task(trial) for trial in trials if trial.state == "open"}
-        return Snapshot(signature, trials, tasks, campaign.executions, campaign.worst)
+        # The trials were read after this process's last change, so their counts are those of the signature.
+        tasks = {trial.number: self._task(trial) for trial in campaign.trials if trial.state == "open"}
+        return self._served.snapshot(tasks, campaign.store.signature()[2])
 
     def _task(self, trial: Trial) -> OpenTask:
         validation = self._served.campaign.validation
-        task: Task = validation.task(validation.space.parameters(validation.space.point(trial.parameters)))
+        task = validation.task(validation.space.parameters(validation.space.point(trial.parameters)))
         start = np.atleast_1d(task.initial_state)
         states, _ = self._served.experiment.names(start.size, 0)
         return OpenTask(tuple(zip(labels_of(states), start.tolist(), strict=True)), task.horizon, task.dt)
 
-    def _tell(self, number: int, told: ToldResult) -> Trial:
+    def _tell(self, number: int, result: ToldResult) -> Trial:
         campaign = self._served.campaign
         try:
-            return tell_result(campaign, self._served.experiment, number, told)
+            return tell_result(campaign, self._served.experiment, number, result)
         except DistanceError:
-            ended = campaign.trials[number]
-            if ended.state != "unmeasured":
+            trial = campaign.trials[number]
+            if trial.state != "unmeasured":
                 raise
-            return ended
-
-
-def _guarded(function: Callable[[], Result]) -> Callable[[], Result]:
-    """Return a function that raises errors of ctxval alone, also if users' code raises anything else."""
-
-    def guarded() -> Result:
-        try:
-            return function()
-        except CtxvalError:
-            raise
-        except Exception as error:
-            raise CampaignError(f"{reason_of(error)}.") from error
-
-    return guarded
+            return trial
 
 
 def recording_in(folder: str, name: str) -> Path:

@@ -23,7 +23,7 @@ Fields = Mapping[str, str]
 
 def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
     """Return what an operator asks for."""
-    seen = _whole(fields, "seen", "the number of trials on the page")
+    seen = _read(fields, "seen", "the number of trials on the page must be a whole number", int)
     match fields.get("how"):
         case "next":
             return TaskRequest(trials=seen)
@@ -38,7 +38,7 @@ def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
             space.point(parameters)
             return TaskRequest(parameters, trials=seen)
         case "again":
-            number = _whole(fields, "trial", "the trial")
+            number = _read(fields, "trial", "the trial must be a whole number", int)
             return TaskRequest(again=number, because=fields.get("because", "").strip() or None, trials=seen)
     raise InputError("choose how the next task is to be found.")
 
@@ -65,17 +65,12 @@ def _number(fields: Fields, field: str, name: str) -> float:
     return _read(fields, field, f"{name} must be a number", float)
 
 
-def _whole(fields: Fields, field: str, name: str) -> int:
-    return _read(fields, field, f"{name} must be a whole number", int)
-
-
 def _read(fields: Fields, field: str, sentence: str, kind: Callable[[str], Number]) -> Number:
     given = fields.get(field, "").strip()
     try:
         value = kind(given)
-        finite = math.isfinite(value)
+        if math.isfinite(value):
+            return value
     except (ValueError, OverflowError):  # a whole number may be too large for a float
-        finite = False
-    if not finite:
-        raise InputError(f"{sentence}, got {given[:60]!r}.")
-    return value
+        pass
+    raise InputError(f"{sentence}, got {given[:60]!r}.")

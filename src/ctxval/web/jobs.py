@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import tempfile
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +13,8 @@ from ctxval._util.texts import reason_of
 from ctxval.campaign.by_hand import write_files
 from ctxval.campaign.choices import OpenTrial
 from ctxval.campaign.telling import parameters_of_trial
-from ctxval.certificates import Certificate, Verdict
+from ctxval.certificates import Verdict
 from ctxval.certificates import judge as judge_trials
-from ctxval.certificates.bounds import with_error
 from ctxval.core.labels import labels_of
 from ctxval.errors import InputError
 from ctxval.plot import overview, worst_trajectories
@@ -25,11 +24,12 @@ from ctxval.web.served import ServedCampaign
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_WAIT = 60.0
-"""Seconds to wait for another process that chooses a task or runs the store."""
-
 Files = dict[str, bytes]
 """The files of a trial by name."""
+
+
+Pictures = dict[str, bytes | str]
+"""Pictures by name as SVG; a text says why a picture is missing."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,6 @@ class TaskRequest:
     """What the operator asks for: by default, the task that the search chooses.
 
     Attributes:
-        parameters: the parameters of a task that the operator chooses.
         again: the number of an earlier trial whose task is executed again.
         because: what was changed since that trial.
         draw: whether the task is an independent draw, for an audit.
@@ -52,41 +51,13 @@ class TaskRequest:
     trials: int | None = None
     decides: bool = False
 
-
-@dataclass(frozen=True, eq=False)
-class Judgement:
-    """A verdict and its certificate as texts.
-
-    Attributes:
-        answer: validated, falsified, undecided; empty if there is no threshold.
-        reason: why, in one sentence.
-        rests_on: what a validation rests on, in one sentence; None if there is none.
-        bound: the upper bound with its confidence; None if there is none.
-        withdrawn: why the bound is withdrawn; None if it is not.
-        statement: what the certificate states; None if there is none.
-        assumptions: what the certificate assumes.
-    """
-
-    answer: str
-    reason: str
-    rests_on: str | None = None
-    bound: str | None = None
-    withdrawn: str | None = None
-    statement: str | None = None
-    assumptions: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class Pictures:
-    """Pictures of the campaign as SVG.
-
-    Attributes:
-        images: the pictures by name.
-        missing: why a picture is missing, by name.
-    """
-
-    images: dict[str, bytes] = field(default_factory=dict)
-    missing: dict[str, str] = field(default_factory=dict)
+    def require_current(self, trials: int) -> None:
+        """Refuse a request if another task was opened since the operator looked."""
+        if self.trials is not None and self.trials != trials:
+            raise InputError(
+                f"another task was opened since this page was loaded, as trial {trials - 1}. If you need one more "
+                "task, ask again."
+            )
 
 
 def warm_up(served: ServedCampaign, tell: TellStage) -> None:
@@ -96,29 +67,21 @@ def warm_up(served: ServedCampaign, tell: TellStage) -> None:
 def choose(served: ServedCampaign, tell: TellStage, request: TaskRequest) -> tuple[int, Files] | None:
     """Open the next trial; return its number and its files. None: the verdict is reached or the budget is spent."""
     tell(Stage("choosing a task"))
-    opened = _ask(served, request)
-    return None if opened is None else (opened.number, _files(served, opened))
-
-
-def _ask(served: ServedCampaign, request: TaskRequest) -> OpenTrial | None:
     campaign = served.campaign
-    with campaign.store.sole_writer(_WAIT):
+    with campaign.store.sole_writer(60.0):
         campaign.refresh()
-        if request.trials is not None and request.trials != len(campaign.trials):
-            raise InputError(
-                f"another task was opened since this page was loaded, as trial {len(campaign.trials) - 1}. If you need "
-                "one more task, ask again."
-            )
+        request.require_current(len(campaign.trials))
         if request.decides:
             if served.threshold is None:
                 raise InputError(
                     "there is no threshold, so no task decides a verdict: start the server with --threshold."
                 )
-            return campaign.ask_for_verdict(served.threshold, served.budget, certificate=served.certificate)
-        parameters = request.parameters
-        if request.again is not None:
-            parameters = parameters_of_trial(campaign, request.again)
-        return campaign.ask(parameters, draw=request.draw, because=request.because)
+            opened = campaign.ask_for_verdict(served.threshold, served.budget, certificate=served.certificate)
+        else:
+            again = request.again
+            parameters = request.parameters if again is None else parameters_of_trial(campaign, again)
+            opened = campaign.ask(parameters, draw=request.draw, because=request.because)
+    return None if opened is None else (opened.number, _files(served, opened))
 
 
 def files_of(served: ServedCampaign, tell: TellStage, number: int) -> Files:
@@ -133,7 +96,7 @@ def _files(served: ServedCampaign, opened: OpenTrial) -> Files:
         return {name: (Path(folder) / "trial" / name).read_bytes() for name in names}
 
 
-def judge(served: ServedCampaign, tell: TellStage) -> Judgement | None:
+def judge(served: ServedCampaign, tell: TellStage) -> Verdict | None:
     """Return the verdict on the trials that have ended; None if there is no threshold.
 
     A certificate refuses open trials, because somebody may have left open what failed. At a rig a trial is nearly
@@ -144,58 +107,40 @@ def judge(served: ServedCampaign, tell: TellStage) -> Judgement | None:
     tell(Stage("computing the verdict"))
     served.campaign.refresh()
     ended = [trial for trial in served.campaign.trials if trial.state != "open"]
-    verdict = judge_trials(ended, served.threshold, served.certificate, served.campaign.provenance)
-    return _judgement(verdict, verdict.certificate, served.experiment.units)
-
-
-def _judgement(verdict: Verdict, certificate: Certificate | None, units: str) -> Judgement:
-    if certificate is None:
-        return Judgement(verdict.answer, verdict.reason, verdict.rests_on)
-    bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
-    return Judgement(
-        verdict.answer,
-        verdict.reason,
-        verdict.rests_on,
-        f"{bound}, with confidence {certificate.confidence:g}",
-        certificate.doubt,
-        certificate.statement,
-        certificate.assumptions,
-    )
+    return judge_trials(ended, served.threshold, served.certificate, served.campaign.provenance)
 
 
 def draw(served: ServedCampaign, tell: TellStage) -> Pictures:
     """Return the pictures of the present trials."""
     tell(Stage("drawing the pictures"))
     served.campaign.refresh()
-    pictures = Pictures()
-    if served.campaign.completed:
-        _draw(pictures, "distance", lambda: _distance_picture(served))
-        _draw(pictures, "worst", lambda: _worst_picture(served))
-    return pictures
+    return pictures_of(served)
 
 
-def _draw(pictures: Pictures, name: str, make: Callable[[], Figure]) -> None:
+def pictures_of(served: ServedCampaign) -> Pictures:
+    """Return the pictures of the trials that the campaign knows."""
     import matplotlib
 
-    # Names of parameters may contain a $, which is not mathematics; a stated id makes equal pictures equal files.
-    try:
-        with matplotlib.rc_context({"text.parse_math": False, "svg.hashsalt": "ctxval"}):
-            content = io.BytesIO()
-            make().savefig(content, format="svg", metadata={"Date": None})
-    except Exception as error:  # a picture must not hide the verdict
-        pictures.missing[name] = reason_of(error)
-    else:
-        pictures.images[name] = content.getvalue()
+    if not served.campaign.completed:
+        return {}
+    pictures: Pictures = {}
+    for name, figure in (("distance", _distance_picture), ("worst", _worst_picture)):
+        # Names of parameters may contain a $, which is not mathematics; a stated id makes equal pictures equal files.
+        try:
+            with matplotlib.rc_context({"text.parse_math": False, "svg.hashsalt": "ctxval"}):
+                content = io.BytesIO()
+                figure(served).savefig(content, format="svg", metadata={"Date": None})
+            pictures[name] = content.getvalue()
+        except Exception as error:  # a picture must not hide the verdict
+            pictures[name] = reason_of(error)
+    return pictures
 
 
 def _distance_picture(served: ServedCampaign) -> Figure:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    axes = overview(served.campaign, units=served.experiment.units, ax=figure.add_subplot())
-    if served.threshold is not None:
-        axes.axhline(served.threshold, color="#000000", linestyle="-.", linewidth=1.4, label="threshold")
-        axes.legend(loc="best", fontsize=8, framealpha=0.9)
+    overview(served.campaign, units=served.experiment.units, threshold=served.threshold, ax=figure.add_subplot())
     return figure
 
 

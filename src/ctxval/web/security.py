@@ -21,12 +21,6 @@ from ctxval.web.access import Access
 MOST_UPLOAD = 64 * 2**20
 """Largest size of a recording in bytes."""
 
-_MOST_FORM, _MOST_OF_STRANGER = 2**18, 2**12
-"""Largest size of any other form in bytes, and of a request without a session."""
-
-_SECONDS = 30.0
-"""Largest time in seconds without a further part of a body."""
-
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; form-action 'self'; "
     "base-uri 'none'; frame-ancestors 'none'"
@@ -44,11 +38,6 @@ HEADERS = {
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
     "Cache-Control": "no-store",
 }
-
-_LONGEST_PATH = 500
-"""Largest number of characters of an address without its query."""
-
-_SAFE = ("GET", "HEAD")
 
 
 @dataclass(frozen=True)
@@ -109,7 +98,7 @@ def refusal(method: str, headers: Headers, hosts: Hosts) -> str | None:
             "--allow-host NAME."
         )
     site = headers.get("sec-fetch-site", "same-origin" if headers.get("origin") else "")
-    if method in _SAFE:
+    if method in ("GET", "HEAD"):
         followed_link = headers.get("sec-fetch-mode") == "navigate" and headers.get("sec-fetch-dest") == "document"
         elsewhere = site in ("cross-site", "same-site") and not followed_link
         return "Other sites cannot use this page." if elsewhere else None
@@ -122,15 +111,7 @@ def refusal(method: str, headers: Headers, hosts: Hosts) -> str | None:
 
 
 class _Body:
-    """Receives a body of a limited size, of which parts arrive in limited time.
-
-    Args:
-        receive: receives the next part.
-        most: largest size in bytes.
-
-    Attributes:
-        refused: the status and the sentence of the response, if the body has more bytes or takes too long.
-    """
+    """Receives a body of a limited size, of which parts arrive in limited time."""
 
     def __init__(self, receive: Receive, most: int) -> None:
         self.receive, self.most = receive, most
@@ -146,7 +127,7 @@ class _Body:
 
     async def __call__(self) -> Message:
         try:
-            async with asyncio.timeout(None if self.whole else _SECONDS):
+            async with asyncio.timeout(None if self.whole else 30.0):
                 message = await self.receive()
         except TimeoutError:
             self.refused = 408, "The request arrives too slowly. Nothing is stored."
@@ -158,14 +139,7 @@ class _Body:
 
 
 class Guard:
-    """Refuses requests before the application reads them, and adds the security headers to every response.
-
-    Args:
-        app: the application.
-        hosts: the names of this server.
-        access: who may use the page.
-        most: largest size of a recording in bytes. It is counted as the body arrives.
-    """
+    """Refuses requests before the application reads them, and adds the security headers to every response."""
 
     def __init__(self, app: ASGIApp, hosts: Hosts, access: Access, most: int = MOST_UPLOAD) -> None:
         self.app, self.hosts, self.access, self.most = app, hosts, access, most
@@ -177,11 +151,18 @@ class Guard:
             await (self.app(scope, receive, send) if scope["type"] == "lifespan" else send({"type": "websocket.close"}))
             return
         headers = Headers(scope=scope)
-        guarded = _with_headers(send)
+
+        async def guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                stated = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    stated.setdefault(name, value)
+            await send(message)
+
         reason = refusal(scope["method"], headers, self.hosts)
-        if reason is not None or len(scope["path"]) > _LONGEST_PATH:
-            status, said = (403, reason) if reason is not None else (414, "The address is too long.")
-            await _refused(status, said)(scope, receive, guarded)
+        if reason is not None or len(scope["path"]) > 500:
+            response = _refused(414, "The address is too long.") if reason is None else _refused(403, reason)
+            await response(scope, receive, guarded)
             return
         body = _Body(receive, self._most(scope))
 
@@ -202,8 +183,8 @@ class Guard:
         if known and (connection := scope.get("state", {}).get("connection")) is not None:
             connection.waiting.remove(connection)
         if scope["path"] == "/enter" or not (known or not self.access.needs_token):
-            return _MOST_OF_STRANGER
-        return self.most if scope["path"].endswith("/recording") else min(self.most, _MOST_FORM)
+            return 2**12
+        return self.most if scope["path"].endswith("/recording") else min(self.most, 2**18)
 
 
 def _refused(status: int, sentence: str) -> HTMLResponse:
@@ -213,14 +194,3 @@ def _refused(status: int, sentence: str) -> HTMLResponse:
         f'<body><main><h1>Refused</h1><p>{escape(sentence)}</p><p><a href="/">To the page</a></p></main></body></html>'
     )
     return HTMLResponse(page, status, {"Connection": "close"})
-
-
-def _with_headers(send: Send) -> Send:
-    async def sending(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            headers = MutableHeaders(scope=message)
-            for name, value in HEADERS.items():
-                headers.setdefault(name, value)
-        await send(message)
-
-    return sending

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import FrameType
@@ -18,12 +19,11 @@ from ctxval.web.access import Access, new_token
 from ctxval.web.app import application
 from ctxval.web.connections import Connection, Waiting
 from ctxval.web.desk import Desk
+from ctxval.web.live import LiveCampaign
 from ctxval.web.security import Hosts, is_loopback
 from ctxval.web.served import OpenCampaign
 from ctxval.web.service import CampaignService
-
-_CONNECTIONS = 256
-"""Largest number of requests and open pages at a time."""
+from ctxval.web.state import PageState
 
 
 @dataclass(frozen=True, repr=False)
@@ -61,27 +61,49 @@ def serve(
         on_start: called with the address of the page and its token, if it has one, before the first request.
     """
     with contextlib.closing(listening(address.host, address.port)) as listener:
-        port = listener.getsockname()[1]
         token = address.token if address.token is not None or is_loopback(address.host) else new_token()
-        access, hosts = Access(token, port), Hosts.of(address.host, address.names)
+        access = Access(token, listener.getsockname()[1])
         service = CampaignService(Desk(open_campaign), reopen)
-        config = uvicorn.Config(
-            application(service, access, hosts),
-            log_level="error",  # whoever sends nonsense must not fill the terminal
-            access_log=False,  # an address may contain the token
-            server_header=False,
-            proxy_headers=False,
-            limit_concurrency=_CONNECTIONS,
-            timeout_graceful_shutdown=5,
-            lifespan="on",
-            http=partial(Connection, Waiting()),  # type: ignore[arg-type]
-            ws="none",
-        )
-        on_start(page_address(address.host, port), token)
+        server = _server(service, access, Hosts.of(address.host, address.names))
+        on_start(page_address(address.host, listener.getsockname()[1]), token)
         try:
-            _Server(config, service.end_events).run(sockets=[listener])
+            server.run(sockets=[listener])
         finally:
             service.close()  # a second Ctrl-C skips the end of the application
+
+
+@contextlib.contextmanager
+def showing(live: LiveCampaign) -> Iterator[str]:
+    """Serve the page of a campaign at this computer while this process executes it; yield the address of the page."""
+    host = "127.0.0.1"
+    with contextlib.closing(listening(host, 0)) as listener:
+        port = listener.getsockname()[1]
+        server = _server(live, Access(None, port), Hosts.of(host))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+        thread.start()
+        try:
+            live.started.wait(10)
+            yield page_address(host, port)
+            live.wait_until_seen()
+        finally:
+            server.end()
+            thread.join()
+
+
+def _server(state: PageState, access: Access, hosts: Hosts) -> _Server:
+    config = uvicorn.Config(
+        application(state, access, hosts),
+        log_level="error",  # whoever sends nonsense must not fill the terminal
+        access_log=False,  # an address may contain the token
+        server_header=False,
+        proxy_headers=False,
+        limit_concurrency=256,  # requests and open pages
+        timeout_graceful_shutdown=5,
+        lifespan="on",
+        http=partial(Connection, Waiting()),  # type: ignore[arg-type]
+        ws="none",
+    )
+    return _Server(config, state.end_events)
 
 
 class _Server(uvicorn.Server):
@@ -96,8 +118,13 @@ class _Server(uvicorn.Server):
         await super().serve(sockets)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        super().handle_exit(sig, frame)  # which asks whether the end has begun already
+        self.end()
+
+    def end(self) -> None:
+        """End the server; any thread may call this."""
         self._loop.call_soon_threadsafe(self._end_events)
-        super().handle_exit(sig, frame)
+        self.should_exit = True
 
 
 def listening(host: str, port: int) -> socket.socket:
@@ -105,8 +132,8 @@ def listening(host: str, port: int) -> socket.socket:
     if not 0 <= port <= 65535:
         raise InputError(f"the port must be from 0 to 65535, got {port}.")
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        return socket.create_server(found[4][:2], family=found[0], backlog=128)
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        return socket.create_server(address[:2], family=family, backlog=128)
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"the page cannot be served at {host}, port {port}: {reason}.") from error

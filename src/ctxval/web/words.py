@@ -31,34 +31,22 @@ _SEARCHES = {
 def why(trial: Trial, units: str) -> list[str]:
     """Return sentences on the reason why the task of a trial was chosen, and on the prediction of its execution."""
     note = trial.note or {}
-    found = [_reason(trial, note, units)]
-    if isinstance(note.get("why"), str) and note.get("how") != "initial":
-        found.append(f"The search does not use the prediction of the learned dynamics: {text(note['why'])}.")
-    if trial.because is not None:
-        found.append(f"Since the last execution of this task: {text(trial.because)}.")
-    prediction = _prediction(note)
-    if prediction is not None:
-        median, upper = (f"{number(one)} {text(units)}".rstrip() for one in (prediction.median, prediction.upper))
-        if math.isfinite(prediction.median):
-            found.append(f"Predicted distance: {median}; below {upper} with probability 0.95.")
-    return found
-
-
-def _reason(trial: Trial, note: Mapping[str, Any], units: str) -> str:
-    expected = note.get("expected")
+    sentences, expected = [_ORIGINS[trial.origin]], note.get("expected")
     if trial.origin == "acquisition" and isinstance(expected, int | float) and abs(expected) < math.inf:
-        return (
-            f"The search expects a distance of {number(expected)} {text(units)}".rstrip()
-            + " here, the largest in the region that it examines."
-        )
-    if trial.origin in ("acquisition", "initial"):
-        return _SEARCHES.get(str(note.get("how")), _ORIGINS[trial.origin])
-    return _ORIGINS[trial.origin]
-
-
-def _prediction(note: Mapping[str, Any]) -> ExecutionPrediction | None:
+        distance = f"{number(expected)} {text(units)}".rstrip()
+        sentences = [f"The search expects a distance of {distance} here, the largest in the region that it examines."]
+    elif trial.origin in ("acquisition", "initial"):
+        sentences = [_SEARCHES.get(str(note.get("how")), _ORIGINS[trial.origin])]
+    if isinstance(note.get("why"), str) and note.get("how") != "initial":
+        sentences.append(f"The search does not use the prediction of the learned dynamics: {text(note['why'])}.")
+    if trial.because is not None:
+        sentences.append(f"Since the last execution of this task: {text(trial.because)}.")
     stored = note.get(PREDICTION)
-    return ExecutionPrediction.from_json(stored) if isinstance(stored, dict) else None
+    prediction = ExecutionPrediction.from_json(stored) if isinstance(stored, dict) else None
+    if prediction is not None and math.isfinite(prediction.median):
+        median, upper = (f"{number(value)} {text(units)}".rstrip() for value in (prediction.median, prediction.upper))
+        sentences.append(f"Predicted distance: {median}; below {upper} with probability 0.95.")
+    return sentences
 
 
 def text(value: object, longest: int = 400) -> str:

@@ -1,17 +1,22 @@
-"""The table ``[certificate]`` of an experiment file, and the options of the command line that override it."""
+"""The tables ``[certificate]``, ``[search]`` and ``[aspect1]`` of an experiment file."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from ctxval.aspect1 import TASKS
 from ctxval.certificates import KINDS, RESOLUTION, CertificateKind, CertificateOptions, require_use
 from ctxval.certificates.options import MOST_VOLUME
-from ctxval.config.parts import require_types
+from ctxval.config.parts import argument, require_types
 from ctxval.errors import CertificateError, InputError, UnknownNameError
+from ctxval.searches import DEFAULT as DEFAULT_SEARCH
+from ctxval.searches import REGISTRY as SEARCHES
+from ctxval.searches import Search, by_name
 
 _OF_ANY_KIND = ("stochastic", "resolution", "volume")
 """Settings of a file that also apply to a certificate of another kind, if that kind has these options."""
@@ -23,8 +28,6 @@ class CertificateTable(BaseModel):
     A kind of certificate from another package has its own options in the table.
 
     Attributes:
-        kind: the kind of the certificate.
-        stochastic: whether two executions of one task may differ.
         volume: the share of the task space that may exceed the threshold.
         resolution: the largest distance between a task and its nearest trial, in diagonals of the task space.
         discard: the number of largest distances to discard, for ``sampling-discarding``.
@@ -75,3 +78,32 @@ class CertificateTable(BaseModel):
 def typed(kind: type[CertificateKind], options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of a kind, with lists converted to tuples if the kind takes tuples."""
     return require_types(f"certificate {kind.name!r}", kind, options)
+
+
+class SearchTable(BaseModel):
+    """The table ``[search]``: the name of a search, and its options."""
+
+    model_config = ConfigDict(extra="allow")
+
+    name: str = DEFAULT_SEARCH
+    repeats: int = Field(default=1, ge=1)
+
+    def build(self, folder: Path | None = None) -> Search:
+        """Return the search."""
+        options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
+        options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
+        return by_name(self.name, repeats=self.repeats, **options)
+
+
+class Aspect1Table(BaseModel):
+    """The table ``[aspect1]``, which ``ctxval check --aspect1`` reads; a campaign does not use it.
+
+    The distance is ``module:attr`` or a table: how far a trajectory is from completing its task. By default it is
+    derived from the distance of the experiment. The threshold is in the units of the goal.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    distance: str | dict[str, Any] | None = None
+    threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
+    tasks: int = Field(default=TASKS, ge=2)

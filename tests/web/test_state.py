@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 
 from ctxval.web.background import Stage
-from ctxval.web.service import Work
+from ctxval.web.state import Work
 
 
 def test_work_that_cannot_be_counted_says_what_it_is() -> None:
