@@ -2,8 +2,8 @@
 
 Each execution lasts one unit and a seeded random part of half a unit; choosing a task takes no time.
 ``python benchmarks/study_workers.py`` runs what is not stored yet and prints a table, or with
-``linear-lag --seeds 3`` a part of it. ``--store FILE`` keeps the results of another version apart. A campaign either explores (the
-search ``auto`` alone) or decides (without a threshold, to 1 %).
+``linear-lag --seeds 3`` a part of it. ``--store FILE`` keeps the results of another version apart. A campaign either
+explores (the search ``auto`` alone) or decides (without a threshold, to 1 %).
 """
 
 from __future__ import annotations
