@@ -1,9 +1,9 @@
 """How much sooner several workers find the worst task: simulated time until an execution is within 1 % of d*.
 
 Each execution lasts one unit and a seeded random part of half a unit; choosing a task takes no time.
-``python benchmarks/study_workers.py`` runs what is not stored yet and prints a table; ``linear-drawn lag --seeds 3``
-runs some systems only. ``--store FILE`` keeps the results of another version apart. A campaign either explores (the
-search ``auto`` alone) or decides (without a threshold, to 1 %).
+``python benchmarks/study_workers.py`` runs what is not stored yet and prints a table, or with
+``linear-lag --seeds 3`` a part of it. ``--store FILE`` keeps the results of another version apart. A campaign either
+explores (the search ``auto`` alone) or decides (without a threshold, to 1 %).
 """
 
 from __future__ import annotations
