@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import solve_continuous_lyapunov
 from scipy.signal import cont2discrete
 
-from ctxval import Campaign, TaskSpace, Truth, cases, models, systems
+from ctxval import Campaign, TaskSpace, Truth, cases, systems
 from ctxval.cases import linear
 from ctxval.errors import InputError, UnknownNameError
 
@@ -27,7 +27,7 @@ def random_system(seed: int, n: int = 4, m: int = 3) -> linear.LinearSystem:
 
 def test_the_step_is_that_of_a_held_input() -> None:
     system = random_system(0)
-    step = models.state_space(system, 0.3)
+    step = system.discretised(0.3)
     A, B, *_ = cont2discrete((system.A, system.B, np.eye(4), np.zeros((4, 3))), 0.3)
     np.testing.assert_allclose(step.A, A, atol=1e-13)
     np.testing.assert_allclose(step.B, B, atol=1e-13)
@@ -40,7 +40,7 @@ def test_the_step_is_the_limit_of_many_small_ones() -> None:
     expected = x
     for _ in range(200):
         expected = small(expected, u)
-    np.testing.assert_allclose(models.state_space(system, 0.2).step(x, u), expected, rtol=1e-10)
+    np.testing.assert_allclose(system.discretised(0.2).step(x, u), expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize("dim", ALL)

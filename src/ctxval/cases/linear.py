@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import expm
 
 from ctxval import (
     Array,
@@ -61,6 +62,13 @@ class LinearSystem:
 
     A: Array
     B: Array
+
+    def discretised(self, dt: float) -> models.Linear:
+        """Return the exact step of dt seconds under a held input: the first n rows of ``exp([[A, B], [0, 0]] dt)``."""
+        n, m = self.B.shape
+        generator = np.block([[self.A, self.B], [np.zeros((m, n + m))]])
+        rows = expm(generator * dt)[:n]
+        return models.Linear(rows[:, :n], rows[:, n:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +132,8 @@ def experiment(seed: int = 0, dim: int = 4, settings: Settings | None = None) ->
     settings = Settings() if settings is None else settings
     of_gain, of_system, of_model = np.random.default_rng(seed).spawn(3)
     gain = of_gain.normal(scale=1 / np.sqrt(dim), size=(dim, dim))
-    # The exact steps under an input that is held.
-    system = models.state_space(draw(of_system, gain, settings), settings.dt)
-    model = models.state_space(draw(of_model, gain, settings), settings.dt)
+    system = draw(of_system, gain, settings).discretised(settings.dt)
+    model = draw(of_model, gain, settings).discretised(settings.dt)
     space = TaskSpace(x_init=(-np.ones(dim), np.ones(dim)), x_final=(-np.ones(dim), np.ones(dim)))
 
     def regulate(p: Parameters) -> Task:
