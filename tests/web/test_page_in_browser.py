@@ -327,7 +327,7 @@ def test_a_run_is_shown_as_it_goes_and_takes_nothing(browser: Any, tmp_path: Pat
     assert one.page.locator("form, button, input").count() == 0
     refused = one.page.request.post(f"{address}choose", headers={"Origin": address.rstrip("/")})
     assert refused.status == 404
-    one.page.locator("#next .done").wait_for(timeout=WAIT)
+    one.page.locator("#next .done").wait_for(timeout=4 * WAIT)
     assert ".report.html" in one.page.locator("#next").inner_text()
     assert one.page.locator(".answer").inner_text() == "validated against 0.5 rad"
     assert one.page.evaluate("document.documentElement.scrollWidth") <= 400

@@ -116,12 +116,11 @@ def open_target(
     """Open the store that an argument names, or the campaign of an experiment with options of the command line."""
     path = Path(target)
     if path.suffix in STORE_SUFFIXES or (path.suffix not in (".toml", ".py") and path.is_file()):
-        store = Store.existing(path)
         if any(value is not None for value in overrides.values()):
             *first, last = (f"--{name}" for name in overrides)
             flags = f"{', '.join(first)} and {last}"
             raise InputError(f"{target} is a store and keeps its own settings: remove {flags}.")
-        return open_store(store, path, experiment, trust, accept_change)
+        return open_store(Store.existing(path), path, experiment, trust, accept_change)
     if path.suffix and ":" not in target and path.suffix != ".toml":
         raise InputError(not_an_experiment(target, f"a store ({', '.join(STORE_SUFFIXES)})"))
     if experiment is not None or trust:

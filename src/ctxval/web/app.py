@@ -116,6 +116,7 @@ class PageRoutes:
         return session, cookie
 
     def _campaign(self, request: Request, session: str, problem: Problem | None = None) -> str:
+        self.state.shown = self.state.version
         replaces = problem is not None and "replace" in problem.fields
         return self.page.campaign(
             self.access.form_token(session),

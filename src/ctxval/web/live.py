@@ -67,9 +67,12 @@ class LiveCampaign(PageState):
         self._post({**shown, "choosing": None, "interval": None, "outcome": outcome})
 
     def wait_until_seen(self) -> None:
-        """Give open pages a second to load the last state."""
+        """Give open pages time to load the last state: until one has, at most 5 s, and a moment for the others."""
+        end = time.monotonic() + 5
+        while self.listeners and time.monotonic() < end and (self.outcome is None or self.shown < self.version):
+            time.sleep(0.05)
         if self.listeners:
-            time.sleep(1)
+            time.sleep(0.5)
 
     def _post(self, changes: dict[str, Any]) -> None:
         self._loop.call_soon_threadsafe(lambda: self.update(**changes))

@@ -81,6 +81,7 @@ class PageState:
         interval: the largest executed distance and a preliminary bound, while a command executes the tasks.
         outcome: how the command that executed the tasks has ended; None if it has not.
         version: a number that grows with each change, also when the server is started again.
+        shown: the version that was last sent to a browser.
         listeners: the number of browsers that are kept up to date.
     """
 
@@ -102,7 +103,7 @@ class PageState:
         self.pictures: Pictures = {}
         self.files: dict[int, Files | str] = {}
         self.version = time.time_ns()
-        self.listeners = 0
+        self.listeners = self.shown = 0
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Task[Any]] = set()
         self._closing = False
