@@ -50,11 +50,14 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"predictions": GOOD.predictions[:2]}, "2 executions of different tasks were predicted"),
     ({"noise": 2 * NOISE}, "2 % of the variance of the residual"),
     ({"left_out": 1.1 * LEFT_OUT}, "leave out 55 % of the largest variance"),
-    ({"coverage": replace(COVERED, beyond=gap(2 * BEYOND))}, "4 % of its range beyond all records of u[0]"),
-    ({"coverage": replace(COVERED, marginal=gap(1.1 * GAP))}, "28 % of its range away from every record of u[0]"),
+    (
+        {"coverage": replace(COVERED, beyond=gap(2 * BEYOND))},
+        "leave the recorded range of u[0] by 4 % (at x[0] 1, u[0] 3)",
+    ),
+    ({"coverage": replace(COVERED, marginal=gap(1.1 * GAP))}, "enter a gap in the records of u[0] by 28 %"),
     (
         {"coverage": replace(COVERED, pair=gap(1.1 * PAIR_GAP, "x[0]", "u[0]"))},
-        "55 % of their ranges away from every record of x[0] and u[0], such as to x[0] 1, u[0] 3",
+        "enter a gap in the joint records of x[0] and u[0] by 55 % (at x[0] 1, u[0] 3)",
     ),
     ({"untried": UntriedParameter("load", 1.1 * GAP, np.zeros(2))}, "the parameter load hardly changes"),
     ({"highest": 1.1 * BEST / TESTED}, "predicted to be 1.1, but the largest executed one is 0.8"),
@@ -157,7 +160,7 @@ def test_a_failure_long_ago_is_forgiven() -> None:
 def test_many_coordinates_may_leave_their_ranges_as_far_as_they_may_leave_gaps() -> None:
     wide = replace(COVERED, pair=None, beyond=gap(0.9 * GAP))
     assert doubt(coverage=wide) is None
-    assert "beyond all records" in (doubt(coverage=replace(wide, beyond=gap(1.1 * GAP))) or "")
+    assert "leave the recorded range" in (doubt(coverage=replace(wide, beyond=gap(1.1 * GAP))) or "")
 
 
 @pytest.mark.parametrize("jumps", [{"sharpness": 1.4 * SHARP}, {"jump": 2 * JUMP}])

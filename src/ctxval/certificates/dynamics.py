@@ -130,7 +130,7 @@ class Dynamics(CertificateKind):
         if largest is None or largest > threshold or not predictions["held"]:
             return ""
         return (
-            f"supported by the model: no draw of the learned dynamics exceeds {threshold:.6g} in a search of "
+            f"supported by the model: no posterior sample of the dynamics exceeds {threshold:.6g} in a search of "
             f"{details['evaluations']} closed loops; {predictions['held']} of the last {predictions['last_ones']} "
             "predictions held"
         )
@@ -187,8 +187,8 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
     upper = raised(evidence, bound)
     if not np.isfinite(upper + error):
         raise CertificateError(
-            "the dynamics give no bound: the closed loops of some draws diverge, or an execution could not be "
-            "predicted. More executions narrow the draws."
+            "the dynamics give no bound: the closed loops of some posterior samples diverge, or an execution could not "
+            "be predicted. More executions narrow them."
         )
     return Certificate(
         kind="dynamics",
@@ -209,7 +209,9 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
 
 def _require_draws(draws: int, confidence: float) -> None:
     if np.ceil((draws + 1) * confidence - 1e-9) > draws:
-        raise CertificateError(f"a confidence of {confidence:g} needs more than the {draws} draws of the dynamics.")
+        raise CertificateError(
+            f"a confidence of {confidence:g} needs more than {draws} posterior samples of the dynamics."
+        )
 
 
 def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> float:

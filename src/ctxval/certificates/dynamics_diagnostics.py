@@ -188,8 +188,8 @@ little there."""
 def _variance_left_out(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
     if evidence.left_out > LEFT_OUT:
         return (
-            f"the draws of the dynamics leave out {100 * evidence.left_out:.0f} % of the largest variance, more than "
-            f"{100 * LEFT_OUT:g} %; more executions reduce this variance"
+            f"the posterior samples of the dynamics leave out {100 * evidence.left_out:.0f} % of the largest variance, "
+            f"more than {100 * LEFT_OUT:g} %; more executions reduce this variance"
         )
     return None
 
@@ -208,29 +208,31 @@ PAIR_GAP = 0.5
 
 
 def _beyond_the_records(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    coverage = evidence.coverage
-    if coverage.beyond.size > (GAP if coverage.pair is None else BEYOND):
-        return _gap(coverage.beyond, "of its range beyond all records of")
-    return None
+    beyond = evidence.coverage.beyond
+    if beyond.size <= (GAP if evidence.coverage.pair is None else BEYOND):
+        return None
+    return f"predicted runs leave the recorded range of {_at(beyond)}; `ctxval run` executes a task that goes there"
 
 
 def _coverage_gap(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    found = evidence.coverage.marginal
-    return _gap(found, "of its range away from every record of") if found.size > GAP else None
+    gap = evidence.coverage.marginal
+    if gap.size <= GAP:
+        return None
+    return f"predicted runs enter a gap in the records of {_at(gap)}; `ctxval run` executes a task that goes there"
 
 
 def _coverage_gap_of_pairs(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    found = evidence.coverage.pair
-    if found is not None and found.size > PAIR_GAP:
-        return _gap(found, "of their ranges away from every record of")
-    return None
-
-
-def _gap(gap: StateInputGap, what: str) -> str:
+    gap = evidence.coverage.pair
+    if gap is None or gap.size <= PAIR_GAP:
+        return None
     return (
-        f"closed loops of the tasks lead {100 * gap.size:.2g} % {what} {' and '.join(gap.coordinates)}, such as to "
-        f"{with_units(gap.place)}; an execution of a task that leads there helps (`ctxval run` executes it)"
+        f"predicted runs enter a gap in the joint records of {_at(gap)}; `ctxval run` executes a task that goes there"
     )
+
+
+def _at(gap: StateInputGap) -> str:
+    """Return the coordinates of a gap, its size as a share of the visited range, and its place."""
+    return f"{' and '.join(gap.coordinates)} by {100 * gap.size:.2g} % (at {with_units(gap.place)})"
 
 
 def untried_parameter(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
