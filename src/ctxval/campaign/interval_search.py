@@ -3,7 +3,7 @@
 Each choice narrows the interval, until a threshold lies outside of it or, without a threshold, until it is narrow. If
 trajectories teach the dynamics, the bound is that from learned dynamics. It needs executions where a draw of the
 dynamics exceeds the limit, where states and inputs are not covered by records, and where predictions are tested. If no
-dynamics can be learned, or if most predictions fail, it is the posterior bound of the distance.
+dynamics can be learned, if most predictions fail, or if it decides earlier, it is the posterior bound of the distance.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
-from ctxval.certificates.covering import RESOLUTION
+from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
 from ctxval.certificates.dynamics_diagnostics import (
     AUDITED,
@@ -117,8 +117,14 @@ class IntervalSearch:
                 return self._by_distance(trials)
             if self._decides(trials, evidence):
                 return self._audit(evidence) if self.audited else None
-        if isinstance(self.options.kind, Automatic) and self.recorder.executions >= _PATIENCE:
-            return self._by_distance(trials)
+        if isinstance(self.options.kind, Automatic):
+            known = _points(trials, self._dimension)
+            patient = self.recorder.executions < _PATIENCE
+            # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
+            if not patient or covering(known, self.options.kind.posterior.resolution, 0) is not None:
+                choice = self._by_distance(trials)
+                if not patient or choice is None:
+                    return choice
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
         best, limit = largest_distance(trials), self.limit
@@ -132,8 +138,7 @@ class IntervalSearch:
                 best = max(best, float(expected[np.isfinite(expected)].max(initial=0.0)))
                 limit = (1 + self.within) * best if self.threshold is None else limit
             after = self.recorder.dynamics.screening(trials, pending=True) or evidence
-            known = _points(trials, self._dimension)
-            point = next_task(after, known, best, limit, self.options.confidence, steady)
+            point = next_task(after, _points(trials, self._dimension), best, limit, self.options.confidence, steady)
         # The results decide when the campaign ends, so the number of independent draws is not planned.
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
