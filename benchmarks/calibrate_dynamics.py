@@ -25,8 +25,8 @@ from dynamics_reporting import REPORTING
 from dynamics_rough import ROUGH
 from dynamics_truths import truth
 
-RULE = 3
-"""Version of the rule by which campaigns are run now: the search and the bound share one posterior."""
+RULE = 4
+"""Version of the rule by which campaigns are run now: predictions that failed raise the bound by their errors."""
 
 BUDGETS = {"reporting": 12, "rough": 12, "paper": 16, "development": 12}
 """Largest numbers of executions."""

@@ -379,7 +379,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.Mean": lambda: certificates.Mean(quantile=0.9),
     "certificates.MadeGood": lambda: certificates.MadeGood(3, 7, "fuse replaced"),
     "certificates.Maxima": lambda: certificates.draw_maxima(sample(), draws=12, paths=4),
-    "certificates.Options": certificates.Options,
     "certificates.Region": certificates.Region,
     "certificates.Sample": sample,
     "certificates.Verdict": lambda: certificates.judge(

@@ -367,7 +367,7 @@ def test_what_is_undecided_says_how_many_more_executions_would_decide(invoke, ca
         invoke("certify", str(campaigns["linear"]), "--resolution", "1", "--threshold", str(tau), "--json").stdout
     )
     assert report["verdict"] == "undecided"
-    assert set(report["expected"]) == {"executions", "validated", "falsified"}
+    assert set(report["expected"]) == {"executions", "validated", "falsified", "fewest"}
     assert "verdict" not in plain
 
 

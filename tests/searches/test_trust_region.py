@@ -75,12 +75,12 @@ def doubtful(X: Array) -> Array:
     return np.full(len(X), 7.0)
 
 
-def test_if_a_doubtful_prediction_was_far_off_every_second_point_is_that_of_the_surrogate() -> None:
+def test_if_doubtful_predictions_were_far_off_every_second_point_is_that_of_the_surrogate() -> None:
     search = TrustRegion()
-    run(search, hill, lambda X: 220.0 * X[:, 0] ** 4, 5, doubt=doubtful)
-    assert engines(search) == ["climb", "scalar", "climb", "scalar", "climb"]
+    run(search, hill, lambda X: 220.0 * X[:, 0] ** 4, 6, doubt=doubtful)
+    assert engines(search) == ["climb", "climb", "scalar", "climb", "scalar", "climb"]
     hedges = [note["why"] for note in search.notes if note is not None and note["engine"] == "scalar"]
-    assert all("the last prediction erred by" in why and "is in doubt" in why for why in hedges)
+    assert all("the last two predictions erred by" in why and "is in doubt" in why for why in hedges)
     never = TrustRegion(settings=TrustRegionSettings(hedge=False))
     run(never, hill, lambda X: 220.0 * X[:, 0] ** 4, 5, doubt=doubtful)
     assert engines(never) == ["climb"] * 5

@@ -47,7 +47,8 @@ def untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
         best: the largest executed distance.
         bound: the bound.
     """
-    return _first(LARGE_DISTANCES, evidence, best, bound)
+    # Executions are chosen for predictions that hold, not for a bound that their errors raise.
+    return _largest_untested(evidence, best, bound) or _no_large_one_held(evidence, bound, bound)
 
 
 def fewest_missing(evidence: DynamicsEvidence, best: float, bound: float) -> int:
@@ -60,7 +61,7 @@ def fewest_missing(evidence: DynamicsEvidence, best: float, bound: float) -> int
     """
     checked = counted(evidence, bound)
     in_a_row = next((k for k, one in enumerate(reversed(checked)) if not held(one, bound)), len(checked))
-    gaps = sum(one(evidence, best, bound) is not None for one in (*COVERAGE, *LARGE_DISTANCES))
+    gaps = sum(one(evidence, best, bound) is not None for one in (*COVERAGE, _largest_untested, _only_small_distances))
     return max(FEWEST - evidence.executions, PREDICTIONS - in_a_row, gaps, 1)
 
 
@@ -273,7 +274,11 @@ MATTERS = 0.3
 
 
 def _only_small_distances(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    allowed = raised(evidence, bound)
+    return _no_large_one_held(evidence, bound, raised(evidence, bound))
+
+
+def _no_large_one_held(evidence: DynamicsEvidence, bound: float, allowed: float) -> str | None:
+    """Return that no prediction held at a large distance, with errors as a bound of ``allowed`` permits."""
     if any(one.distance >= MATTERS * bound and held(one, allowed) for one in counted(evidence, bound)):
         return None
     return (
@@ -337,9 +342,6 @@ COVERAGE: tuple[Diagnostic, ...] = (
 )
 """Diagnostics of what the records and executions do not cover."""
 
-LARGE_DISTANCES: tuple[Diagnostic, ...] = (_largest_untested, _only_small_distances)
-"""Diagnostics of whether predictions were tested at large distances."""
-
 DIAGNOSTICS: tuple[Diagnostic, ...] = (
     _few_executions,
     _unplanned,
@@ -348,7 +350,8 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
     _noisy,
     _variance_left_out,
     *COVERAGE,
-    *LARGE_DISTANCES,
+    _largest_untested,
+    _only_small_distances,
     _distance_jumps,
     _searches_disagree,
 )

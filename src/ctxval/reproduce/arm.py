@@ -145,7 +145,7 @@ class ArmModels(Study):
                 + ", ".join(f"{1000 * spread(missed_by[m])[0]:.2f} mm ({MODELS[m][0]})" for m in MODELS)
                 + f" from its target, median over the table; {1000 * near:.0f} mm are {100 * MISSED:g} % of its side",
                 agreement(max(missed) < near, min(missed) < near),
-                "the other models do not even complete their missed_by tasks, so that d* of these says little",
+                "the other models do not even complete their own tasks, so that d* of these says little",
             ),
         ]
 

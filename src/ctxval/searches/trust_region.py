@@ -6,8 +6,8 @@ value. It shrinks if an execution does not and the prediction was wrong. If no i
 if several executions have not improved, a new region starts at the point of the whole cube with the largest optimistic
 value for a larger kappa. A larger kappa favours points where the dynamics are not known.
 
-A prediction may be wrong in a way that its doubt does not show. So the search hedges: if the last prediction was far
-off and the next one is in doubt, or if several executions have found nothing larger, every second point is that of
+A prediction may be wrong in a way that its doubt does not show. So the search hedges: if the last two predictions were
+far off and the next one is in doubt, or if several executions have found nothing larger, every second point is that of
 Bayesian optimisation on the values alone.
 """
 
@@ -60,7 +60,7 @@ class TrustRegionSettings:
         compared_on: largest number of known values, the latest ones, on which the two are compared.
         good_enough: mean error of the logarithm up to which a prediction needs no comparison.
         hedge: whether a prediction that may mislead alternates with the surrogate.
-        far_off: relative error of the last prediction from which on the search hedges if the doubt exceeds 1.
+        far_off: relative error of the last two predictions from which on the search hedges if the doubt exceeds 1.
         fruitless: number of executions that found nothing larger, from which on it hedges in any case.
         distinct: least distance of a suggestion from each known point, in at least one coordinate.
         apart: least distance of a suggestion from pending and failed points, as a share of the cube's diagonal.
@@ -217,10 +217,10 @@ class TrustRegion(SequentialSearch):
         ]
         if not rows or not self._settings.hedge or (self.notes[-1] or {}).get("engine") != _ENGINE:
             return None
-        value, expected = self.values[rows[-1]], (self.notes[rows[-1]] or {})["expected"]
-        error = abs(value - expected) / max(value, expected, 1e-300)
-        if (self._last_note or {})["doubt"] > 1 and error > self._settings.far_off:
-            return f"the last prediction erred by {100 * error:.0f} % and the next one is in doubt"
+        last = [(self.values[row], (self.notes[row] or {})["expected"]) for row in rows[-2:]]
+        error = min(abs(value - expected) / max(value, expected, 1e-300) for value, expected in last)
+        if len(last) == 2 and (self._last_note or {})["doubt"] > 1 and error > self._settings.far_off:
+            return f"the last two predictions erred by {100 * error:.0f} % or more and the next one is in doubt"
         values = self.values[np.isfinite(self.values)]
         gains = values[1:] > (1 + self._settings.improvement) * np.maximum.accumulate(values)[:-1]
         fruitless = len(gains) - int(np.flatnonzero(gains).max(initial=-1)) - 1
